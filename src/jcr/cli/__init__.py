@@ -1,0 +1,108 @@
+"""The command line: one module a command, imported only when that command is asked for.
+
+A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
+field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
+status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug.
+"""
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
+
+from jcr.errors import InputError, NotTrustedError
+
+COMMANDS = {
+    "run": "everything: reconstruct, calibrate, map, report",
+    "calibrate": "up to calibration.json",
+    "map": "(re)build the map of a run",
+    "query": "occupancy, distance, colour, label at points",
+    "compare": "difference of two calibrations in mm and degrees",
+    "simulate": "a simulated capture with ground truth",
+    "bench": "the tables and timings of the README",
+}
+
+_OVERVIEW = """\
+usage: jcr COMMAND [ARGUMENTS]
+
+From pictures of a robot's wrist camera and the gripper pose of each: where the camera sits on the gripper,
+the metric scale, and a map in the robot's base frame.
+
+{commands}
+
+jcr COMMAND --help    arguments and examples of one command
+jcr --version         the version
+
+examples:
+  jcr run captures/table out/table
+  jcr query out/table points.csv
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit with its status."""
+    sys.exit(dispatch(sys.argv[1:] if arguments is None else arguments))
+
+
+def dispatch(arguments: Sequence[str]) -> int:
+    """The exit status of one command line."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        commands = "\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items())
+        sys.stdout.write(_OVERVIEW.format(commands=commands))
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    if name == "--version":
+        from jcr import __version__
+
+        sys.stdout.write(f"jcr {__version__}\n")
+        return 0
+    if name not in COMMANDS:
+        return _fail(2, f"{name!r} is no command of jcr; there are {', '.join(COMMANDS)} (jcr --help)")
+    try:
+        return _call(import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+    except InputError as error:
+        return _fail(2, str(error))
+    except NotTrustedError as error:
+        return _fail(3, str(error))
+    except KeyboardInterrupt:
+        return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
+
+
+def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
+    import tyro
+
+    # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            parsed = tyro.cli(
+                command.Arguments,
+                prog=program,
+                args=list(arguments),
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            return 0
+        return _fail(2, f"{_flatten(complaint.getvalue())} ({program} --help)")
+    return command.main(parsed)
+
+
+def _flatten(box: str) -> str:
+    """The first message of tyro's box, on one line."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    lines = [line.strip(" │") for line in text.splitlines() if not re.match(r"^[╭╰├]", line.strip())]
+    message = []
+    for line in lines:
+        if re.match(r"^[─━-]{3,}$", line):
+            break
+        message.append(line)
+    return re.sub(r"\s+", " ", " ".join(message)).strip() or "the arguments cannot be understood"
+
+
+def _fail(status: int, message: str) -> int:
+    sys.stderr.write(f"error: {' '.join(message.split())}\n")
+    return status

@@ -1,0 +1,178 @@
+"""The records that flow from stage to stage, and nothing else.
+
+Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward), `recon` (arbitrary origin
+and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera with OpenCV's five-coefficient distortion, in pixels of a `width` x `height` image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3."""
+
+    @property
+    def matrix(self) -> Float[ndarray, "3 3"]:
+        """K (3,3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Images of one scene and the gripper pose at each, checked on reading."""
+
+    folder: Path
+    images: tuple[str, ...]
+    """Paths relative to `folder`; the names by which everything later speaks of an image."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    image_size: tuple[int, int]
+    """Width, height in pixels after EXIF rotation; the same for all images."""
+    intrinsics: Intrinsics | None = None
+    """None: unknown, to be estimated."""
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of common 3D points, the food of bundle adjustment, whatever back end made them."""
+
+    image: Int[ndarray, "k"]
+    """Row of the reconstruction (not of the capture) that each observation belongs to."""
+    x_px: Float[ndarray, "k 2"]
+    """In the capture's original image, distorted as the lens made it."""
+    point: Int[ndarray, "k"]
+    """Row of `points_in_recon`."""
+    points_in_recon: Float[ndarray, "p 3"]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
+
+    image_index: Int[ndarray, "m"]
+    """Rows of the capture that were registered, ascending."""
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    intrinsics: Intrinsics
+    """Of the capture's original images: given, or estimated by the back end."""
+    pointmap_intrinsics: Intrinsics
+    """The undistorted pinhole grid in which the pointmaps live (size W x H)."""
+    points_in_recon: Float[ndarray, "m h w 3"]
+    confidence: Float[ndarray, "m h w"]
+    """At least 0; 0 means no estimate (the point may be anything, finite)."""
+    colors: UInt8[ndarray, "m h w 3"]
+    """RGB at the pointmap's pixels."""
+    tracks: Tracks
+    backend: str
+    is_metric: bool = False
+    notes: tuple[str, ...] = ()
+    """What the user should know: images not registered, distortion dropped."""
+
+
+@dataclass(frozen=True)
+class ImageVerdict:
+    """What the calibration thinks of one image of the capture."""
+
+    image: str
+    used: bool
+    reason: str | None
+    """Why it was not used; None when it was."""
+    translation_residual_mm: float | None
+    rotation_residual_deg: float | None
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Which directions of (translation, rotation, scale) the motions can see."""
+
+    observable: bool
+    unobservable: tuple[str, ...]
+    """In words, e.g. "scale: every view turns about one point fixed to the gripper"."""
+    advice: tuple[str, ...]
+    """One cure per unobservable direction."""
+
+
+@dataclass(frozen=True)
+class RobotNoise:
+    """One-sigma noise of the gripper poses per axis."""
+
+    translation: float
+    rotation: float
+    estimated: bool
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Error on images left out of the calibration: the number to believe."""
+
+    translation_mm: float
+    rotation_deg: float
+    reprojection_px: float | None
+    how: str
+
+
+COVARIANCE_ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "log_scale")
+"""Error of the translation in gripper axes; rotation error vector about gripper axes (R_true = exp(r)·R);
+relative scale error (scale_true = exp(s)·scale)."""
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    scale: float
+    """Metres per unit of the reconstruction."""
+    base_from_recon: Float[ndarray, "4 4"]
+    """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
+    covariance: Float[ndarray, "7 7"]
+    inliers: Bool[ndarray, "n"]
+    """Per pose given to the solver."""
+    translation_residual_m: Float[ndarray, "n"]
+    """Per pose: distance from where the fit puts the gripper."""
+    rotation_residual_rad: Float[ndarray, "n"]
+    observability: Observability
+    robot_noise: RobotNoise
+    residual_translation: float
+    """Mean δ_t in metres over consecutive used poses, as the paper defines it."""
+    residual_rotation: float
+    """Mean δ_R, Frobenius norm, likewise."""
+    converged: bool
+    warnings: tuple[str, ...] = ()
+    intrinsics: Intrinsics | None = None
+    """Refined by bundle adjustment; None when poses alone were given."""
+    held_out: HeldOut | None = None
+    reasons: tuple[str | None, ...] = ()
+    """Per pose: why it was rejected, None when used."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Confident points in the base frame, with the rays that saw them."""
+
+    points_in_base: Float[ndarray, "n 3"]
+    color: UInt8[ndarray, "n 3"]
+    confidence: Float[ndarray, "n"]
+    margin: Float[ndarray, "n"]
+    """One-sigma position uncertainty (m) that the calibration leaves at the point."""
+    label: Int[ndarray, "n"]
+    """Segment; 0 = none."""
+    image: Int[ndarray, "n"]
+    """Row of `camera_centers_in_base`."""
+    camera_centers_in_base: Float[ndarray, "m 3"]
+    label_names: tuple[str, ...] = field(default=("none",))
