@@ -1,0 +1,78 @@
+"""Images as the network was trained on them, and the intrinsics that go with the pixels it sees.
+
+Pixel (0, 0) is the centre of the top-left pixel. A resize by s maps x' = (x + 0.5)·s − 0.5 (the image's outer
+edges stay its outer edges, which is what Pillow's resize does); a crop subtracts its corner. Forgetting the
+half pixel shifts the principal point by (1 − s)/2 pixels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.records import Intrinsics
+
+PATCH = 16
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Where the network's pixels lie in the original image: resized to `resized_size`, then cropped."""
+
+    original_size: tuple[int, int]
+    """Width, height in pixels, after EXIF rotation."""
+    resized_size: tuple[int, int]
+    crop_corner: tuple[int, int]
+    """Left, top of the crop in the resized image."""
+    size: tuple[int, int]
+    """Width, height of what the network sees."""
+
+    @property
+    def scale(self) -> Float[ndarray, "2"]:
+        """Resized over original, for x and y (they differ by the rounding of the sizes)."""
+        return np.array(self.resized_size) / np.array(self.original_size)
+
+    def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the original image in the network's grid."""
+        return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
+
+    def original_from_grid(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the network's grid in the original image."""
+        return (x_px + np.array(self.crop_corner) + 0.5) / self.scale - 0.5
+
+    def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
+        """The pinhole of the grid, given the pinhole of the original image (its distortion is dropped)."""
+        cx, cy = self.grid_from_original(np.array([original.cx, original.cy]))
+        sx, sy = self.scale
+        width, height = self.size
+        return Intrinsics(original.fx * sx, original.fy * sy, float(cx), float(cy), width, height)
+
+    def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
+        """The pinhole of the original image, given that of the grid."""
+        cx, cy = self.original_from_grid(np.array([grid.cx, grid.cy]))
+        sx, sy = self.scale
+        width, height = self.original_size
+        return Intrinsics(grid.fx / sx, grid.fy / sy, float(cx), float(cy), width, height)
+
+
+def image_grid(original_size: tuple[int, int], long_edge: int = 512) -> ImageGrid:
+    """The published resize and crop for an image of `original_size` (width, height).
+
+    512: the long edge becomes 512 and both edges are cropped around the centre to multiples of the patch; a
+    square image is cropped to 4:3, the network having seen none. 224: the short edge becomes 224, then a
+    square is cropped.
+    """
+    width, height = original_size
+    longest = max(width, height)
+    target = round(long_edge * longest / min(width, height)) if long_edge == 224 else long_edge
+    resized = (round(width * target / longest), round(height * target / longest))
+    center = (resized[0] // 2, resized[1] // 2)
+    if long_edge == 224:
+        half = (min(center),) * 2
+    else:
+        half = tuple(2 * c // PATCH * (PATCH // 2) for c in center)
+        if resized[0] == resized[1]:
+            half = (half[0], 3 * half[0] // 4)
+    corner = (center[0] - half[0], center[1] - half[1])
+    return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
