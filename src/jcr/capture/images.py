@@ -1,0 +1,47 @@
+"""Reading one image file, whatever a camera or a phone wrote."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+from PIL import Image, ImageOps
+
+from jcr.errors import InputError
+
+MAX_PIXELS = 64_000_000
+"""Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
+
+
+def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """RGB (h,w,3) uint8, turned upright by its EXIF tag; InputError when the file is no readable image."""
+    try:
+        with warnings.catch_warnings():
+            # Pillow's own bomb warning would end a run that treats warnings as errors; our limit is lower.
+            warnings.simplefilter("ignore")
+            with Image.open(path) as opened:
+                _refuse_size(path, opened.size)
+                # Phones write MPO: one JPEG with a depth or preview picture behind it; its first is the photograph.
+                if opened.format != "MPO" and getattr(opened, "n_frames", 1) > 1:
+                    raise InputError(f"{path}: holds {opened.n_frames} pictures; save one as PNG or JPEG")
+                opened.load()
+                upright = ImageOps.exif_transpose(opened)
+                if upright.mode.startswith("I"):  # 16-bit grey, which convert() would clip at 255
+                    grey = np.asarray(upright, dtype=np.float64)
+                    eight_bit = np.clip(grey / 256, 0, 255).astype(np.uint8)
+                    return np.repeat(eight_bit[..., None], 3, axis=2)
+                return np.asarray(upright.convert("RGB"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such image; correct its name in the capture or add the file") from None
+    except InputError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
+
+
+def _refuse_size(path: Path, size: tuple[int, int]) -> None:
+    if size[0] * size[1] > MAX_PIXELS:
+        raise InputError(
+            f"{path}: {size[0]}x{size[1]} pixels are more than {MAX_PIXELS // 1_000_000} million; shrink the image"
+        )
