@@ -21,7 +21,7 @@ def rotation_exp(rotation_vector: Vectors) -> Rotations:
 
 
 def rotation_log(rotation: Rotations) -> Vectors:
-    """SO(3) logarithm: matrices (...,3,3) to rotation vectors (...,3) rad of length at most π; safe at 0 and π."""
+    """SO(3) logarithm: matrices (...,3,3) to rotation vectors (...,3) rad, length ≤ π; safe at 0 and π."""
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(*rotation.shape[:-2], 3)
 
@@ -80,7 +80,7 @@ def nearest_rotation(matrix: Rotations) -> Rotations:
 
 
 def fit_similarity(
-    x_in_a: Float[ndarray, "n 3"], x_in_b: Float[ndarray, "n 3"], weights: Float[ndarray, "n"] | None = None
+    x_in_a: Float[ndarray, "n 3"], x_in_b: Float[ndarray, "n 3"], weights: Float[ndarray, " n"] | None = None
 ) -> tuple[Float[ndarray, "4 4"], float]:
     """Least-squares `a_from_b` (4,4) and scale with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991)."""
     w = np.full(len(x_in_a), 1.0 / len(x_in_a)) if weights is None else weights / weights.sum()

@@ -52,11 +52,11 @@ class Capture:
 class Tracks:
     """Observations of common 3D points, the food of bundle adjustment, whatever back end made them."""
 
-    image: Int[ndarray, "k"]
+    image: Int[ndarray, " k"]
     """Row of the reconstruction (not of the capture) that each observation belongs to."""
     x_px: Float[ndarray, "k 2"]
     """In the capture's original image, distorted as the lens made it."""
-    point: Int[ndarray, "k"]
+    point: Int[ndarray, " k"]
     """Row of `points_in_recon`."""
     points_in_recon: Float[ndarray, "p 3"]
 
@@ -65,7 +65,7 @@ class Tracks:
 class Reconstruction:
     """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
 
-    image_index: Int[ndarray, "m"]
+    image_index: Int[ndarray, " m"]
     """Rows of the capture that were registered, ascending."""
     recon_from_camera: Float[ndarray, "m 4 4"]
     intrinsics: Intrinsics
@@ -141,11 +141,11 @@ class HandEye:
     base_from_recon: Float[ndarray, "4 4"]
     """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
     covariance: Float[ndarray, "7 7"]
-    inliers: Bool[ndarray, "n"]
+    inliers: Bool[ndarray, " n"]
     """Per pose given to the solver."""
-    translation_residual_m: Float[ndarray, "n"]
+    translation_residual_m: Float[ndarray, " n"]
     """Per pose: distance from where the fit puts the gripper."""
-    rotation_residual_rad: Float[ndarray, "n"]
+    rotation_residual_rad: Float[ndarray, " n"]
     observability: Observability
     robot_noise: RobotNoise
     residual_translation: float
@@ -167,12 +167,12 @@ class PointCloud:
 
     points_in_base: Float[ndarray, "n 3"]
     color: UInt8[ndarray, "n 3"]
-    confidence: Float[ndarray, "n"]
-    margin: Float[ndarray, "n"]
+    confidence: Float[ndarray, " n"]
+    margin: Float[ndarray, " n"]
     """One-sigma position uncertainty (m) that the calibration leaves at the point."""
-    label: Int[ndarray, "n"]
+    label: Int[ndarray, " n"]
     """Segment; 0 = none."""
-    image: Int[ndarray, "n"]
+    image: Int[ndarray, " n"]
     """Row of `camera_centers_in_base`."""
     camera_centers_in_base: Float[ndarray, "m 3"]
     label_names: tuple[str, ...] = field(default=("none",))

@@ -22,7 +22,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
             warnings.simplefilter("ignore")
             with Image.open(path) as opened:
                 _refuse_size(path, opened.size)
-                # Phones write MPO: one JPEG with a depth or preview picture behind it; its first is the photograph.
+                # Phones write MPO: a JPEG with previews behind it, whose first picture is the photograph.
                 if opened.format != "MPO" and getattr(opened, "n_frames", 1) > 1:
                     raise InputError(f"{path}: holds {opened.n_frames} pictures; save one as PNG or JPEG")
                 opened.load()
@@ -43,5 +43,5 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
 def _refuse_size(path: Path, size: tuple[int, int]) -> None:
     if size[0] * size[1] > MAX_PIXELS:
         raise InputError(
-            f"{path}: {size[0]}x{size[1]} pixels are more than {MAX_PIXELS // 1_000_000} million; shrink the image"
+            f"{path}: {size[0]}x{size[1]} is over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
         )

@@ -68,9 +68,7 @@ def read_json(file: Path) -> Any:
         keys = [key for key, _ in pairs]
         for key in keys:
             if keys.count(key) > 1:
-                raise InputError(
-                    f"{file}: the key {key!r} appears twice in one object; keep the one you mean"
-                )
+                raise InputError(f"{file}: the key {key!r} appears twice in one object; keep one")
         return dict(pairs)
 
     try:
@@ -155,7 +153,7 @@ def _common_size(folder: Path, images: tuple[str, ...]) -> tuple[int, int]:
         same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), name)
         if same != name:
             raise InputError(
-                f"{folder / name}: the same picture as {same}; drop one frame, or take the missing picture again"
+                f"{folder / name}: the same picture as {same}; drop one of the frames or take it again"
             )
     first = sizes[images[0]]
     for name, size in sizes.items():
