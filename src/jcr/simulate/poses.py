@@ -1,0 +1,169 @@
+"""Where the wrist goes: hand-eye transforms and patterns of gripper poses over a table.
+
+A pattern is made of camera poses, since what must be in view is the table; the gripper follows from them.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.geometry import inverse, rotation_exp, transform
+
+Pattern = Literal["varied", "orbit", "translation", "one-axis", "planar", "pivot", "camera-centre", "two"]
+Cameras = Float[ndarray, "n 4 4"]
+
+# Azimuth and elevation (degrees, seen from the table; the robot stands at azimuth 180), distance (m) and roll
+# (degrees; 0: the top of the image points away from the robot). High left and right, three along x, sides:
+# any first few of them already turn about several axes and overlap.
+_VIEWS = np.array(
+    [
+        (150, 62, 0.52, -15),
+        (-145, 60, 0.60, 20),
+        (180, 74, 0.44, 5),
+        (100, 66, 0.55, -25),
+        (-95, 64, 0.47, 30),
+        (0, 86, 0.64, -10),
+        (135, 43, 0.50, -20),
+        (-130, 42, 0.56, 15),
+        (0, 72, 0.56, 10),
+        (165, 48, 0.40, -35),
+        (85, 48, 0.62, -40),
+        (-80, 47, 0.58, 40),
+    ]
+)
+
+
+def random_hand_eye(rng: np.random.Generator) -> Float[ndarray, "4 4"]:
+    """A plausible gripper_from_camera (4,4): 3 to 12 cm away, up to 25° aside of the gripper's z, any roll."""
+    side, roll, toward = rng.uniform(0, 2 * np.pi, 3)
+    aside, ahead = rng.uniform(0.03, 0.1), rng.uniform(-0.05, 0.06)
+    tilt = np.radians(rng.uniform(5, 25)) * np.array([np.cos(toward), np.sin(toward), 0.0])
+    rotation = rotation_exp(tilt) @ rotation_exp(np.array([0.0, 0.0, roll]))
+    return transform(rotation, np.array([aside * np.cos(side), aside * np.sin(side), ahead]))
+
+
+def gripper_poses(
+    pattern: Pattern,
+    count: int,
+    target_in_base: Float[ndarray, "3"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+) -> Cameras:
+    """True base_from_gripper (n,4,4) of the pattern about `target_in_base`; `two` has 2 poses whatever `count`."""
+    base_from_camera = _PATTERNS[pattern](count, target_in_base, gripper_from_camera, rng)
+    return base_from_camera @ inverse(gripper_from_camera)
+
+
+def _look_at(
+    target: Float[ndarray, "n 3"],
+    azimuth_deg: Float[ndarray, "n"],
+    elevation_deg: Float[ndarray, "n"],
+    distance: Float[ndarray, "n"],
+    roll_deg: Float[ndarray, "n"],
+) -> Cameras:
+    """base_from_camera (n,4,4) of cameras that see `target` in the middle of the image."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    away = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+    )
+    z = -away
+    x = np.cross(z, [1.0, 0.0, 0.0])
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    upright = np.stack([x, np.cross(z, x), z], -1)
+    roll = Rotation.from_euler("z", roll_deg[:, None], degrees=True).as_matrix()
+    return transform(upright @ roll, target + distance[:, None] * away)
+
+
+def _facing(
+    target: Float[ndarray, "n 3"], rotation: Float[ndarray, "n 3 3"], distance: Float[ndarray, "n"]
+) -> Cameras:
+    """base_from_camera (n,4,4) with given rotations, put where their optical axes meet the targets."""
+    return transform(rotation, target - distance[:, None] * rotation[..., 2])
+
+
+def _aims(
+    count: int, target: Float[ndarray, "3"], spread: float, rng: np.random.Generator
+) -> Float[ndarray, "n 3"]:
+    """Points on the table about `target` to look at."""
+    return target + np.column_stack([rng.uniform(-spread, spread, (count, 2)), rng.uniform(0, 0.05, count)])
+
+
+def _varied(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    views = _VIEWS[np.arange(count) % len(_VIEWS)]
+    azimuth, elevation, distance, roll = (views + rng.uniform(-1, 1, (count, 4)) * (12, 4, 0.04, 15)).T
+    return _look_at(_aims(count, target, 0.04, rng), azimuth, elevation, distance, roll)
+
+
+def _two(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    return _varied(2, target, gripper_from_camera, rng)
+
+
+def _orbit(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    azimuth = 180 + np.linspace(-100, 100, count) + rng.uniform(-5, 5, count)
+    elevation, roll = rng.uniform(45, 75, count), rng.uniform(-40, 40, count)
+    return _look_at(np.tile(target, (count, 1)), azimuth, elevation, np.full(count, 0.5), roll)
+
+
+def _one_axis(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    turns = np.radians(np.linspace(-80, 80, count) + rng.uniform(-4, 4, count))
+    start = _look_at(target[None], *np.array([[180.0], [52.0], [0.55], [rng.uniform(-15, 15)]]))[0]
+    about_target = transform(np.eye(3), target)
+    turned = transform(rotation_exp(turns[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
+    return about_target @ turned @ inverse(about_target) @ start
+
+
+def _translation(
+    count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator
+) -> Cameras:
+    start = _look_at(target[None], *np.array([[180.0], [65.0], [0.55], [rng.uniform(-20, 20)]]))
+    rotation = np.tile(start[:, :3, :3], (count, 1, 1))
+    return _facing(_aims(count, target, 0.12, rng), rotation, rng.uniform(0.42, 0.68, count))
+
+
+def _planar(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    down = np.diag([1.0, -1.0, -1.0])
+    yaw = np.radians(np.linspace(-70, 70, count) + rng.uniform(-5, 5, count))
+    rotation = (
+        rotation_exp(rng.permutation(yaw)[:, None] * [0.0, 0.0, 1.0]) @ down @ gripper_from_camera[:3, :3]
+    )
+    return _facing(_aims(count, target, 0.08, rng), rotation, rng.uniform(0.42, 0.68, count))
+
+
+def _pivot(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
+    start = _look_at(target[None], *np.array([[180.0], [75.0], [0.5], [rng.uniform(-20, 20)]]))[0]
+    tool_in_gripper = np.array([0.0, 0.0, 0.2])
+    base_from_gripper = start @ inverse(gripper_from_camera)
+    about_tool = transform(np.eye(3), base_from_gripper[:3, :3] @ tool_in_gripper + base_from_gripper[:3, 3])
+    return about_tool @ transform(_tilts(count, 20, 60, rng), np.zeros(3)) @ inverse(about_tool) @ start
+
+
+def _camera_centre(
+    count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator
+) -> Cameras:
+    start = _look_at(target[None], *np.array([[180.0], [75.0], [0.6], [rng.uniform(-20, 20)]]))[0]
+    return transform(_tilts(count, 12, 60, rng) @ start[:3, :3], start[:3, 3])
+
+
+def _tilts(count: int, tilt_deg: float, yaw_deg: float, rng: np.random.Generator) -> Float[ndarray, "n 3 3"]:
+    """Rotations about level axes all around by up to `tilt_deg`, after yaw by up to `yaw_deg`."""
+    toward = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1)) / count
+    tilt = np.radians(rng.uniform(0.5, 1.0, count) * tilt_deg)
+    yaw = np.radians(rng.uniform(-yaw_deg, yaw_deg, count))
+    level = np.stack([np.cos(toward), np.sin(toward), 0 * toward], -1)
+    return rotation_exp(tilt[:, None] * level) @ rotation_exp(yaw[:, None] * [0.0, 0.0, 1.0])
+
+
+_PATTERNS: dict[Pattern, Callable[[int, ndarray, ndarray, np.random.Generator], Cameras]] = {
+    "varied": _varied,
+    "orbit": _orbit,
+    "translation": _translation,
+    "one-axis": _one_axis,
+    "planar": _planar,
+    "pivot": _pivot,
+    "camera-centre": _camera_centre,
+    "two": _two,
+}

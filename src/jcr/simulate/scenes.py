@@ -1,0 +1,128 @@
+"""Scenes: a table with objects on it, made from a seed; and the MJCF that MuJoCo renders."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.geometry import transform
+from jcr.simulate import textures
+from jcr.simulate.meshes import box
+from jcr.simulate.objects import CATALOGUE, Part, TableObject
+
+SceneName = Literal["tabletop", "light8", "light7", "dark", "measuring"]
+TableName = Literal["light", "dark"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What stands on which table."""
+
+    objects: tuple[str, ...]
+    table: TableName
+    plain_table: bool
+    """A low-texture table top; otherwise wood."""
+
+
+RECIPES: dict[SceneName, Recipe] = {
+    "tabletop": Recipe(("carton", "box", "book", "can", "mug", "tape", "apple", "block"), "light", False),
+    "light8": Recipe(("carton", "book", "can", "mug", "bottle", "bowl", "apple", "tape"), "light", True),
+    "light7": Recipe(("box", "mug", "can", "tape", "block", "bottle", "book"), "light", True),
+    "dark": Recipe(("carton", "bowl", "mug", "can", "apple", "block", "book"), "dark", True),
+    "measuring": Recipe(("tape", "box", "mug", "toolbox"), "light", True),
+}
+
+_TABLE_SIZE = (0.95, 1.2, 0.04)
+_TEXEL_M = 0.0005
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A table and what stands on it, in the robot's base frame."""
+
+    name: str
+    table: tuple[Part, ...]
+    """The table's surface in a frame at the middle of its top, z up."""
+    table_center_in_base: Float[ndarray, "3"]
+    """The middle of the group of objects, on the table top, in metres."""
+    objects: tuple[TableObject, ...]
+    light_in_base: Float[ndarray, "3"]
+    """Where the lamp hangs, in metres."""
+
+    @property
+    def table_height(self) -> float:
+        """z of the table top in the base frame, in metres."""
+        return float(self.table_center_in_base[2])
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name per label: 0 is what is no part of the scene, 1 the table, then the objects."""
+        return ("none", "table", *(thing.name for thing in self.objects))
+
+    @property
+    def workspace_in_base(self) -> Float[ndarray, "2 3"]:
+        """Lowest and highest corner of the box a map should cover, in metres."""
+        return self.table_center_in_base + np.array([[-0.36, -0.40, -0.03], [0.36, 0.40, 0.30]])
+
+
+def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Scene:
+    """The scene of that name and seed; `table` overrides the recipe's light or dark table top."""
+    # One stream a matter: a change in the textures must not move the objects.
+    layout, looks, lamp = (np.random.default_rng([seed, stream]) for stream in (1, 2, 3))
+    recipe = RECIPES[name]
+    center = np.array([layout.uniform(0.46, 0.52), layout.uniform(-0.03, 0.03), layout.uniform(-0.05, 0.08)])
+    things = [CATALOGUE[thing](looks) for thing in recipe.objects]
+    top = _table_top(looks, table or recipe.table, recipe.plain_table)
+    body = Part(box(_TABLE_SIZE, ("+x", "-x", "+y", "-y", "-z")), (0.45, 0.42, 0.38))
+    parts = tuple(replace(part, mesh=part.mesh.moved((0, 0, -_TABLE_SIZE[2]))) for part in (top, body))
+    light = center + [lamp.uniform(-0.7, 0.3), lamp.uniform(-0.6, 0.6), lamp.uniform(1.4, 1.8)]
+    return Scene(name, parts, center, _placed(layout, things, center), light)
+
+
+def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:
+    shape = round(_TABLE_SIZE[1] / _TEXEL_M), round(_TABLE_SIZE[0] / _TEXEL_M)
+    if plain:
+        color = (0.80, 0.79, 0.76) if table == "light" else (0.16, 0.16, 0.17)
+        texture = textures.laminate(rng, *shape, color, contrast=0.03 if table == "light" else 0.08)
+    else:
+        light, dark = (
+            ((0.80, 0.66, 0.48), (0.50, 0.34, 0.20))
+            if table == "light"
+            else ((0.36, 0.25, 0.17), (0.13, 0.08, 0.05))
+        )
+        texture = textures.wood(rng, *shape, light, dark)
+    r, g, b = texture.reshape(-1, 3).mean(0) / 255
+    return Part(box(_TABLE_SIZE, ("+z",)), (float(r), float(g), float(b)), texture, shine=0.0)
+
+
+def _placed(
+    rng: np.random.Generator, things: Sequence[TableObject], center_in_base: Float[ndarray, "3"]
+) -> tuple[TableObject, ...]:
+    """The objects, each turned at random, where the bounding circles of none overlap."""
+    gap, reach = 0.012, 0.2
+    order = sorted(range(len(things)), key=lambda k: -things[k].radius)
+    xy: dict[int, Float[ndarray, 2]] = {}
+    while len(xy) < len(things):
+        xy.clear()
+        # Every round that fails makes the table a little larger, so that this ends.
+        reach *= 1.03
+        for k in order:
+            for _ in range(60):
+                spot = rng.uniform(-1, 1, 2) * reach * (0.9, 1.15)
+                if all(np.linalg.norm(spot - xy[j]) > things[k].radius + things[j].radius + gap for j in xy):
+                    xy[k] = spot
+                    break
+            else:
+                break
+    middle = np.mean([xy[k] for k in range(len(things))], axis=0)
+    placed = []
+    for k, thing in enumerate(things):
+        turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
+        placed.append(
+            replace(thing, base_from_object=transform(turn, center_in_base + np.append(xy[k] - middle, 0.0)))
+        )
+    return tuple(placed)
