@@ -1,0 +1,398 @@
+"""DUSt3R's network (Wang et al., CVPR 2024): two images in, two pointmaps in the first camera's frame out.
+
+A ViT encodes each image on its own; two decoders read each other's tokens through cross-attention (CroCo v2,
+Weinzaepfel et al., ICCV 2023); a head per view turns tokens into a 3D point and a confidence per pixel,
+either linear or a dense prediction transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are those of
+the published checkpoints, because they are the keys of the state dict.
+
+Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+PATCH = 16
+Tokens = Float[Tensor, "b n c"]
+FeatureMap = Float[Tensor, "b c h w"]
+Rotary = Float[Tensor, "2 n 2 frequencies"]
+"""Cosines and sines per token, coordinate (y, x) and frequency."""
+
+
+class Features(NamedTuple):
+    """An encoded image: tokens (b,n,c) and the shape (rows, columns) of their grid."""
+
+    tokens: Tensor
+    grid: tuple[int, int]
+
+
+class Pointmap(NamedTuple):
+    """Points (b,h,w,3) in the first image's camera frame, up to scale, and their confidence (b,h,w) ≥ 1."""
+
+    points: Tensor
+    confidence: Tensor
+
+
+class Dust3r(nn.Module):
+    """The network, built from the fields of a published configuration.
+
+    Raises ValueError for a configuration that this network does not cover.
+    """
+
+    def __init__(
+        self,
+        *,
+        enc_embed_dim: int = 768,
+        enc_depth: int = 12,
+        enc_num_heads: int = 12,
+        dec_embed_dim: int = 512,
+        dec_depth: int = 8,
+        dec_num_heads: int = 16,
+        head_type: str = "linear",
+        pos_embed: str = "RoPE100",
+        mlp_ratio: float = 4.0,
+        patch_size: int = PATCH,
+        output_mode: str = "pts3d",
+        depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf")),
+        conf_mode: Sequence[object] = ("exp", 1, float("inf")),
+        img_size: object = None,
+        patch_embed_cls: str = "PatchEmbedDust3R",
+        landscape_only: bool = False,
+        freeze: str = "none",
+    ) -> None:
+        """The last four say how the published network was trained and change nothing here."""
+        super().__init__()
+        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", pos_embed)
+        expected = {
+            "pos_embed": (pos_embed, frequency, "RoPE100"),
+            "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
+            "patch_size": (patch_size, patch_size == PATCH, PATCH),
+            "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
+            "depth_mode": (
+                depth_mode,
+                list(depth_mode) == ["exp", -float("inf"), float("inf")],
+                "exp, unbounded",
+            ),
+            "conf_mode": (conf_mode, list(conf_mode) == ["exp", 1, float("inf")], "exp from 1"),
+            "dec_depth": (dec_depth, head_type == "linear" or dec_depth > 9, "over 9 with a dpt head"),
+        }
+        for name, (value, known, cure) in expected.items():
+            if not known:
+                raise ValueError(f"{name} = {value!r} is not covered; it must be {cure}")
+        assert frequency is not None
+        self.rope_base = float(frequency[1])
+        self.head_dims = (enc_embed_dim // enc_num_heads, dec_embed_dim // dec_num_heads)
+        self.mixed_precision: bool | None = None
+        """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
+
+        self.patch_embed = PatchEmbed(enc_embed_dim)
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_embed_dim))  # only its pre-training used it
+        self.enc_blocks = nn.ModuleList(
+            EncoderBlock(enc_embed_dim, enc_num_heads, mlp_ratio) for _ in range(enc_depth)
+        )
+        self.enc_norm = nn.LayerNorm(enc_embed_dim, eps=1e-6)
+        self.decoder_embed = nn.Linear(enc_embed_dim, dec_embed_dim)
+        self.dec_blocks, self.dec_blocks2 = (
+            nn.ModuleList(DecoderBlock(dec_embed_dim, dec_num_heads, mlp_ratio) for _ in range(dec_depth))
+            for _ in range(2)
+        )
+        self.dec_norm = nn.LayerNorm(dec_embed_dim, eps=1e-6)
+        head = LinearHead if head_type == "linear" else DptHead
+        self.downstream_head1 = head(enc_embed_dim, dec_embed_dim, dec_depth)
+        self.downstream_head2 = head(enc_embed_dim, dec_embed_dim, dec_depth)
+
+    def forward(
+        self,
+        image1: Float[Tensor, "b 3 h w"],
+        image2: Float[Tensor, "b 3 h2 w2"],
+        true_shape1: Int[Tensor, "b 2"] | None = None,
+        true_shape2: Int[Tensor, "b 2"] | None = None,
+    ) -> tuple[Pointmap, Pointmap]:
+        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16.
+
+        A row whose true (height, width) is the transpose of the tensor's is a portrait image that was laid
+        down to batch it with landscape ones; it is stood up for the network, its pointmap laid down again.
+        """
+        if true_shape1 is None and true_shape2 is None:
+            return self.decode(self.encode(image1), self.encode(image2))
+        lying = torch.stack([_lying(image1, true_shape1), _lying(image2, true_shape2)], 1)
+        view1, view2 = (
+            Pointmap(image.new_empty(*image[:, 0].shape, 3), torch.empty_like(image[:, 0]))
+            for image in (image1, image2)
+        )
+        for lies1, lies2 in lying.unique(dim=0).tolist():
+            rows = (lying == torch.tensor([lies1, lies2], device=lying.device)).all(1).nonzero()[:, 0]
+            features1 = self.encode(image1[rows].mT if lies1 else image1[rows])
+            features2 = self.encode(image2[rows].mT if lies2 else image2[rows])
+            part1, part2 = self.decode(features1, features2)
+            for view, part, lies in ((view1, part1, lies1), (view2, part2, lies2)):
+                view.points[rows] = part.points.transpose(1, 2) if lies else part.points
+                view.confidence[rows] = part.confidence.mT if lies else part.confidence
+        return view1, view2
+
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Features:
+        """Tokens of images in [-1, 1]; each image needs this once, however many pairs it is in."""
+        if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
+            raise ValueError(
+                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
+            )
+        with self._autocast(images):
+            grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
+            rotary = rotary_embedding(grid_positions(grid, images.device), self.head_dims[0], self.rope_base)
+            # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
+            x = self.patch_embed(images).float()
+            for block in self.enc_blocks:
+                x = block(x, rotary)
+            return Features(self.enc_norm(x), grid)
+
+    def decode(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
+        """Pointmaps of both images in the first one's camera frame; (1, 2) does not give (2, 1)."""
+        with self._autocast(features1.tokens):
+            layers1, layers2 = self.decoder_layers(features1, features2)
+            return (
+                self.downstream_head1(layers1, features1.grid),
+                self.downstream_head2(layers2, features2.grid),
+            )
+
+    def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
+        """Per view: the encoder's tokens, then those after each decoder block, the last ones normalised."""
+        rotary1, rotary2 = (
+            rotary_embedding(grid_positions(f.grid, f.tokens.device), self.head_dims[1], self.rope_base)
+            for f in (features1, features2)
+        )
+        x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
+        layers1, layers2 = [features1.tokens], [features2.tokens]
+        for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
+            x1, x2 = block1(x1, x2, rotary1, rotary2), block2(x2, x1, rotary2, rotary1)
+            layers1.append(x1)
+            layers2.append(x2)
+        layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
+        return layers1, layers2
+
+    def _autocast(self, like: Tensor) -> torch.autocast:
+        enabled = like.is_cuda if self.mixed_precision is None else self.mixed_precision
+        return torch.autocast(like.device.type, torch.bfloat16, enabled=enabled)
+
+
+def grid_positions(grid: tuple[int, int], device: torch.device) -> Int[Tensor, "n 2"]:
+    """Row and column of each token, row by row."""
+    rows, columns = (torch.arange(size, device=device) for size in grid)
+    return torch.cartesian_prod(rows, columns)
+
+
+def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -> Rotary:
+    """Cosines and sines of position · base^(−2k/D), D = head_dim/2 (RoPE, Su et al. 2021, per axis)."""
+    per_axis = head_dim // 2
+    exponent = torch.arange(0, per_axis, 2, device=position.device).float() / per_axis
+    angle = position[..., None] * base**-exponent
+    return torch.stack([angle.cos(), angle.sin()])
+
+
+def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b heads n d"]:
+    """Turn queries or keys by their position: the first half of a head's channels by y, the second by x."""
+    cos, sin = rotary
+    a, b = x.unflatten(-1, (2, 2, -1)).unbind(-2)
+    return torch.stack([a * cos - b * sin, b * cos + a * sin], -2).flatten(-3).to(x.dtype)
+
+
+class PatchEmbed(nn.Module):
+    """A token per 16x16 patch."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
+
+    def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
+        return self.proj(images).flatten(2).mT
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention with rotary positions."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
+        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        out = F.scaled_dot_product_attention(rotate(q, rotary), rotate(k, rotary), v)
+        return self.proj(out.transpose(1, 2).flatten(2))
+
+
+class CrossAttention(nn.Module):
+    """Multi-head attention of one image's tokens to the other's."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.projq, self.projk, self.projv, self.proj = (nn.Linear(dim, dim) for _ in range(4))
+
+    def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
+        q, k, v = (
+            project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for project, tokens in ((self.projq, x), (self.projk, y), (self.projv, y))
+        )
+        out = F.scaled_dot_product_attention(rotate(q, rotary_x), rotate(k, rotary_y), v)
+        return self.proj(out.transpose(1, 2).flatten(2))
+
+
+class Mlp(nn.Module):
+    def __init__(self, dim: int, ratio: float) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, int(dim * ratio))
+        self.fc2 = nn.Linear(int(dim * ratio), dim)
+
+    def forward(self, x: Tokens) -> Tokens:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class EncoderBlock(nn.Module):
+    def __init__(self, dim: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = (nn.LayerNorm(dim, eps=1e-6) for _ in range(2))
+        self.attn = Attention(dim, heads)
+        self.mlp = Mlp(dim, mlp_ratio)
+
+    def forward(self, x: Tokens, rotary: Rotary) -> Tokens:
+        x = x + self.attn(self.norm1(x), rotary)
+        return x + self.mlp(self.norm2(x))
+
+
+class DecoderBlock(nn.Module):
+    def __init__(self, dim: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.norm1, self.norm2, self.norm3, self.norm_y = (nn.LayerNorm(dim, eps=1e-6) for _ in range(4))
+        self.attn = Attention(dim, heads)
+        self.cross_attn = CrossAttention(dim, heads)
+        self.mlp = Mlp(dim, mlp_ratio)
+
+    def forward(self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary) -> Tokens:
+        x = x + self.attn(self.norm1(x), rotary_x)
+        x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
+        return x + self.mlp(self.norm3(x))
+
+
+def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
+    """Points and confidence from a head's four channels: the length d of xyz becomes exp(d) − 1."""
+    xyz, c = raw.float().permute(0, 2, 3, 1).split([3, 1], -1)
+    length = xyz.norm(dim=-1, keepdim=True)
+    return Pointmap(xyz * (length.expm1() / length.clamp(min=1e-8)), 1 + c[..., 0].exp())
+
+
+class LinearHead(nn.Module):
+    """A 16x16 block of raw outputs from each token of the last layer."""
+
+    def __init__(self, enc_dim: int, dec_dim: int, dec_depth: int) -> None:
+        super().__init__()
+        self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
+
+    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+        with torch.autocast(layers[-1].device.type, enabled=False):
+            tokens = self.proj(layers[-1].float())
+        return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
+
+
+class DptHead(nn.Module):
+    def __init__(self, enc_dim: int, dec_dim: int, dec_depth: int) -> None:
+        super().__init__()
+        self.layers = (0, dec_depth // 2, 3 * dec_depth // 4, dec_depth)
+        self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
+
+    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+        maps = [layers[layer].mT.unflatten(-1, grid) for layer in self.layers]
+        return pointmap(self.dpt(maps))
+
+
+class Dpt(nn.Module):
+    """Token grids of four depths to one map at pixel resolution, fused from the coarsest up."""
+
+    def __init__(self, dims: Sequence[int], width: int = 256) -> None:
+        super().__init__()
+        pyramid = (96, 192, 384, 768)
+        self.act_postprocess = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(dim, out, 1), *resize)
+            for dim, out, resize in zip(
+                dims,
+                pyramid,
+                (
+                    [nn.ConvTranspose2d(96, 96, 4, 4)],
+                    [nn.ConvTranspose2d(192, 192, 2, 2)],
+                    [],
+                    [nn.Conv2d(768, 768, 3, 2, 1)],
+                ),
+                strict=True,
+            )
+        )
+        self.scratch = Scratch(pyramid, width)
+        self.head = nn.Sequential(
+            nn.Conv2d(width, width // 2, 3, 1, 1),
+            nn.UpsamplingBilinear2d(scale_factor=2),
+            nn.Conv2d(width // 2, 128, 3, 1, 1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(128, 4, 1),
+        )
+
+    def forward(self, maps: list[Tensor]) -> FeatureMap:
+        levels = [resize(x) for resize, x in zip(self.act_postprocess, maps, strict=True)]
+        x = self.head[:4](self.scratch(levels))
+        # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head[4](x.float())
+
+
+class Scratch(nn.Module):
+    """Four levels, finest first, brought to one width and fused."""
+
+    def __init__(self, pyramid: Sequence[int], width: int) -> None:
+        super().__init__()
+        self.layer_rn = nn.ModuleList(nn.Conv2d(c, width, 3, 1, 1, bias=False) for c in pyramid)
+        # Checkpoints hold the four convolutions under a second name too.
+        self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = self.layer_rn
+        self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
+
+    def forward(self, levels: list[Tensor]) -> FeatureMap:
+        level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
+        # Of an odd grid the stride-2 level comes out a row or column too large.
+        x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
+        return self.refinenet1(self.refinenet2(self.refinenet3(x, level3), level2), level1)
+
+
+class Fusion(nn.Module):
+    """Add a finer level to a coarser one, refine, and double the resolution."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.resConfUnit1, self.resConfUnit2 = ResidualUnit(width), ResidualUnit(width)
+        self.out_conv = nn.Conv2d(width, width, 1)
+
+    def forward(self, x: FeatureMap, finer: FeatureMap | None = None) -> FeatureMap:
+        if finer is not None:
+            x = x + self.resConfUnit1(finer)
+        # A 1x1 convolution commutes with bilinear upsampling; before it, it costs a quarter.
+        x = self.out_conv(self.resConfUnit2(x))
+        return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+
+
+class ResidualUnit(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, 1, 1)
+        self.conv2 = nn.Conv2d(width, width, 3, 1, 1)
+
+    def forward(self, x: FeatureMap) -> FeatureMap:
+        return x + self.conv2(F.relu_(self.conv1(F.relu(x))))
+
+
+def _lying(image: Tensor, true_shape: Tensor | None) -> Tensor:
+    """Per row: whether the image lies on its side in the tensor."""
+    height, width = image.shape[-2:]
+    if true_shape is None or height == width:
+        return torch.zeros(len(image), dtype=torch.bool, device=image.device)
+    return (true_shape[:, 0] == width).to(image.device)
