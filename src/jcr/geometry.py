@@ -9,9 +9,14 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.errors import InputError
+
 Transforms = Float[ndarray, "*batch 4 4"]
 Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
+
+RIGID_TOLERANCE = 1e-3
+"""Largest entry of RᵀR − I accepted as rounding; transforms printed with four digits pass."""
 
 
 def rotation_exp(rotation_vector: Vectors) -> Rotations:
@@ -95,3 +100,29 @@ def fit_similarity(
 def rotation_between_deg(a: Rotations, b: Rotations) -> Float[ndarray, "*batch"]:
     """Angle in degrees between two (stacks of) rotations."""
     return np.degrees(rotation_angle(np.swapaxes(a, -1, -2) @ b))
+
+
+def require_rigid(matrix: Float[ndarray, "4 4"], where: str) -> Float[ndarray, "4 4"]:
+    """The matrix with its rotation made exact; InputError saying how far from rigid it is, and why.
+
+    `where` begins the message: the file and frame, or the argument, that the matrix came from.
+    """
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: holds NaN or infinity; record that pose again or drop the frame")
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
+        transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], atol=1e-9)
+        hint = "it is transposed (column-major): transpose it" if transposed else "write 0 0 0 1"
+        raise InputError(f"{where}: its last row is {np.round(matrix[3], 4).tolist()}, not 0 0 0 1; {hint}")
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if off > RIGID_TOLERANCE:
+        size = abs(determinant) ** (1 / 3)
+        scaled = size > 0 and np.abs(rotation.T @ rotation / size**2 - np.eye(3)).max() < RIGID_TOLERANCE
+        hint = f"it is scaled by {size:.4g}: divide it out" if scaled else "check units, order and angles"
+        raise InputError(f"{where}: no rotation, RᵀR differs from the identity by {off:.2g}; {hint}")
+    if determinant < 0:
+        raise InputError(
+            f"{where}: a reflection (determinant {determinant:.3f}); an axis has its sign flipped"
+        )
+    return transform(nearest_rotation(rotation), matrix[:3, 3])

@@ -64,9 +64,9 @@ def _rotations(
     candidates.append(nearest_rotation(np.einsum("nm,nmi,nmj->ij", pair_weights, a, b)))
 
     def polish(rotation: Rotation3) -> tuple[float, Rotation3, Rotation3]:
-        # The two best rotations given each other, in turn: monotone, and the linear start is within a degree.
+        # The two best rotations given each other, in turn: monotone; a likelihood fit finishes the work.
         base = rotation
-        for _ in range(20):
+        for _ in range(5):
             base = nearest_rotation(np.einsum("n,nij,nkj->ik", weights, gripper @ rotation, camera))
             before = rotation
             rotation = nearest_rotation(np.einsum("n,nji,njk->ik", weights, gripper, base @ camera))
@@ -85,7 +85,7 @@ def _translations(
     base_rotation: Rotation3,
     weights: Weights,
 ) -> tuple[Float[ndarray, "3"], float, Float[ndarray, "3"]]:
-    """t_X, λ and the translation of base_from_recon from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
+    """t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
 
     The paper prints t_c^e for the camera's translation in its d_i(λ); t_C is meant.
     """

@@ -11,13 +11,12 @@ from numpy import ndarray
 
 from jcr.capture.images import read_image
 from jcr.errors import InputError
+from jcr.geometry import require_rigid
 from jcr.records import Capture, Intrinsics
 
 MIN_FRAMES = 3
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
-RIGID_TOLERANCE = 1e-3
-"""Largest entry of RᵀR − I accepted; poses printed with four digits pass."""
 
 
 def read_capture(path: str | Path) -> Capture:
@@ -93,28 +92,7 @@ def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
         raise InputError(f"{where}: not a 4x4 matrix of numbers; write four rows of four") from None
     if matrix.shape != (4, 4):
         raise InputError(f"{where}: shape {matrix.shape}, not 4x4; write four rows of four numbers")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where}: holds NaN or infinity; record that pose again or drop the frame")
-    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
-        transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], atol=1e-9)
-        hint = "it is transposed (column-major): transpose it" if transposed else "write 0 0 0 1"
-        raise InputError(f"{where}: its last row is {np.round(matrix[3], 4).tolist()}, not 0 0 0 1; {hint}")
-    rotation = matrix[:3, :3]
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if off > RIGID_TOLERANCE:
-        size = abs(determinant) ** (1 / 3)
-        scaled = size > 0 and np.abs(rotation.T @ rotation / size**2 - np.eye(3)).max() < RIGID_TOLERANCE
-        hint = f"it is scaled by {size:.4g}: divide it out" if scaled else "check units, order and angles"
-        raise InputError(f"{where}: no rotation, RᵀR differs from the identity by {off:.2g}; {hint}")
-    if determinant < 0:
-        raise InputError(
-            f"{where}: a reflection (determinant {determinant:.3f}); an axis has its sign flipped"
-        )
-    # Poses printed with few digits are rigid up to rounding; everything later may rely on exact rotations.
-    u, _, vt = np.linalg.svd(rotation)
-    matrix[:3, :3] = u @ vt
-    return matrix
+    return require_rigid(matrix, where)
 
 
 def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:

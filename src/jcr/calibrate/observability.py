@@ -1,0 +1,171 @@
+"""Which parts of the calibration the motions can see, in words, with the cure.
+
+The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
+the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
+well as it can; rotations count by an arm of 0.3 m, scale by the spread of the camera centres. It is about 0.4
+for general motion, and the sine of the deviation for a nearly degenerate one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.calibrate.pose_fit import Cues, Poses
+from jcr.geometry import skew
+from jcr.records import Observability
+
+ARM = 0.3
+"""Metres per radian."""
+MIN_SPREAD = 0.1
+"""Metres; camera centres closer together than this say little of scale."""
+WEAK = 0.06
+"""Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
+EXACT = 0.005
+"""Excitation below which no better measurement would help."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Principal directions of what the motions see, least seen first."""
+
+    value: Float[ndarray, "7"]
+    direction: Float[ndarray, "7 7"]
+    """Rows; unit vectors of (translation in m, rotation times ARM, log scale times `spread`)."""
+    spread: float
+    """Root mean square distance (m) of the camera centres from their mean, at least MIN_SPREAD."""
+
+
+def excitation(
+    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"] | None, cues: Cues | None = None
+) -> Excitation:
+    """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
+    n = len(base_from_gripper)
+    offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
+    # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
+    offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
+    rotation = base_from_gripper[:, :3, :3]
+    centers = base_from_gripper[:, :3, 3] + rotation @ offset
+    arm = centers - centers.mean(0)
+    spread = max(float(np.sqrt((arm**2).sum(1).mean())), MIN_SPREAD)
+    j = np.zeros((n, 6, 13))
+    j[:, :3, 0:3] = -rotation
+    j[:, :3, 3:6] = -rotation @ skew(offset) / ARM
+    j[:, :3, 6] = arm / spread
+    j[:, :3, 7:10] = np.eye(3)
+    j[:, :3, 10:] = -skew(arm - rotation @ offset) / ARM
+    j[:, 3:, 3:6] = -np.eye(3)
+    j[:, 3:, 10:] = np.swapaxes(rotation, 1, 2)
+    hessian = np.einsum("nij,nik->jk", j, j) / n
+    seen = hessian[:7, :7] - hessian[:7, 7:] @ np.linalg.pinv(hessian[7:, 7:], rcond=1e-12) @ hessian[7:, :7]
+    if cues is not None and cues.scale is not None:
+        seen[6, 6] += 1.0
+    if cues is not None and cues.offset is not None:
+        seen[:3, :3] += np.outer(cues.offset[0], cues.offset[0])
+    squared, vectors = np.linalg.eigh(seen)
+    return Excitation(np.sqrt(np.maximum(squared, 0.0)), vectors.T, spread)
+
+
+def observability(
+    base_from_gripper: Poses,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    cues: Cues | None = None,
+) -> Observability:
+    """The unseen directions named, one cure each; X, where known, tells a look-at orbit from a fixed tool."""
+    n = len(base_from_gripper)
+    found = excitation(base_from_gripper, gripper_from_camera, cues)
+    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
+    threshold = WEAK * min(1.0, max(n - 2, 0.5) / 4)
+    unseen = found.value < threshold
+    if n == 2:
+        return Observability(
+            False,
+            ("offset along, and turn about, the one axis that two images share",),
+            ("add one image or more, turned by 20° or more about another axis",),
+        )
+    if not unseen.any():
+        return Observability(True, (), ())
+    grade = "" if found.value[0] < EXACT * min(1.0, max(n - 2, 0.5) / 4) else "nearly unseen: "
+    names, advice = _explain(base_from_gripper, gripper_from_camera, found, unseen)
+    return Observability(False, tuple(grade + name for name in names), advice)
+
+
+def _explain(
+    base_from_gripper: Poses,
+    gripper_from_camera: Float[ndarray, "4 4"] | None,
+    found: Excitation,
+    unseen: ndarray,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    rotation = base_from_gripper[:, :3, :3]
+    # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
+    u, length, vt = np.linalg.svd(rotation.mean(0))
+    still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
+    parts = np.linalg.norm(found.direction[unseen][:, :3], axis=0), np.abs(found.direction[unseen])
+    sees_scale = parts[1][:, 6].max() < 0.2
+    if still.all():
+        return (
+            "offset of the camera on the gripper in x, y and z: the gripper never rotates (pure translation)",
+        ), ("tilt the wrist by 20° or more, about two different axes, in at least three images",)
+    if still.any():
+        axis = u[:, 0]
+        name = f"offset along {_axis_words(axis, 'base')}: all rotations are about it"
+        cure = f"tilt the wrist by 20° or more away from {_axis_words(axis, 'base')} in two images"
+        if unseen.sum() == 1 and sees_scale:
+            return (f"{name} (planar or SCARA motion)",), (
+                cure + ", or give the camera's known height along it",
+            )
+        return (
+            name + " (one fixed axis)",
+            "scale: the camera moves on circles about one axis only",
+            f"turn of the camera about {_axis_words(axis, 'base')}",
+        )[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height between images")
+    if not sees_scale:
+        return _scale_words(base_from_gripper, gripper_from_camera)
+    weakest = found.direction[0]
+    what = "offset" if np.linalg.norm(weakest[:3]) > np.linalg.norm(weakest[3:6]) else "turn"
+    axis = weakest[:3] if what == "offset" else weakest[3:6]
+    return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
+        "turn the wrist more, about axes at right angles to each other, in three or more images",
+    )
+
+
+def _scale_words(
+    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"] | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Scale is lost when a point fixed to the gripper stays where it is: which point, and what moves it."""
+    point = fixed_point(base_from_gripper)
+    cure = "take two or more images 20 % nearer to or farther from that point"
+    if gripper_from_camera is None:
+        return (
+            f"scale: all views turn about one point {np.linalg.norm(point):.2f} m from the gripper's origin",
+        ), (cure,)
+    to_point = point - gripper_from_camera[:3, 3]
+    radius = float(np.linalg.norm(to_point))
+    optical_axis = gripper_from_camera[:3, 2]
+    if radius < 0.03:
+        return ("scale: the camera only turns about its own centre",), (
+            "move the camera sideways by 10 cm or more between images",
+        )
+    if to_point @ optical_axis > np.cos(np.radians(15)) * radius:
+        return (
+            f"scale and the offset along the optical axis: a look-at orbit at a constant {radius:.2f} m",
+        ), (cure,)
+    where = ", ".join(f"{1e3 * x:.0f}" for x in point)
+    return (f"scale: every view turns about one tool point fixed at ({where}) mm in the gripper frame",), (
+        "move that point too: take two or more images with it 10 cm away from where it was",
+    )
+
+
+def fixed_point(base_from_gripper: Poses) -> Float[ndarray, "3"]:
+    """The point in the gripper frame that moves least in the base, by least squares."""
+    rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
+    rows = (rotation - rotation.mean(0)).reshape(-1, 3)
+    return np.linalg.lstsq(rows, -(position - position.mean(0)).ravel(), rcond=1e-9)[0]
+
+
+def _axis_words(axis: Float[ndarray, "3"], frame: str) -> str:
+    k = int(np.abs(axis).argmax())
+    if abs(axis[k]) > np.cos(np.radians(10)):
+        return f"the {frame}'s {'xyz'[k]} axis"
+    return f"the axis ({', '.join(f'{x:.2f}' for x in axis)}) of the {frame}"
