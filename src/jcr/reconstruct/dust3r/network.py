@@ -339,7 +339,7 @@ class Dpt(nn.Module):
             nn.Conv2d(128, 4, 1),
         )
 
-    def forward(self, maps: list[Tensor]) -> FeatureMap:
+    def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
         levels = [resize(x) for resize, x in zip(self.act_postprocess, maps, strict=True)]
         x = self.head[:4](self.scratch(levels))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
@@ -372,7 +372,7 @@ class Fusion(nn.Module):
         self.resConfUnit1, self.resConfUnit2 = ResidualUnit(width), ResidualUnit(width)
         self.out_conv = nn.Conv2d(width, width, 1)
 
-    def forward(self, x: FeatureMap, finer: FeatureMap | None = None) -> FeatureMap:
+    def forward(self, x: FeatureMap, finer: FeatureMap | None = None) -> Float[Tensor, "b c 2*h 2*w"]:
         if finer is not None:
             x = x + self.resConfUnit1(finer)
         # A 1x1 convolution commutes with bilinear upsampling; before it, it costs a quarter.
