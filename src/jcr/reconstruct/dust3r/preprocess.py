@@ -5,23 +5,26 @@ edges stay its outer edges, which is what Pillow's resize does); a crop subtract
 half pixel shifts the principal point by (1 − s)/2 pixels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
+from PIL import Image
 
-from jcr.records import Intrinsics
+from jcr.capture.images import read_image
+from jcr.reconstruct.lens import NO_DISTORTION, distort, fold_distance_px, pinhole_inside, undistort_image
+from jcr.records import Capture, Intrinsics
 
 PATCH = 16
 
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Where the network's pixels lie in the original image: resized to `resized_size`, then cropped."""
+    """Where the network's pixels lie in an undistorted image: resized to `resized_size`, then cropped."""
 
     original_size: tuple[int, int]
-    """Width, height in pixels, after EXIF rotation."""
+    """Width, height in pixels, upright and undistorted."""
     resized_size: tuple[int, int]
     crop_corner: tuple[int, int]
     """Left, top of the crop in the resized image."""
@@ -76,3 +79,62 @@ def image_grid(original_size: tuple[int, int], long_edge: int = 512) -> ImageGri
             half = (half[0], 3 * half[0] // 4)
     corner = (center[0] - half[0], center[1] - half[1])
     return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
+
+
+@dataclass(frozen=True)
+class PreparedImages:
+    """A capture's images as the network reads them."""
+
+    colors: UInt8[ndarray, "n h w 3"]
+    grid: ImageGrid
+    lens: Intrinsics | None
+    """Of the capture's images; None: unknown."""
+    pinhole: Intrinsics | None
+    """Of the undistorted images that `grid` resizes; None: unknown."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Pinhole of the network's grid; None: unknown."""
+        return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
+
+    def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the network's grid in the capture's images, distorted as the lens made them."""
+        undistorted_px = self.grid.original_from_grid(x_px)
+        if self.pinhole is None or self.lens is None or self.lens.distortion == NO_DISTORTION:
+            return undistorted_px
+        k = self.pinhole
+        return distort(self.lens, (undistorted_px - [k.cx, k.cy]) / [k.fx, k.fy])
+
+
+def prepare_images(capture: Capture, long_edge: int = 512) -> PreparedImages:
+    """Read, undistort where the lens is known, resize and crop the images of a capture.
+
+    Raises InputError for an image that cannot be read.
+    """
+    lens, notes = capture.intrinsics, []
+    if lens is not None and (fold := fold_distance_px(lens)) is not None:
+        lens = replace(lens, distortion=NO_DISTORTION)
+        notes.append(f"the stored distortion folds over at {fold:.0f} px from the centre: not used")
+    pinhole = lens
+    if lens is not None and lens.distortion != NO_DISTORTION:
+        pinhole = pinhole_inside(lens, max(lens.width, lens.height))
+    size = capture.image_size if pinhole is None else (pinhole.width, pinhole.height)
+    grid = image_grid(size, long_edge)
+    width, height = grid.size
+    colors = np.empty((len(capture), height, width, 3), np.uint8)
+    for row, name in enumerate(capture.images):
+        image = read_image(capture.folder / name)
+        if lens is not None and pinhole is not None and pinhole is not lens:
+            image = undistort_image(image, lens, pinhole)
+        colors[row] = resize_and_crop(image, grid)
+    return PreparedImages(colors, grid, lens, pinhole, tuple(notes))
+
+
+def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
+    """An image on the network's grid, by the published filters: Lanczos to shrink, bicubic to enlarge."""
+    shrinks = max(grid.original_size) > max(grid.resized_size)
+    filter_ = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
+    resized = Image.fromarray(image).resize(grid.resized_size, filter_)
+    left, top = grid.crop_corner
+    return np.asarray(resized)[top : top + grid.size[1], left : left + grid.size[0]]
