@@ -180,15 +180,18 @@ _READERS = {".pth": _read_pth, ".pt": _read_pth, ".safetensors": _read_safetenso
 
 
 def _parse_model(text: str) -> dict[str, object]:
-    """The keyword arguments of "Name(key=literal, ...)", inf being a literal; ValueError for all else."""
+    """The keyword arguments of "Name(key=literal, ...)", inf being a literal too; ValueError for all else."""
 
     class InfinityIsNumber(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.AST:
             return ast.Constant(math.inf) if node.id == "inf" else node
 
     call = ast.parse(text, mode="eval").body
-    if not isinstance(call, ast.Call) or call.args or any(keyword.arg is None for keyword in call.keywords):
-        raise ValueError(f"model = {text[:60]!r} is no call with keywords")
+    names = ("AsymmetricCroCo3DStereo", "AsymmetricMASt3R")
+    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id not in names:
+        raise ValueError(f"model = {text[:60]!r} is neither {' nor '.join(names)}")
+    if call.args or any(keyword.arg is None for keyword in call.keywords):
+        raise ValueError(f"model = {text[:60]!r} has arguments without a name")
     transformer = InfinityIsNumber()
     return {str(k.arg): ast.literal_eval(transformer.visit(k.value)) for k in call.keywords}
 

@@ -1,0 +1,201 @@
+"""Both checkpoint layouts, their faults, and pickles that must not run."""
+
+import argparse
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from jcr.errors import InputError
+from jcr.reconstruct.dust3r import weights
+from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.reconstruct.dust3r.weights import fingerprint, is_cached, load_weights
+
+CONFIG = {
+    "head_type": "dpt",
+    "enc_embed_dim": 32,
+    "enc_depth": 1,
+    "enc_num_heads": 2,
+    "dec_embed_dim": 32,
+    "dec_depth": 10,
+    "dec_num_heads": 2,
+}
+MODEL = (
+    "AsymmetricCroCo3DStereo(pos_embed='RoPE100', img_size=(512, 512), head_type='dpt', output_mode='pts3d', "
+    "depth_mode=('exp', -inf, inf), conf_mode=('exp', 1, inf), enc_embed_dim=32, enc_depth=1, "
+    "enc_num_heads=2, dec_embed_dim=32, dec_depth=10, dec_num_heads=2, landscape_only=False)"
+)
+
+
+@pytest.fixture(scope="module")
+def network() -> Dust3r:
+    torch.manual_seed(0)
+    return Dust3r(**CONFIG).eval()
+
+
+def write_pth(path: Path, network: Dust3r, model: str = MODEL, **tensors: torch.Tensor) -> Path:
+    state = {**network.state_dict(), **tensors}
+    torch.save({"args": argparse.Namespace(model=model, epochs=100), "model": state}, path)
+    return path
+
+
+def write_folder(folder: Path, network: Dust3r, config: dict[str, object] = CONFIG) -> Path:
+    # Published safetensors name a tied tensor once and write Infinity into their JSON.
+    state = {key: tensor for key, tensor in network.state_dict().items() if ".layer_rn." not in key}
+    folder.mkdir(exist_ok=True)
+    save_file(state, folder / "model.safetensors")
+    infinite = {"depth_mode": ["exp", -float("inf"), float("inf")], "conf_mode": ["exp", 1, float("inf")]}
+    (folder / "config.json").write_text(json.dumps({**config, **infinite, "freeze": "none"}))
+    return folder
+
+
+def assert_same_output(network: Dust3r, loaded: Dust3r) -> None:
+    image = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    with torch.inference_mode():
+        for ours, theirs in zip(network(image, image.flip(3)), loaded(image, image.flip(3)), strict=True):
+            torch.testing.assert_close(ours.points, theirs.points, rtol=1e-5, atol=1e-6)
+
+
+def test_every_layout_loads_to_the_same_network(
+    tmp_path: Path, network: Dust3r, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "folder", network)
+    pth = write_pth(tmp_path / "weights.pth", network)
+    for source in (folder, folder / "model.safetensors", pth):
+        loaded = load_weights(source)
+        assert_same_output(network, loaded.network)
+        assert fingerprint(loaded.network) == fingerprint(network)
+        assert not loaded.is_metric
+    load_weights(pth)
+    said = capsys.readouterr().err
+    assert said.count(str(pth)) == 1 and "licence" in said
+
+
+def test_a_second_decoder_that_is_not_stored_is_a_copy_of_the_first(tmp_path: Path, network: Dust3r) -> None:
+    state = {key: value for key, value in network.state_dict().items() if not key.startswith("dec_blocks2.")}
+    torch.save({"args": argparse.Namespace(model=MODEL), "model": state}, tmp_path / "croco.pth")
+    loaded = load_weights(tmp_path / "croco.pth").network
+    assert torch.equal(loaded.dec_blocks2[3].mlp.fc1.weight, network.dec_blocks[3].mlp.fc1.weight)
+
+
+def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: Dust3r) -> None:
+    model = MODEL.replace("AsymmetricCroCo3DStereo", "AsymmetricMASt3R").replace("'dpt'", "'catmlp+dpt'")
+    model = model.replace("'pts3d'", "'pts3d+desc24'").replace(")\n", "")[:-1] + ", two_confs=True)"
+    matching = {
+        f"downstream_head{head}.head_local_features.fc{layer}.{leaf}": torch.zeros(4)
+        for head in (1, 2)
+        for layer in (1, 2)
+        for leaf in ("weight", "bias")
+    }
+    loaded = load_weights(write_pth(tmp_path / "mast3r.pth", network, model, **matching))
+    assert loaded.is_metric
+    assert_same_output(network, loaded.network)
+
+
+class Trap:
+    """Unpickled by pickle.load, it creates a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("layout", ["pickle", "torch"])
+def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
+    sprung = tmp_path / "sprung"
+    content = {"args": argparse.Namespace(model=MODEL, trap=Trap(sprung)), "model": {}}
+    bad = tmp_path / "bad.pth"
+    if layout == "pickle":
+        bad.write_bytes(pickle.dumps(content))
+    else:
+        torch.save(content, bad)
+    with pytest.raises(InputError, match=r"bad\.pth: damaged, or holds code"):
+        load_weights(bad)
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "__import__('os').abort()",
+        "AsymmetricMASt3R(depth_mode=(lambda: 1)())",
+        "AsymmetricMASt3R(*[1])",
+        "AsymmetricMASt3R(" + "(" * 5000,
+        "os.abort",
+    ],
+)
+def test_the_model_string_is_read_and_never_evaluated(tmp_path: Path, network: Dust3r, model: str) -> None:
+    with pytest.raises(InputError, match="no checkpoint of DUSt3R"):
+        load_weights(write_pth(tmp_path / "weights.pth", network, model))
+
+
+def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, network: Dust3r) -> None:
+    def complaint(source: Path | str) -> str:
+        with pytest.raises(InputError) as caught:
+            load_weights(source)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert "no such weights" in complaint(tmp_path / "absent.pth")
+    folder = write_folder(tmp_path / "folder", network)
+    tensors = folder / "model.safetensors"
+    whole = tensors.read_bytes()
+    tensors.write_bytes(whole[: len(whole) // 2])
+    assert "damaged or no safetensors" in complaint(folder)
+    tensors.write_bytes(whole)
+    (folder / "config.json").write_text('{"enc_depth": ')
+    assert "no readable JSON" in complaint(folder)
+    (folder / "config.json").write_text(json.dumps({**CONFIG, "enc_depth": 2}))
+    assert "enc_blocks.1" in complaint(folder)
+    (folder / "config.json").write_text(json.dumps({**CONFIG, "num_classes": 1000}))
+    assert "num_classes" in complaint(folder)
+    (folder / "config.json").unlink()
+    assert "config.json belongs beside them" in complaint(folder)
+
+    pth = write_pth(tmp_path / "weights.pth", network)
+    pth.write_bytes(pth.read_bytes()[:-5000])
+    assert "damaged" in complaint(pth)
+    torch.save(network.state_dict(), pth)
+    assert "no checkpoint of DUSt3R" in complaint(pth)
+    write_pth(pth, network, foreign=torch.zeros(1))
+    assert "not of this network, foreign first" in complaint(pth)
+    write_pth(pth, network, enc_norm_weight=torch.zeros(1))
+    assert "enc_norm_weight" in complaint(pth)
+    write_pth(pth, network, **{"enc_norm.weight": torch.zeros(3)})
+    assert "enc_norm.weight is (3,), the configuration asks for (32,)" in complaint(pth)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "0 weights files" in complaint(empty)
+    (tmp_path / "image.png").touch()
+    assert "not .png" in complaint(tmp_path / "image.png")
+    write_pth(pth, network)
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="use --device cpu"):
+            load_weights(pth, "cuda")
+
+
+def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
+    tmp_path: Path, network: Dust3r, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import huggingface_hub.constants
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    hub_id = weights.CHECKPOINTS["dust3r"].hub_id
+    assert not is_cached(hub_id)
+    with pytest.raises(InputError, match="not in the cache and not to be had from the hub"):
+        load_weights(hub_id)
+    repository = tmp_path / f"models--{hub_id.replace('/', '--')}"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text("0" * 40)
+    (repository / "snapshots").mkdir()
+    write_folder(repository / "snapshots" / ("0" * 40), network)
+    assert is_cached(hub_id)
+    loaded = load_weights(hub_id)
+    assert "CC BY-NC-SA 4.0" in loaded.licence
+    assert_same_output(network, loaded.network)
