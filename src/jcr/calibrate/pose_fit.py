@@ -27,8 +27,14 @@ TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
 
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
 """So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
-NOISE_GUESS = (1e-4, np.radians(0.01))
-"""Counts as one observation of the robot's noise, so that a perfect fit does not claim a perfect robot."""
+NOISE_FLOOR = (2e-5, np.radians(0.002))
+"""m, rad; so that a perfect fit does not claim a perfect robot."""
+REACH = 0.45
+"""m. A joint's error shows in position as in orientation times the reach behind it: σ_t ≈ REACH · σ_r."""
+REACH_WEIGHT = 5.0
+"""That relation counts as so many observations. A lens that is slightly off disturbs positions more than
+orientations, and few images do not tell the two noises apart: without it, real captures trust positions too
+much."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +70,27 @@ class PoseFit:
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """Covariance in records.COVARIANCE_ORDER, widened for an estimated noise."""
-        return np.linalg.inv(self.hessian)[:7, :7] * widening(min(self.degrees_of_freedom))
+        return np.linalg.inv(self.hessian)[:7, :7] * widening(self.degrees_of_freedom)
 
 
-def widening(degrees_of_freedom: float) -> float:
-    """Factor on a 7×7 covariance whose variance was estimated with so many degrees of freedom.
+def widening(degrees_of_freedom: tuple[float, float]) -> float:
+    """Factor on a 7×7 covariance whose two variances were estimated with so many degrees of freedom.
 
     A squared Mahalanobis distance then follows 7·F(7, ν), not χ²(7); the factor makes the 95 % ellipsoid that
-    users draw from a covariance hold 95 %.
+    users draw from a covariance hold 95 %. The tie between the variances adds its own observations to ν.
     """
-    if np.isinf(degrees_of_freedom):
-        return 1.0
-    return float(7 * f.ppf(0.95, 7, degrees_of_freedom) / chi2.ppf(0.95, 7))
+    nu = sum(degrees_of_freedom) + 2 * REACH_WEIGHT
+    return 1.0 if np.isinf(nu) else float(7 * f.ppf(0.95, 7, nu) / chi2.ppf(0.95, 7))
+
+
+def robot_noise(
+    squares: tuple[float, float], degrees_of_freedom: tuple[float, float], before: tuple[float, float]
+) -> tuple[float, float]:
+    """σ_t and σ_r from sums of squared residuals (m², rad²), tied to each other by the arm's reach."""
+    weight = REACH_WEIGHT
+    sigma_t = np.sqrt((squares[0] + weight * (REACH * before[1]) ** 2) / (degrees_of_freedom[0] + weight))
+    sigma_r = np.sqrt((squares[1] + weight * (before[0] / REACH) ** 2) / (degrees_of_freedom[1] + weight))
+    return max(float(sigma_t), NOISE_FLOOR[0]), max(float(sigma_r), NOISE_FLOOR[1])
 
 
 def deleted_residuals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
@@ -110,10 +125,9 @@ def fit_poses(
                 max(3 * m - float((inverse_h * h_t).sum()) / sigma_t**2, 0.1),
                 max(3 * m - float((inverse_h * h_r).sum()) / sigma_r**2, 0.1),
             )
-            guess_t, guess_r = NOISE_GUESS
+            squares = float(weights @ (r_t**2).sum(1)), float(weights @ (r_r**2).sum(1))
             before = (sigma_t, sigma_r)
-            sigma_t = float(np.sqrt((weights @ (r_t**2).sum(1) + guess_t**2) / (dof[0] + 1)))
-            sigma_r = float(np.sqrt((weights @ (r_r**2).sum(1) + guess_r**2) / (dof[1] + 1)))
+            sigma_t, sigma_r = robot_noise(squares, dof, before)
             settled = abs(sigma_t / before[0] - 1) < 1e-6 and abs(sigma_r / before[1] - 1) < 1e-6
             hessian = h_t / sigma_t**2 + h_r / sigma_r**2 + prior_h
         else:
