@@ -1,8 +1,8 @@
 """Joint calibration and representation: a wrist camera's pictures to a calibrated camera and a map.
 
-    capture = jcr.read_capture("captures/table")
-    result = jcr.run(capture, "out/table")
-    scene = jcr.load_map("out/table")
+capture = jcr.read_capture("captures/table")
+result = jcr.run(capture, "out/table")
+scene = jcr.load_map("out/table")
 """
 
 from importlib import import_module
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jcr.errors import InputError, NotTrustedError
 
 if TYPE_CHECKING:
-    from jcr.calibrate.calibrate import solve_hand_eye
+    from jcr.calibrate.hand_eye import solve_hand_eye
     from jcr.capture.read import read_capture
     from jcr.pipeline import build_map, calibrate, run
     from jcr.represent.scene import load_map
@@ -21,7 +21,7 @@ __version__ = version("jcr")
 
 _ROOMS = {
     "read_capture": "jcr.capture.read",
-    "solve_hand_eye": "jcr.calibrate.calibrate",
+    "solve_hand_eye": "jcr.calibrate.hand_eye",
     "run": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",

@@ -159,6 +159,8 @@ class HandEye:
     held_out: HeldOut | None = None
     reasons: tuple[str | None, ...] = ()
     """Per pose: why it was rejected, None when used."""
+    reprojection_px: Float[ndarray, " n"] | None = None
+    """Per pose: median reprojection error after bundle adjustment; NaN where it took no part."""
 
 
 @dataclass(frozen=True)

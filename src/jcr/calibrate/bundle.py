@@ -55,9 +55,7 @@ class Adjusted:
     """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
     robot_hat: Float[ndarray, "m 6 6"]
     """Posterior covariance of those in units of the noise."""
-    image: Int[ndarray, " k"]
-    """Of each observation that was used."""
-    reprojection_px: Float[ndarray, " k"]
+    problem: "_Problem"
     iterations: int
 
 
@@ -185,7 +183,7 @@ def _minimise(
 
 
 def _seen_from(bundle: Bundle, problem: _Problem) -> tuple[ndarray, ndarray, ndarray]:
-    """Per observation, the point in the gripper, from the camera's centre in gripper axes, and in the camera."""
+    """Each observation's point in the gripper, from the camera's centre in gripper axes, and in the camera."""
     gripper = bundle.base_from_gripper[problem.image]
     from_gripper = bundle.points_in_base[problem.point] - gripper[:, :3, 3]
     in_gripper = np.einsum("kji,kj->ki", gripper[:, :3, :3], from_gripper)
@@ -382,9 +380,25 @@ def _summary(
         dof,
         _robot_residual(bundle, problem.reported),
         hat / sigma[:, None] / sigma[None],
-        problem.image,
-        np.linalg.norm(_reprojection(bundle, problem), axis=1),
+        problem,
         iterations,
+    )
+
+
+def median_reprojection(
+    adjusted: Adjusted, base_from_gripper: Float[ndarray, "m 4 4"] | None = None
+) -> Float[ndarray, " m"]:
+    """Median reprojection error (px) of every image, with the gripper where adjusted or where told."""
+    bundle = adjusted.bundle
+    if base_from_gripper is not None:
+        bundle = replace(bundle, base_from_gripper=base_from_gripper)
+    length = np.linalg.norm(_reprojection(bundle, adjusted.problem), axis=1)
+    image = adjusted.problem.image
+    return np.array(
+        [
+            np.median(length[image == i]) if (image == i).any() else np.nan
+            for i in range(len(bundle.base_from_gripper))
+        ]
     )
 
 

@@ -1,0 +1,255 @@
+"""calibration.json: what a calibration is on disk."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jcr.errors import InputError
+from jcr.files import write_text
+from jcr.geometry import require_rigid
+from jcr.records import COVARIANCE_ORDER, Capture, HandEye, ImageVerdict, Intrinsics, Reconstruction
+
+FORMAT = "jcr.calibration/1"
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Residuals(_Part):
+    """The paper's residuals over consecutive used images."""
+
+    translation: float
+    rotation: float
+
+
+class Uncertainty(_Part):
+    """One-sigma uncertainty; axes of the gripper frame."""
+
+    translation_std_mm: list[float]
+    rotation_std_deg: list[float]
+    scale_std_percent: float
+    covariance: list[list[float]]
+    order: list[str]
+    worst: str
+
+
+class HeldOutError(_Part):
+    translation_mm: float
+    rotation_deg: float
+    reprojection_px: float | None
+    how: str
+
+
+class Observed(_Part):
+    observable: bool
+    unobservable: list[str]
+    advice: list[str]
+
+
+class Noise(_Part):
+    translation_mm: float
+    rotation_deg: float
+    estimated: bool
+
+
+class Image(_Part):
+    image: str
+    used: bool
+    reason: str | None
+    translation_residual_mm: float | None
+    rotation_residual_deg: float | None
+    reprojection_px: float | None = None
+
+
+class Lens(_Part):
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: list[float]
+    width: int
+    height: int
+
+
+class CalibrationFile(_Part):
+    """The content of calibration.json; everything found is null where nothing was."""
+
+    format: Literal["jcr.calibration/1"] = FORMAT
+    gripper_from_camera: Matrix | None
+    scale: float | None
+    base_from_recon: Matrix | None
+    converged: bool
+    backend: str
+    images: list[Image]
+    residuals: Residuals | None
+    uncertainty: Uncertainty | None
+    held_out: HeldOutError | None
+    observability: Observed
+    robot_noise: Noise | None
+    intrinsics: Lens | None
+    warnings: list[str]
+    timings_s: dict[str, float]
+    version: str
+
+
+def calibration_file(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    hand_eye: HandEye,
+    timings_s: dict[str, float],
+    version: str,
+) -> CalibrationFile:
+    """The file of a calibration of `capture`."""
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    held_out = hand_eye.held_out
+    return CalibrationFile(
+        gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
+        scale=hand_eye.scale,
+        base_from_recon=hand_eye.base_from_recon.tolist(),
+        converged=hand_eye.converged,
+        backend=reconstruction.backend,
+        images=[
+            Image(**vars(verdict), reprojection_px=pixels)
+            for verdict, pixels in image_verdicts(capture, reconstruction, hand_eye)
+        ],
+        residuals=Residuals(translation=hand_eye.residual_translation, rotation=hand_eye.residual_rotation),
+        uncertainty=Uncertainty(
+            translation_std_mm=(1e3 * std[:3]).tolist(),
+            rotation_std_deg=np.degrees(std[3:6]).tolist(),
+            scale_std_percent=float(100 * std[6]),
+            covariance=hand_eye.covariance.tolist(),
+            order=list(COVARIANCE_ORDER),
+            worst=worst_direction(hand_eye),
+        ),
+        held_out=None if held_out is None else HeldOutError(**vars(held_out)),
+        observability=Observed(
+            observable=hand_eye.observability.observable,
+            unobservable=list(hand_eye.observability.unobservable),
+            advice=list(hand_eye.observability.advice),
+        ),
+        robot_noise=Noise(
+            translation_mm=1e3 * hand_eye.robot_noise.translation,
+            rotation_deg=float(np.degrees(hand_eye.robot_noise.rotation)),
+            estimated=hand_eye.robot_noise.estimated,
+        ),
+        intrinsics=_lens(hand_eye.intrinsics),
+        warnings=[*hand_eye.warnings, *reconstruction.notes],
+        timings_s=timings_s,
+        version=version,
+    )
+
+
+def failed_file(
+    capture: Capture, backend: str, reason: str, timings_s: dict[str, float], version: str
+) -> CalibrationFile:
+    """The file of a capture whose images gave no camera poses at all."""
+    return CalibrationFile(
+        gripper_from_camera=None,
+        scale=None,
+        base_from_recon=None,
+        converged=False,
+        backend=backend,
+        images=[
+            Image(
+                image=name,
+                used=False,
+                reason="not registered",
+                translation_residual_mm=None,
+                rotation_residual_deg=None,
+            )
+            for name in capture.images
+        ],
+        residuals=None,
+        uncertainty=None,
+        held_out=None,
+        observability=Observed(
+            observable=False, unobservable=["everything: no camera poses"], advice=[reason]
+        ),
+        robot_noise=None,
+        intrinsics=_lens(capture.intrinsics),
+        warnings=[reason],
+        timings_s=timings_s,
+        version=version,
+    )
+
+
+def image_verdicts(
+    capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye
+) -> list[tuple[ImageVerdict, float | None]]:
+    """What became of every image of the capture, with its median reprojection error."""
+    row_of = {int(row): k for k, row in enumerate(reconstruction.image_index)}
+    verdicts = []
+    for row, name in enumerate(capture.images):
+        k = row_of.get(row)
+        if k is None:
+            verdicts.append(
+                (ImageVerdict(name, False, f"not registered by {reconstruction.backend}", None, None), None)
+            )
+            continue
+        verdict = ImageVerdict(
+            name,
+            bool(hand_eye.inliers[k]),
+            hand_eye.reasons[k],
+            1e3 * float(hand_eye.translation_residual_m[k]),
+            float(np.degrees(hand_eye.rotation_residual_rad[k])),
+        )
+        pixels = None if hand_eye.reprojection_px is None else float(hand_eye.reprojection_px[k])
+        verdicts.append((verdict, None if pixels is None or np.isnan(pixels) else pixels))
+    return verdicts
+
+
+def worst_direction(hand_eye: HandEye) -> str:
+    """The least certain direction of the offset in words, e.g. "along the optical axis: ±4.0 mm"."""
+    variance, vectors = np.linalg.eigh(hand_eye.covariance[:3, :3])
+    direction = vectors[:, 2]
+    std_mm = 1e3 * float(np.sqrt(variance[2]))
+    named = {
+        "the optical axis": hand_eye.gripper_from_camera[:3, 2],
+        "the image's x axis": hand_eye.gripper_from_camera[:3, 0],
+        "the image's y axis": hand_eye.gripper_from_camera[:3, 1],
+    }
+    name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
+    if abs(axis @ direction) < np.cos(np.radians(30)):
+        name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
+    return f"along {name}: ±{std_mm:.2g} mm"
+
+
+def write_calibration(path: Path, content: CalibrationFile) -> None:
+    """Write calibration.json whole or not at all."""
+    write_text(path, json.dumps(content.model_dump(), indent=2, allow_nan=False) + "\n")
+
+
+def read_calibration(path: Path) -> CalibrationFile:
+    """A calibration.json (or the one in a run folder); InputError when it is none, or of a newer format."""
+    file = path / "calibration.json" if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
+    try:
+        content = json.loads(file.read_bytes().decode())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{file}: damaged ({error}); run the calibration again") from None
+    kind = content.get("format") if isinstance(content, dict) else None
+    if kind != FORMAT:
+        raise InputError(f"{file}: format {kind!r}, this version reads {FORMAT!r}; use the jcr that wrote it")
+    try:
+        parsed = CalibrationFile.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{file}: {place}: {first['msg']}; run the calibration again") from None
+    if parsed.gripper_from_camera is not None:
+        require_rigid(np.array(parsed.gripper_from_camera), f"{file}: gripper_from_camera")
+    return parsed
+
+
+def _lens(intrinsics: Intrinsics | None) -> Lens | None:
+    if intrinsics is None:
+        return None
+    fields = vars(intrinsics) | {"distortion": list(intrinsics.distortion)}
+    return Lens(**fields)

@@ -1,0 +1,39 @@
+"""`jcr map`: the map of a calibrated run, made again."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jcr.represent.cloud import CloudOptions
+from jcr.represent.train import MapOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """(Re)build cloud, map and report of a run with other options.
+
+    examples:
+      jcr map out/tabletop --preset paper
+      jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Build the map and say where it is."""
+    from jcr.pipeline import build_map
+    from jcr.progress import progress_bars
+
+    with progress_bars(arguments.quiet) as progress:
+        result = build_map(arguments.out, arguments.cloud, arguments.map, progress=progress)
+    sys.stdout.write(f"map: {result.out / 'map.safetensors'}\nreport: {result.out / 'report.html'}\n")
+    return 0

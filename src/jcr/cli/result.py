@@ -1,0 +1,48 @@
+"""How a calibration is told on the terminal, the same for every command that ends with one."""
+
+import json
+import sys
+
+import numpy as np
+
+from jcr.pipeline import RunResult
+
+
+def show(result: RunResult, as_json: bool) -> int:
+    """Print the calibration on stdout and its doubts on stderr; the exit status, 0 or 3."""
+    content = result.calibration
+    if as_json:
+        sys.stdout.write(json.dumps(content.model_dump()) + "\n")
+    else:
+        sys.stdout.write(summary(result))
+    for warning in content.warnings[0 if content.converged else 1 :]:
+        sys.stderr.write(f"warning: {warning}\n")
+    if not content.converged:
+        sys.stderr.write(f"error: not to be trusted: {content.warnings[0]}\n")
+        return 3
+    return 0
+
+
+def summary(result: RunResult) -> str:
+    """A few lines a person reads: the transform, how sure it is, what was left out."""
+    hand_eye, content = result.hand_eye, result.calibration
+    uncertainty = content.uncertainty
+    assert uncertainty is not None  # a result has been calibrated
+    with np.printoptions(precision=6, suppress=True):
+        matrix = "\n  ".join(str(hand_eye.gripper_from_camera).splitlines())
+    x, y, z = uncertainty.translation_std_mm
+    rx, ry, rz = uncertainty.rotation_std_deg
+    used = sum(image.used for image in content.images)
+    lines = [
+        f"gripper_from_camera ({used} of {len(content.images)} images, back end {content.backend})",
+        f"  {matrix}",
+        f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
+        f"scale {hand_eye.scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
+    ]
+    if content.held_out is not None:
+        held_out = content.held_out
+        pixels = "" if held_out.reprojection_px is None else f", {held_out.reprojection_px:.2f} px"
+        error = f"{held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°{pixels}"
+        lines.append(f"held out: {error} ({held_out.how})")
+    lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
+    return "\n".join(lines) + "\n"

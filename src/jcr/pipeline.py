@@ -1,0 +1,232 @@
+"""The stages in order, from a capture to a run folder that any of them can start again from.
+
+capture -> reconstruct -> calibrate -> cloud -> map -> report
+"""
+
+import fcntl
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from jcr import __version__
+from jcr.calibrate.calibrate import CalibrateOptions
+from jcr.calibrate.calibrate import calibrate as calibrate_stage
+from jcr.calibrate.file import CalibrationFile, calibration_file, failed_file, write_calibration
+from jcr.capture.read import read_capture
+from jcr.errors import InputError, NotTrustedError
+from jcr.export.points import write_cloud
+from jcr.files import write_text
+from jcr.progress import Progress
+from jcr.reconstruct.backends import ReconstructOptions, chosen, reconstruct
+from jcr.reconstruct.file import read_reconstruction, write_reconstruction
+from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.represent.scene import SceneMap
+from jcr.represent.train import MapOptions, build_scene
+
+STATE = "run.json"
+"""In the run folder: the capture, and what each finished stage was made from."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of every stage."""
+
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run found, and where it is kept."""
+
+    out: Path
+    calibration: CalibrationFile
+    hand_eye: HandEye
+    reconstruction: Reconstruction
+    cloud: PointCloud | None = None
+    scene: SceneMap | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration may be trusted."""
+        return self.hand_eye.converged
+
+
+def run(
+    capture: Capture,
+    out: str | Path,
+    options: RunOptions | None = None,
+    *,
+    backend: str | None = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Everything: calibration, cloud, map and report of a capture in the folder `out`.
+
+    Finished stages are taken from `out` when capture and options are unchanged. Raises InputError on input
+    that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
+    """
+    options = _with_backend(options, backend)
+    with _run_folder(Path(out)) as folder:
+        result = _calibrate(capture, folder, options, progress)
+        result = _map(capture, folder, options, result, progress)
+        _report(capture, result)
+        return result
+
+
+def calibrate(
+    capture: Capture,
+    out: str | Path,
+    options: RunOptions | None = None,
+    *,
+    backend: str | None = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
+    options = _with_backend(options, backend)
+    with _run_folder(Path(out)) as folder:
+        return _calibrate(capture, folder, options, progress)
+
+
+def build_map(
+    out: str | Path,
+    cloud: CloudOptions | None = None,
+    map: MapOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Cloud, map and report again, from the capture and the calibration that the run folder `out` names."""
+    with _run_folder(Path(out)) as folder:
+        state = _read_state(folder)
+        if "capture" not in state:
+            raise InputError(f"{folder}: holds no run; make one with `jcr run` or `jcr calibrate`")
+        capture = read_capture(state["capture"])
+        options = RunOptions(
+            ReconstructOptions(**state["options"]["reconstruct"]),
+            CalibrateOptions(**state["options"]["calibrate"]),
+            cloud or CloudOptions(),
+            map or MapOptions(),
+        )
+        result = _calibrate(capture, folder, options, progress)
+        result = _map(capture, folder, options, result, progress)
+        _report(capture, result)
+        return result
+
+
+def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
+    report = progress or (lambda stage, fraction: None)
+    made_from = _fingerprint(capture, asdict(options.reconstruct))
+    state = _read_state(folder)
+    start = time.perf_counter()
+    try:
+        if state.get("reconstruct") == made_from:
+            reconstruction = read_reconstruction(folder / "reconstruction.npz")
+        else:
+            reconstruction = reconstruct(capture, options.reconstruct, progress)
+            write_reconstruction(folder / "reconstruction.npz", reconstruction)
+        state = {
+            "capture": str(capture.folder.resolve()),
+            "reconstruct": made_from,
+            "options": {"reconstruct": asdict(options.reconstruct), "calibrate": asdict(options.calibrate)},
+        }
+        write_text(folder / STATE, json.dumps(state, indent=2) + "\n")
+        reconstructed = time.perf_counter()
+        report("calibrate", 0.0)
+        hand_eye = calibrate_stage(capture, reconstruction, options.calibrate)
+        report("calibrate", 1.0)
+    except NotTrustedError as error:
+        timings = {"reconstruct": round(time.perf_counter() - start, 3)}
+        failed = failed_file(capture, chosen(options.reconstruct), str(error), timings, __version__)
+        write_calibration(folder / "calibration.json", failed)
+        _write_log(folder, failed)
+        raise
+    timings = {
+        "reconstruct": round(reconstructed - start, 3),
+        "calibrate": round(time.perf_counter() - reconstructed, 3),
+    }
+    content = calibration_file(capture, reconstruction, hand_eye, timings, __version__)
+    write_calibration(folder / "calibration.json", content)
+    _write_log(folder, content)
+    return RunResult(folder, content, hand_eye, reconstruction)
+
+
+def _map(
+    capture: Capture, folder: Path, options: RunOptions, result: RunResult, progress: Progress | None
+) -> RunResult:
+    start = time.perf_counter()
+    cloud = point_cloud(capture, result.reconstruction, result.hand_eye, options=options.cloud)
+    write_cloud(folder / "cloud.ply", cloud)
+    scene = build_scene(cloud, options.map, progress)
+    scene.save(folder / "map.safetensors")
+    timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
+    content = result.calibration.model_copy(update={"timings_s": timings})
+    write_calibration(folder / "calibration.json", content)
+    _write_log(folder, content)
+    return replace(result, calibration=content, cloud=cloud, scene=scene)
+
+
+def _report(capture: Capture, result: RunResult) -> None:
+    from jcr.report.html import report_html
+
+    write_text(result.out / "report.html", report_html(capture, result))
+
+
+def _with_backend(options: RunOptions | None, backend: str | None) -> RunOptions:
+    options = options or RunOptions()
+    if backend is None:
+        return options
+    return replace(options, reconstruct=replace(options.reconstruct, backend=backend))
+
+
+@contextmanager
+def _run_folder(folder: Path) -> Iterator[Path]:
+    """The folder, made and held: a second run on it is told so, and writes nothing between the first's files."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(f"{folder}: is a file; name a folder for the results") from None
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{folder}: another jcr is writing there; wait for it or choose another"
+            ) from None
+        yield folder
+
+
+def _fingerprint(capture: Capture, options: dict[str, Any]) -> str:
+    """A hash of all that a stage's result depends on: pictures, poses, lens, options and version."""
+    digest = hashlib.sha256()
+    for name in capture.images:
+        digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
+    digest.update(capture.base_from_gripper.tobytes())
+    lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
+    digest.update(json.dumps([lens, options, __version__], sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _read_state(folder: Path) -> dict[str, Any]:
+    try:
+        state = json.loads((folder / STATE).read_text())
+        return state if isinstance(state, dict) else {}
+    except (OSError, ValueError):
+        return {}  # without a state every stage is made again, which is always right
+
+
+def _write_log(folder: Path, content: CalibrationFile) -> None:
+    lines = [f"jcr {content.version}, back end {content.backend}"]
+    lines += [f"{stage}: {seconds:.2f} s" for stage, seconds in content.timings_s.items()]
+    lines += [f"{image.image}: {image.reason or 'used'}" for image in content.images]
+    lines += [f"warning: {warning}" for warning in content.warnings]
+    write_text(folder / "log.txt", "\n".join(lines) + "\n")

@@ -1,0 +1,78 @@
+"""reconstruction.npz: a Reconstruction on disk, from which calibration and map can be made again."""
+
+import json
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from jcr.errors import InputError
+from jcr.files import written_whole
+from jcr.records import Intrinsics, Reconstruction, Tracks
+
+FORMAT = "jcr.reconstruction/1"
+
+
+def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
+    """Write the record whole or not at all."""
+    about = {
+        "format": FORMAT,
+        "backend": reconstruction.backend,
+        "is_metric": reconstruction.is_metric,
+        "notes": list(reconstruction.notes),
+        "intrinsics": asdict(reconstruction.intrinsics),
+        "pointmap_intrinsics": asdict(reconstruction.pointmap_intrinsics),
+    }
+    arrays = {
+        "image_index": reconstruction.image_index,
+        "recon_from_camera": reconstruction.recon_from_camera,
+        "points_in_recon": reconstruction.points_in_recon,
+        "confidence": reconstruction.confidence,
+        "colors": reconstruction.colors,
+        "track_image": reconstruction.tracks.image,
+        "track_x_px": reconstruction.tracks.x_px,
+        "track_point": reconstruction.tracks.point,
+        "track_points_in_recon": reconstruction.tracks.points_in_recon,
+    }
+    with written_whole(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
+
+
+def read_reconstruction(path: Path) -> Reconstruction:
+    """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            about = json.loads(str(file["about"]))
+            if about["format"] != FORMAT:
+                raise InputError(
+                    f"{path}: format {about['format']!r}, not {FORMAT!r}; use the jcr that wrote it"
+                )
+            return Reconstruction(
+                image_index=file["image_index"],
+                recon_from_camera=file["recon_from_camera"],
+                intrinsics=_intrinsics(about["intrinsics"]),
+                pointmap_intrinsics=_intrinsics(about["pointmap_intrinsics"]),
+                points_in_recon=file["points_in_recon"],
+                confidence=file["confidence"],
+                colors=file["colors"],
+                tracks=Tracks(
+                    file["track_image"],
+                    file["track_x_px"],
+                    file["track_point"],
+                    file["track_points_in_recon"],
+                ),
+                backend=about["backend"],
+                is_metric=about["is_metric"],
+                notes=tuple(about["notes"]),
+            )
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
+
+
+def _intrinsics(fields: dict) -> Intrinsics:
+    return Intrinsics(**(fields | {"distortion": tuple(fields["distortion"])}))
