@@ -1,37 +1,71 @@
-"""Point clouds as PLY, the format every viewer reads."""
+"""PLY point clouds in the base frame, metres, and back."""
 
 from pathlib import Path
 
 import numpy as np
 
+from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.records import PointCloud
 
+_VERTEX = np.dtype(
+    [(axis, "<f4") for axis in "xyz"]
+    + [(channel, "|u1") for channel in ("red", "green", "blue")]
+    + [("label", "<i4"), ("confidence", "<f4"), ("margin", "<f4"), ("image", "<i4")]
+)
+_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+
 
 def write_cloud(path: Path, cloud: PointCloud) -> None:
-    """Write binary PLY: x y z in metres in the base frame, RGB, label, confidence, margin (m)."""
-    vertex = np.empty(
-        len(cloud.points_in_base),
-        dtype=[
-            *((axis, "<f4") for axis in "xyz"),
-            *((channel, "u1") for channel in ("red", "green", "blue")),
-            ("label", "<i4"),
-            ("confidence", "<f4"),
-            ("margin", "<f4"),
-        ],
-    )
-    for k, axis in enumerate("xyz"):
-        vertex[axis] = cloud.points_in_base[:, k]
-    for k, channel in enumerate(("red", "green", "blue")):
-        vertex[channel] = cloud.color[:, k]
-    vertex["label"], vertex["confidence"], vertex["margin"] = cloud.label, cloud.confidence, cloud.margin
-    kinds = {"<f4": "float", "u1": "uchar", "|u1": "uchar", "<i4": "int"}
+    """Write points with colour, label, confidence, margin (m) and image as binary PLY.
+
+    The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back.
+    """
+    vertices = np.empty(len(cloud.points_in_base), _VERTEX)
+    for name, column in zip("xyz", cloud.points_in_base.T, strict=True):
+        vertices[name] = column
+    for name, column in zip(("red", "green", "blue"), cloud.color.T, strict=True):
+        vertices[name] = column
+    for name in ("label", "confidence", "margin", "image"):
+        vertices[name] = getattr(cloud, name)
+    centers = cloud.camera_centers_in_base.tolist()
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        "comment frame: robot base; unit: metre; margin: one sigma in metre",
-        f"element vertex {len(vertex)}",
-        *(f"property {kinds[vertex.dtype[name].str]} {name}" for name in vertex.dtype.names or ()),
+        "comment jcr cloud in the base frame, metres",
+        *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
+        *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
+        f"element vertex {len(vertices)}",
+        *(f"property {_PLY_TYPES[kind[1:]]} {name}" for name, kind in _VERTEX.descr),
         "end_header\n",
     ]
-    write_bytes(path, "\n".join(header).encode() + vertex.tobytes())
+    write_bytes(path, "\n".join(header).encode() + vertices.tobytes())
+
+
+def read_cloud(path: Path) -> PointCloud:
+    """The cloud that `write_cloud` wrote; raises InputError for any other file."""
+    try:
+        header, separator, body = path.read_bytes().partition(b"end_header\n")
+        lines = header.decode().splitlines()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no cloud here; make one with jcr map OUT") from None
+    except UnicodeDecodeError:
+        separator, lines, body = b"", [], b""
+    words = [line.split(maxsplit=3) for line in lines]
+    if not separator or "comment jcr cloud in the base frame, metres" not in lines:
+        raise InputError(f"{path}: is no cloud of jcr; make it again with jcr map OUT")
+    if len(body) % _VERTEX.itemsize:
+        raise InputError(f"{path}: the cloud is cut short; make it again with jcr map OUT")
+    vertices = np.frombuffer(body, _VERTEX)
+    centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
+    names = tuple(word[3] for word in words if word[:2] == ["comment", "label"])
+    return PointCloud(
+        points_in_base=np.stack([vertices[name] for name in "xyz"], 1).astype(np.float64),
+        color=np.stack([vertices[name] for name in ("red", "green", "blue")], 1),
+        confidence=vertices["confidence"].astype(np.float64),
+        margin=vertices["margin"].astype(np.float64),
+        label=vertices["label"].astype(int),
+        image=vertices["image"].astype(int),
+        camera_centers_in_base=np.array(centers).reshape(-1, 3),
+        label_names=names,
+    )

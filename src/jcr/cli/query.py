@@ -1,0 +1,121 @@
+"""`jcr query`: what the map knows at points."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.files import write_bytes, write_text
+
+_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Ask the map of a run about points: occupancy, unknown, distance, its gradient, colour and label.
+
+    Points are metres in the robot's base frame. Distances are NaN outside of the mapped workspace.
+
+    examples:
+      jcr query out/table points.csv
+      jcr query out/table cloud.ply --write answers.npy
+      jcr query out/table points.npy --unknown occupied --json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run, with its map.safetensors."""
+    points: Annotated[Path, tyro.conf.Positional]
+    """.csv (three columns, a header line is fine), .npy of shape (n, 3), or .ply."""
+    write: Path | None = None
+    """.csv or .npy (a structured array) to write; by default points.answers.csv beside the points."""
+    unknown: Literal["occupied", "free", "report"] = "report"
+    """How places count that nobody has seen: solid, empty, or as occupancy one half."""
+    json: bool = False
+    """Print the answers on stdout as JSON instead of writing a file."""
+
+
+def main(arguments: Arguments) -> int:
+    """Answer for every point, in the order of the input."""
+    from jcr.represent.scene import load_map
+
+    scene = load_map(arguments.out)
+    x_in_base = read_points(arguments.points)
+    sample = scene.query(x_in_base, arguments.unknown)
+    # Eight-bit colours, as the points had them; outside of the workspace there is none.
+    red, green, blue = np.nan_to_num(sample.color * 255).round().astype(np.uint8).T
+    columns = (*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T)
+    columns = (*columns, red, green, blue, sample.label)
+    rows = np.rec.fromarrays(columns, names=_COLUMNS)
+    if arguments.json:
+        answers = {name: _finite(rows[name]) for name in _COLUMNS.split(",")} | {
+            "label_names": list(scene.label_names)
+        }
+        sys.stdout.write(json.dumps(answers) + "\n")
+        return 0
+    path = arguments.write or arguments.points.with_suffix(".answers.csv")
+    if path.suffix == ".npy":
+        import io
+
+        buffer = io.BytesIO()
+        np.save(buffer, np.asarray(rows))
+        write_bytes(path, buffer.getvalue())
+    elif path.suffix == ".csv":
+        formats = "%.6f,%.6f,%.6f,%.4f,%d,%.5f,%.4f,%.4f,%.4f,%d,%d,%d,%d"
+        lines = "\n".join(formats % tuple(row) for row in rows.tolist())
+        write_text(path, f"{_COLUMNS}\n{lines}\n")
+    else:
+        raise InputError(f"{path}: answers are written as .csv or .npy")
+    unknown = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(rows) else "none"
+    sys.stderr.write(f"wrote {path}: {len(rows)} points, {unknown}\n")
+    return 0
+
+
+def read_points(path: Path) -> Float[ndarray, "n 3"]:
+    """Points (n,3) in metres from .csv, .npy or .ply; raises InputError where the file is none of these."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
+    try:
+        if path.suffix == ".npy":
+            points = np.load(path, allow_pickle=False)
+        elif path.suffix == ".ply":
+            import trimesh
+
+            points = np.asarray(trimesh.load(path).vertices)  # pyright: ignore[reportAttributeAccessIssue]
+        elif path.suffix == ".csv":
+            points = _read_csv(path)
+        else:
+            raise InputError(f"{path}: points are read from .csv, .npy or .ply")
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read as points ({error}); give x, y, z in metres") from error
+    if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.number):
+        raise InputError(
+            f"{path}: expected points of shape (n, 3) in metres, got {points.shape} {points.dtype}"
+        )
+    return points.astype(np.float64)
+
+
+def _read_csv(path: Path) -> ndarray:
+    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    if not lines:
+        return np.zeros((0, 3))
+    try:
+        [float(word) for word in lines[0].split(",")]
+    except ValueError:
+        lines = lines[1:]
+    return np.array([[float(word) for word in line.split(",")] for line in lines]).reshape(len(lines), -1)
+
+
+def _finite(column: ndarray) -> list:
+    """The column for JSON, which knows no NaN."""
+    if column.dtype.kind != "f":
+        return column.tolist()
+    return [None if np.isnan(value) else round(float(value), 6) for value in column]

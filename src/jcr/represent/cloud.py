@@ -1,0 +1,93 @@
+"""From pointmaps and a calibration to one metric point cloud in the base frame (paper, section IV-C)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Integer
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
+from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+
+
+@dataclass(frozen=True)
+class CloudOptions:
+    """Which points of the pointmaps enter the map."""
+
+    confidence_percentile: float = 20.0
+    """Drop this share (%) of the estimated points, the least confident first."""
+    confidence_threshold: float | None = None
+    """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
+    max_points: int = 200_000
+    """Keep at most so many points, drawn evenly over the pixels of all images."""
+    cloud_seed: int = 0
+    """Seed of that draw."""
+
+
+def point_cloud(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    hand_eye: HandEye,
+    labels: Integer[ndarray, "m h w"] | None = None,
+    options: CloudOptions | None = None,
+    label_names: tuple[str, ...] = ("none",),
+) -> PointCloud:
+    """The confident points in the base frame, each with colour, label, margin and the camera that saw it.
+
+    `labels` (m,h,w) are segments at the pointmaps' pixels, 0 = none; `label_names` names them.
+    Raises InputError when no point passes the threshold.
+    """
+    options = options or CloudOptions()
+    confidence = reconstruction.confidence
+    keep = confidence > 0
+    if options.confidence_threshold is not None:
+        keep &= confidence >= options.confidence_threshold
+    elif keep.any():
+        keep &= confidence >= np.percentile(confidence[keep], options.confidence_percentile)
+    pixel = np.flatnonzero(keep)
+    if len(pixel) == 0:
+        best = float(confidence.max()) if confidence.size else 0.0
+        raise InputError(
+            f"{capture.folder}: no point is confident enough for a map (the best confidence is {best:.3g}); "
+            "lower --confidence-threshold or add images with more overlap"
+        )
+    if len(pixel) > options.max_points:
+        draw = np.random.default_rng(options.cloud_seed)
+        pixel = np.sort(draw.choice(pixel, options.max_points, replace=False))
+
+    image = pixel // confidence[0].size
+    x_in_recon = reconstruction.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
+    recon_from_camera = scale_translation(reconstruction.recon_from_camera, hand_eye.scale)
+    return PointCloud(
+        points_in_base=apply_similarity(hand_eye.base_from_recon, hand_eye.scale, x_in_recon),
+        color=reconstruction.colors.reshape(-1, 3)[pixel],
+        confidence=confidence.reshape(-1)[pixel].astype(np.float64),
+        margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),
+        label=np.zeros(len(pixel), int) if labels is None else labels.reshape(-1)[pixel].astype(int),
+        image=image,
+        camera_centers_in_base=apply(hand_eye.base_from_recon, recon_from_camera[:, :3, 3]),
+        label_names=label_names,
+    )
+
+
+def position_std(
+    hand_eye: HandEye,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    image: Integer[ndarray, " n"],
+    x_in_recon: Float[ndarray, "n 3"],
+) -> Float[ndarray, " n"]:
+    """One-sigma uncertainty (m), in the worst direction, that the calibration leaves at each point.
+
+    `recon_from_camera` and `x_in_recon` are metric. A point that image i sees at x in its camera lies in the
+    base frame at base_from_gripper[i] · gripper_from_camera · x. With q = R·x, the point seen from the camera
+    in gripper axes, the errors of `jcr.records.COVARIANCE_ORDER` move it by dt + dr x q + ds·q, whose
+    Jacobian is [I, -skew(q), q]; rotating the result to the base frame changes no length.
+    """
+    recon_to_camera = inverse(recon_from_camera)
+    x_in_camera = np.einsum("nij,nj->ni", recon_to_camera[image, :3, :3], x_in_recon)
+    x_in_camera += recon_to_camera[image, :3, 3]
+    q = x_in_camera @ hand_eye.gripper_from_camera[:3, :3].T
+    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(q), q[:, :, None]], axis=-1)
+    covariance = jacobian @ hand_eye.covariance @ np.swapaxes(jacobian, -1, -2)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))

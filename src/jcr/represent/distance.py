@@ -1,0 +1,108 @@
+"""Signed distance to the nearest surface: an exact Euclidean distance transform of the learned field."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn import functional as F
+
+BISECTIONS = 5
+"""Halvings of a grid edge in search of the surface: 0.3 mm at cells of 1 cm."""
+
+IsSolid = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]
+
+
+@dataclass(frozen=True)
+class DistanceGrid:
+    """Signed distance (m, negative inside) and its gradient at the nodes of a regular grid."""
+
+    lower: Float[Tensor, "3"]
+    cell: float
+    table: Float[Tensor, "4 nz ny nx"]
+    """Distance, then its derivatives along x, y and z."""
+
+    def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+        """Distance and gradient, interpolated trilinearly at points (n,3) of the box."""
+        return self._interpolate(self.table, x_in_base)
+
+    def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """The distance alone, at points (n,3) of the box."""
+        return self._interpolate(self.table[:1], x_in_base)[:, 0]
+
+    def _interpolate(
+        self, table: Float[Tensor, "k nz ny nx"], x: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n k"]:
+        cells = torch.tensor(table.shape[:0:-1], device=x.device) - 1
+        at = (x - self.lower) * (2.0 / self.cell / cells) - 1.0
+        at = at.view(1, 1, 1, -1, 3)
+        return (
+            F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1).T
+        )
+
+
+def distance_grid(
+    lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], is_solid: IsSolid, closed: bool
+) -> DistanceGrid:
+    """Distance of the nodes (nz,ny,nx) of a grid from the boundary of what `is_solid`; if `closed`, so is all outside.
+
+    Nodes beside the boundary carry the point of it that is nearest to them; every other node takes the distance
+    to the point of its nearest such node. Where there is no boundary at all, the distance is the box's diagonal.
+    """
+    node = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")[::-1], -1).to(lower.device)
+    solid = is_solid(lower + cell * node.view(-1, 3)).view(shape)
+    offset, beside = _boundary(lower, cell, solid, is_solid)
+    if not beside.any():
+        diagonal = float(np.linalg.norm(shape)) * cell
+        distance = np.full(shape, diagonal, np.float32)
+    else:
+        nearest = distance_transform_edt(~beside, return_distances=False, return_indices=True)
+        assert isinstance(nearest, ndarray)
+        row = np.ravel_multi_index(tuple(nearest), shape)
+        squared = np.zeros(shape, np.float32)
+        for axis, (index, shift) in enumerate(zip(nearest, offset, strict=True)):
+            own = np.arange(shape[axis], dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
+            squared += (index + shift.take(row) - own) ** 2
+        distance = cell * np.sqrt(squared)
+    distance[solid.cpu().numpy()] *= -1
+    if closed:
+        for axis, n in enumerate(shape):
+            wall = cell * np.minimum(np.arange(n), np.arange(n)[::-1]).astype(np.float32)
+            distance = np.minimum(distance, wall.reshape([-1 if a == axis else 1 for a in range(3)]))
+    dz, dy, dx = np.gradient(distance, cell)
+    return DistanceGrid(lower, cell, torch.as_tensor(np.stack([distance, dx, dy, dz]), device=lower.device))
+
+
+def _boundary(
+    lower: Float[Tensor, "3"], cell: float, solid: Bool[Tensor, "nz ny nx"], is_solid: IsSolid
+) -> tuple[Float[ndarray, "3 nz ny nx"], Bool[ndarray, "nz ny nx"]]:
+    """Offsets (in cells, z y x) from nodes to the boundary nearest them, and which nodes are beside it.
+
+    Where the boundary cuts a node's edges at t_x, t_y and t_z, the plane through the cuts is nearest at n·d with
+    n_a = d / t_a and 1/d² = Σ 1/t_a², as fast marching starts (Adalsteinsson and Sethian 1999).
+    """
+    inverse = np.zeros((3, *solid.shape), np.float32)
+    for axis in range(3):
+        n = solid.shape[axis] - 1
+        low = (solid.narrow(axis, 0, n) != solid.narrow(axis, 1, n)).nonzero()
+        start = lower + cell * low.flip(1)
+        step = torch.zeros(3, device=lower.device)
+        step[2 - axis] = cell
+        low_is_solid = solid[tuple(low.T)]
+        share = torch.full((len(low),), 0.5, device=lower.device)
+        for k in range(2, BISECTIONS + 2):
+            beyond = is_solid(start + share[:, None] * step) != low_is_solid
+            share += torch.where(beyond, -(0.5**k), 0.5**k)
+        forward, backward = np.zeros(solid.shape, np.float32), np.zeros(solid.shape, np.float32)
+        index = low.cpu().numpy()
+        forward[tuple(index.T)] = 1.0 / share.cpu().numpy()
+        index[:, axis] += 1
+        backward[tuple(index.T)] = 1.0 / (1.0 - share.cpu().numpy())
+        inverse[axis] = np.where(forward >= backward, forward, -backward)
+    total = (inverse**2).sum(0)
+    beside = total > 0
+    return inverse / np.where(beside, total, 1.0), beside

@@ -1,0 +1,177 @@
+"""The networks of the map: an encoding of position, one hidden layer, one linear head per property.
+
+`SinusoidalEncoding` with 256 hidden units is the paper's network, `GridEncoding` with 32 the default. Positions
+are metres of the base frame; each encoding scales them by itself.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """What must be known to build a field before its weights are loaded."""
+
+    heads: dict[str, int]
+    """Property and its number of outputs."""
+    hidden: int
+    frequencies: int = 0
+    """Of the sinusoidal encoding; 0 = feature grids."""
+    grids: tuple[tuple[int, int], ...] = ()
+    """(lattice, features) of each feature grid."""
+
+
+class Lattice(nn.Module):
+    """The nodes of a regular grid over the workspace, of which a chosen few carry features.
+
+    Fine features are needed near surfaces only; all other nodes share row 0.
+    """
+
+    lower: Tensor
+    row: Tensor
+    nodes: Tensor
+
+    def __init__(
+        self, lower: Float[Tensor, "3"], cell: float, shape: tuple[int, int, int], nodes: Int[Tensor, " k"]
+    ) -> None:
+        super().__init__()
+        self.cell, self.shape = cell, shape
+        row = torch.zeros(math.prod(shape), dtype=torch.int32, device=lower.device)
+        row[nodes] = torch.arange(1, len(nodes) + 1, dtype=torch.int32, device=lower.device)
+        self.register_buffer("lower", lower, persistent=False)
+        self.register_buffer("row", row, persistent=False)
+        self.register_buffer("nodes", nodes)
+
+    @classmethod
+    def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
+        """The lattice whose nodes with features are the corners of the cells that are `near`."""
+        corner = F.max_pool3d(F.pad(near, (1, 1, 1, 1, 1, 1)).float()[None], 2, 1)[0] > 0
+        nz, ny, nx = corner.shape
+        return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
+
+    def corners(self, x_in_base: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
+        """The rows of the eight nodes around each point, and their trilinear weights."""
+        nz, ny, nx = self.shape
+        at = (x_in_base - self.lower) * (1.0 / self.cell)
+        last = torch.tensor([nx - 2, ny - 2, nz - 2], dtype=torch.int32, device=at.device)
+        low = torch.minimum(at.detach().int().clamp_(min=0), last)
+        share = (at - low).clamp(0.0, 1.0)
+        x, y, z = low.unbind(1)
+        first = (z * ny + y) * nx + x
+        steps = torch.tensor([0, 1, nx, nx + 1], dtype=torch.int32, device=at.device)
+        index = first[:, None] + torch.cat([steps, steps + ny * nx])
+        (ax, ay, az), (bx, by, bz) = (1 - share).unbind(1), share.unbind(1)
+        plane = torch.stack([ay * ax, ay * bx, by * ax, by * bx], 1)
+        weight = torch.cat([plane * az[:, None], plane * bz[:, None]], 1)
+        return self.row.take(index.long()), weight
+
+
+class Interpolate(torch.autograd.Function):
+    """Weighted sums of table rows; several times faster to differentiate than indexing or embedding_bag."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
+        """(n, features) from a table (k, features), rows (n,8) and weights (n,8)."""
+        ctx.save_for_backward(table, rows, weight)
+        return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
+        """Scatter the gradient to the rows, one feature at a time; and to the weights if they come from a query."""
+        (gradient,) = gradients
+        table, rows, weight = ctx.saved_tensors
+        of_table = of_weight = None
+        if ctx.needs_input_grad[0]:
+            of_table = torch.zeros(table.shape[::-1], device=table.device)
+            flat = rows.view(-1).long()
+            for column, out in zip(gradient.unbind(1), of_table, strict=True):
+                out.scatter_add_(0, flat, (column[:, None] * weight).view(-1))
+            of_table = of_table.T.contiguous()
+        if ctx.needs_input_grad[2]:
+            of_weight = (table[rows.long()] * gradient[:, None]).sum(-1)
+        return of_table, None, of_weight
+
+
+class SinusoidalEncoding(nn.Module):
+    """sin and cos of 2^k·π·x for k < frequencies, as NeRF (Mildenhall 2020, eq. 4); the box is [-1, 1]."""
+
+    frequency: Tensor
+    center: Tensor
+
+    def __init__(self, frequencies: int, box: Float[Tensor, "2 3"]) -> None:
+        super().__init__()
+        # One scale for all axes: the longest side of the box spans [-1, 1].
+        scale = 2.0 / (box[1] - box[0]).max()
+        frequency = scale * math.pi * 2.0 ** torch.arange(frequencies, device=box.device)
+        self.register_buffer("frequency", frequency, persistent=False)
+        self.register_buffer("center", box.mean(0), persistent=False)
+        self.features = 6 * frequencies
+
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n f"]:
+        """Features of points (n,3)."""
+        angle = ((x_in_base - self.center)[:, :, None] * self.frequency).flatten(1)
+        return torch.cat([angle.sin(), angle.cos()], 1)
+
+
+class GridEncoding(nn.Module):
+    """Features interpolated trilinearly between the nodes of lattices."""
+
+    def __init__(self, lattices: Sequence[Lattice], features: Sequence[int]) -> None:
+        super().__init__()
+        self.lattices = list(lattices)
+        self.tables = nn.ParameterList(
+            torch.zeros(len(lattice.nodes) + 1, n, device=lattice.lower.device)
+            for lattice, n in zip(lattices, features, strict=True)
+        )
+        self.features = sum(features)
+
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n f"]:
+        """Features of points (n,3)."""
+        parts = zip(self.tables, self.lattices, strict=True)
+        return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts], 1)
+
+
+class Field(nn.Module):
+    """Properties at every place: logits of occupancy and labels, plain values of all else."""
+
+    def __init__(self, shape: FieldShape, box: Float[Tensor, "2 3"], lattices: Sequence[Lattice]) -> None:
+        super().__init__()
+        self.encoding = (
+            SinusoidalEncoding(shape.frequencies, box)
+            if shape.frequencies
+            else GridEncoding([lattices[k] for k, _ in shape.grids], [n for _, n in shape.grids])
+        )
+        self.hidden = nn.Linear(self.encoding.features, shape.hidden)
+        self.heads = nn.ModuleDict({name: nn.Linear(shape.hidden, n) for name, n in shape.heads.items()})
+
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
+        """Outputs (n, outputs) of every head at points (n,3)."""
+        hidden = F.relu(self.hidden(self.encoding(x_in_base)))
+        return {name: head(hidden) for name, head in self.heads.items()}
+
+
+class Fields(nn.Module):
+    """All fields of a map, one for all properties or one for each, and the lattices they share."""
+
+    def __init__(
+        self, shapes: Sequence[FieldShape], box: Float[Tensor, "2 3"], lattices: Sequence[Lattice]
+    ) -> None:
+        super().__init__()
+        self.shapes = tuple(shapes)
+        self.lattices = nn.ModuleList(lattices)
+        self.of = nn.ModuleList(Field(shape, box, lattices) for shape in shapes)
+
+    def forward(self, x_in_base: Float[Tensor, "n 3"], names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs (n, outputs) of the named heads at points (n,3)."""
+        out: dict[str, Tensor] = {}
+        for shape, field in zip(self.shapes, self.of, strict=True):
+            if not shape.heads.keys().isdisjoint(names):
+                out |= field(x_in_base)
+        return {name: out[name] for name in names}
