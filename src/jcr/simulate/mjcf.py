@@ -35,7 +35,7 @@ def to_mjcf(
     xml.SubElement(visual, "quality", shadowsize="2048", offsamples="0")
     # All light is the lamps': a head light would move with the camera and wash the shading out.
     xml.SubElement(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0 0 0", specular="0 0 0")
-    xml.SubElement(visual, "map", znear="0.02", zfar="12")
+    xml.SubElement(visual, "map", znear="0.02", zfar="12", shadowscale="0.5")
     assets = xml.SubElement(root, "asset")
     xml.SubElement(
         assets,
@@ -73,7 +73,7 @@ def _add_lamps(world: xml.Element, scene: Scene) -> None:
             diffuse=_text(np.full(3, 0.6 / _LAMPS)),
             specular=_text(np.full(3, 0.3 / _LAMPS)),
             ambient="0 0 0",
-            cutoff="60",
+            cutoff="40",
             exponent="1",
             castshadow="true",
         )

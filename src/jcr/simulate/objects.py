@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import apply
+from jcr.geometry import apply, rotation_exp, transform
 from jcr.simulate import textures
 from jcr.simulate.meshes import Mesh, box, revolved, tube
 from jcr.simulate.textures import Color, Image
+from jcr.simulate.truth import TrueObject
 
 _WHITE, _STEEL, _PAPER, _BLACK = (
     (0.88, 0.87, 0.84),
@@ -42,16 +43,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class OrientedBox:
-    """The smallest upright box around an object."""
-
-    base_from_box: Float[ndarray, "4 4"]
-    """Origin at the centre of the box; z up."""
-    size: Float[ndarray, "3"]
-    """Along the box's x, y, z, in metres."""
-
-
-@dataclass(frozen=True)
 class TableObject:
     """Something rigid that stands on the table."""
 
@@ -61,34 +52,31 @@ class TableObject:
     base_from_object: Float[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
     @property
-    def vertices_in_base(self) -> Float[ndarray, "v 3"]:
-        """All vertices of its surface (v,3) m."""
-        return apply(self.base_from_object, np.concatenate([part.mesh.vertices for part in self.parts]))
-
-    @property
-    def height(self) -> float:
-        """Of its highest point above the table, in metres."""
-        return float(max(part.mesh.vertices[:, 2].max() for part in self.parts))
-
-    @property
     def radius(self) -> float:
         """Of the smallest circle about its origin that holds its footprint, in metres."""
-        return float(max(np.linalg.norm(part.mesh.vertices[:, :2], axis=1).max() for part in self.parts))
+        return float(np.linalg.norm(self._vertices[:, :2], axis=1).max())
+
+    def measured(self, label: int) -> TrueObject:
+        """Its height, footprint and the smallest upright box around it."""
+        x_in_base = apply(self.base_from_object, self._vertices)
+        height = float(self._vertices[:, 2].max())
+        # OpenCV's planar geometry takes single precision: about the object's origin that is exact to 1e-8 m.
+        origin = self.base_from_object[:3, 3]
+        outline = cv2.convexHull((x_in_base - origin)[:, :2].astype(np.float32))[:, 0]
+        (x, y), (length, width), angle_deg = cv2.minAreaRect(outline)
+        turn = rotation_exp(np.radians([0.0, 0.0, angle_deg]))
+        return TrueObject(
+            name=self.name,
+            label=label,
+            height=height,
+            footprint_in_base=outline + origin[:2],
+            base_from_box=transform(turn, origin + [x, y, height / 2]),
+            box_size=np.array([length, width, height]),
+        )
 
     @property
-    def footprint_in_base(self) -> Float[ndarray, "k 2"]:
-        """Convex outline of its shadow on the table from straight above, x and y in metres."""
-        return cv2.convexHull(self.vertices_in_base[:, :2].astype(np.float32))[:, 0].astype(np.float64)
-
-    @property
-    def oriented_box(self) -> OrientedBox:
-        """The upright box of smallest base around it."""
-        (x, y), (length, width), angle_deg = cv2.minAreaRect(self.footprint_in_base.astype(np.float32))
-        cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-        base_from_box = np.eye(4)
-        base_from_box[:2, :2] = [[cos, -sin], [sin, cos]]
-        base_from_box[:3, 3] = x, y, self.base_from_object[2, 3] + self.height / 2
-        return OrientedBox(base_from_box, np.array([length, width, self.height]))
+    def _vertices(self) -> Float[ndarray, "v 3"]:
+        return np.concatenate([part.mesh.vertices for part in self.parts])
 
 
 def carton(rng: np.random.Generator) -> TableObject:
@@ -196,7 +184,8 @@ def mug(rng: np.random.Generator) -> TableObject:
 
 def tape(rng: np.random.Generator) -> TableObject:
     """A roll of tape, lying."""
-    inner, thickness, height = rng.uniform((0.032, 0.010, 0.024), (0.038, 0.018, 0.05))
+    # Packing tape: a 76 mm core, about 48 mm wide.
+    inner, thickness, height = rng.uniform((0.0378, 0.008, 0.046), (0.0382, 0.018, 0.05))
     outer, color = inner + thickness, _paint(rng)
     band = revolved([(outer, 0.0), (outer, height)])
     edges = revolved([(outer, height), (inner + 0.002, height)], [(inner + 0.002, 0.0), (outer, 0.0)])
@@ -247,10 +236,9 @@ def fruit(rng: np.random.Generator) -> TableObject:
     z -= z.min()
     r[[0, -1]] = 0.0
     color = (0.70, 0.17, 0.13) if rng.random() < 0.5 else (0.55, 0.62, 0.2)
-    top = float(z[-1])
-    stalk = revolved(
-        [(0.0018, top), (0.0018, top + 0.018)], [(0.0018, top + 0.018), (0.0, top + 0.018)], segments=8
-    )
+    # It ends below the rim of its dimple: the height of an apple is that of its flesh.
+    foot, tip = float(z[-1]), float(z[-1]) + 0.2 * radius
+    stalk = revolved([(0.002, foot), (0.002, tip)], [(0.002, tip), (0.0, tip)], segments=8)
     flesh = revolved(list(zip(r, z, strict=True)))
     return TableObject(
         "apple",
@@ -259,24 +247,23 @@ def fruit(rng: np.random.Generator) -> TableObject:
 
 
 def toolbox(rng: np.random.Generator) -> TableObject:
-    """A toolbox: body, lid with two latches, handle."""
-    x, y, z = rng.uniform((0.26, 0.13, 0.09), (0.30, 0.15, 0.11))
-    color = _paint(rng)
-    lid_size = (x + 0.008, y + 0.008, 0.035)
-    label = textures.printed(rng, 320, 640, color)
+    """A toolbox: body, lid with a sticker and a grip, latches."""
+    x, y, z = rng.uniform((0.24, 0.12, 0.08), (0.28, 0.14, 0.10))
+    color, sticker = _paint(rng), _paint(rng)
+    lid = np.array([x + 0.008, y + 0.008, 0.03])
+    top = z + lid[2]
     parts = [
-        Part(box((x, y, z), ("+y", "-y")), color, label),
-        Part(box((x, y, z), ("+x", "-x", "-z")), color),
-        Part(box(lid_size).moved((0, 0, z)), _BLACK, textures.printed(rng, 320, 640, _BLACK)),
+        Part(box((x, y, z), ("+x", "-x", "-z")), color, textures.glaze(rng, 256, 512, color)),
+        Part(box((x, y, z), ("+y", "-y")), color, textures.printed(rng, 320, 800, color)),
+        Part(box(lid).moved((0, 0, z)), _BLACK, textures.glaze(rng, 400, 800, _BLACK)),
+        Part(box((0.45 * x, 0.026, 0.024)).moved((0, 0, top)), color, textures.glaze(rng, 64, 256, color)),
     ]
     for side in (-1, 1):
+        label = box((0.6 * x, 0.24 * y, 0.0005)).moved((0, side * 0.3 * y, top))
+        parts.append(Part(label, sticker, textures.printed(rng, 96, 512, sticker)))
         for end in (-1, 1):
-            latch = box((0.03, 0.008, 0.04)).moved((end * 0.3 * x, side * (y / 2 + 0.006), z - 0.02))
+            latch = box((0.03, 0.006, 0.04)).moved((end * 0.3 * x, side * (y / 2 + 0.006), z - 0.02))
             parts.append(Part(latch, _STEEL, shine=0.3))
-    angle = np.linspace(0, np.pi, 24)
-    top = z + lid_size[2]
-    path = np.stack([0.25 * x * np.cos(angle), 0 * angle, top + 0.04 * np.sin(angle) ** 0.6], -1)
-    parts.append(Part(tube(path, 0.007), color))
     return TableObject("toolbox", tuple(parts))
 
 

@@ -38,7 +38,7 @@ _VIEWS = np.array(
 
 
 def random_hand_eye(rng: np.random.Generator) -> Float[ndarray, "4 4"]:
-    """A plausible gripper_from_camera (4,4): 3 to 12 cm away, up to 25° aside of the gripper's z, any roll."""
+    """A plausible gripper_from_camera (4,4): 3 to 12 cm away, tilted by up to 25°, any roll."""
     side, roll, toward = rng.uniform(0, 2 * np.pi, 3)
     aside, ahead = rng.uniform(0.03, 0.1), rng.uniform(-0.05, 0.06)
     tilt = np.radians(rng.uniform(5, 25)) * np.array([np.cos(toward), np.sin(toward), 0.0])
@@ -53,7 +53,7 @@ def gripper_poses(
     gripper_from_camera: Float[ndarray, "4 4"],
     rng: np.random.Generator,
 ) -> Cameras:
-    """True base_from_gripper (n,4,4) of the pattern about `target_in_base`; `two` has 2 poses whatever `count`."""
+    """True base_from_gripper (n,4,4) of the pattern about a target; `two` has 2 poses whatever `count`."""
     base_from_camera = _PATTERNS[pattern](count, target_in_base, gripper_from_camera, rng)
     return base_from_camera @ inverse(gripper_from_camera)
 

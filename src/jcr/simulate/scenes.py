@@ -1,4 +1,4 @@
-"""Scenes: a table with objects on it, made from a seed; and the MJCF that MuJoCo renders."""
+"""Scenes: a table with objects on it, made from a seed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +13,7 @@ from jcr.geometry import transform
 from jcr.simulate import textures
 from jcr.simulate.meshes import box
 from jcr.simulate.objects import CATALOGUE, Part, TableObject
+from jcr.simulate.truth import TrueObject
 
 SceneName = Literal["tabletop", "light8", "light7", "dark", "measuring"]
 TableName = Literal["light", "dark"]
@@ -38,6 +39,8 @@ RECIPES: dict[SceneName, Recipe] = {
 
 _TABLE_SIZE = (0.95, 1.2, 0.04)
 _TEXEL_M = 0.0005
+_GAP = 0.015
+"""Between the bounding circles of neighbours, in metres."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,11 @@ class Scene:
     def labels(self) -> tuple[str, ...]:
         """Name per label: 0 is what is no part of the scene, 1 the table, then the objects."""
         return ("none", "table", *(thing.name for thing in self.objects))
+
+    @property
+    def true_objects(self) -> tuple[TrueObject, ...]:
+        """What there is to measure on the table."""
+        return tuple(thing.measured(label) for label, thing in enumerate(self.objects, start=2))
 
     @property
     def workspace_in_base(self) -> Float[ndarray, "2 3"]:
@@ -103,26 +111,21 @@ def _placed(
     rng: np.random.Generator, things: Sequence[TableObject], center_in_base: Float[ndarray, "3"]
 ) -> tuple[TableObject, ...]:
     """The objects, each turned at random, where the bounding circles of none overlap."""
-    gap, reach = 0.012, 0.2
-    order = sorted(range(len(things)), key=lambda k: -things[k].radius)
-    xy: dict[int, Float[ndarray, 2]] = {}
-    while len(xy) < len(things):
-        xy.clear()
-        # Every round that fails makes the table a little larger, so that this ends.
-        reach *= 1.03
-        for k in order:
-            for _ in range(60):
-                spot = rng.uniform(-1, 1, 2) * reach * (0.9, 1.15)
-                if all(np.linalg.norm(spot - xy[j]) > things[k].radius + things[j].radius + gap for j in xy):
-                    xy[k] = spot
-                    break
-            else:
-                break
-    middle = np.mean([xy[k] for k in range(len(things))], axis=0)
+    radii = np.array([thing.radius for thing in things])
+    spots = np.zeros((len(things), 2))
+    order = rng.permutation(len(things))
+    for count, k in enumerate(order):
+        # The first free spot on the way from the middle outwards, in ever new directions.
+        turn = rng.uniform(0, 2 * np.pi, 500)
+        tries = np.linspace(0, 0.5, 500)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        others = order[:count]
+        clear = np.linalg.norm(tries[:, None] - spots[others], axis=-1) - radii[others] - radii[k]
+        spots[k] = tries[(clear > _GAP).all(1).argmax()]
+    low, high = (spots - radii[:, None]).min(0), (spots + radii[:, None]).max(0)
+    spots -= (low + high) / 2
     placed = []
     for k, thing in enumerate(things):
         turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
-        placed.append(
-            replace(thing, base_from_object=transform(turn, center_in_base + np.append(xy[k] - middle, 0.0)))
-        )
+        middle_in_base = center_in_base + np.append(spots[k], 0.0)
+        placed.append(replace(thing, base_from_object=transform(turn, middle_in_base)))
     return tuple(placed)

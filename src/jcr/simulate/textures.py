@@ -1,4 +1,6 @@
-"""Textures made with NumPy from a seed: wood, speckled laminate, and print for packages and labels."""
+"""Textures made with NumPy from a seed: wood, laminate, print for packages and labels, glaze."""
+
+import colorsys
 
 import cv2
 import numpy as np
@@ -9,7 +11,71 @@ Image = UInt8[ndarray, "h w 3"]
 Color = tuple[float, float, float]
 
 _WORDS = ("COFFEE", "RICE", "TEA", "OATS", "CORN", "SOUP", "PASTA", "SALT", "COCOA", "BEANS", "PLUM", "MINT")
-_FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX_SMALL)
+_FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SIMPLEX)
+
+
+def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: Color) -> Image:
+    """Planks along the rows with year rings, fibres and pores between two colours (h,w,3)."""
+    planks = []
+    edges = np.linspace(0, height, 9).round().astype(int)
+    for rows in np.diff(edges):
+        bend = 30 * _smooth_noise(rng, rows, width, (140, 500)) + 6 * _smooth_noise(
+            rng, rows, width, (50, 150)
+        )
+        across = np.arange(rows, dtype=np.float32)[:, None] + bend
+        spacing = np.float32(rng.uniform(26, 44))
+        ring = 0.5 + 0.5 * np.sin(2 * np.pi * across / spacing + 2 * np.sin(across / (1.3 * spacing)))
+        fibre = _smooth_noise(rng, rows, width, (2, 60)) + _smooth_noise(rng, rows, width, (4, 14))
+        pores = np.clip(_smooth_noise(rng, rows, width, (3, 10)) - 0.7, 0, 1)
+        shade = 0.22 * ring**3 + 0.1 * fibre + 1.5 * pores + np.float32(0.12 + rng.uniform(-0.09, 0.09))
+        # The gap to the next plank.
+        shade[:2] = 0.8
+        planks.append(shade)
+    shade = np.concatenate(planks)[..., None]
+    return _to_image(_rgb(light) * (1 - shade) + _rgb(dark) * shade)
+
+
+def laminate(rng: np.random.Generator, height: int, width: int, color: Color, contrast: float) -> Image:
+    """A plain table top with faint specks and clouds of that contrast (h,w,3)."""
+    specks, clouds = (_smooth_noise(rng, height, width, (cell, cell)) for cell in (4, 150))
+    return _to_image(_rgb(color) * (1 + np.float32(contrast) * (0.5 * specks + 0.5 * clouds)[..., None]))
+
+
+def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
+    """A printed package: a ground colour, a name, a picture of overlapping shapes, small print (h,w,3)."""
+    image = np.full((height, width, 3), _ink(color), np.uint8)
+    inks = [_ink(colorsys.hsv_to_rgb(*rng.uniform((0, 0.25, 0.35), (1, 0.85, 0.95)))) for _ in range(4)]
+    bright = np.mean(color) > 0.45
+    lettering = _ink((0.10, 0.10, 0.16) if bright else (0.95, 0.93, 0.86))
+    band = int(rng.uniform(0.25, 0.35) * height)
+    for _ in range(16):
+        center = int(rng.uniform(0, width)), int(rng.uniform(band, height))
+        axes = tuple(int(v) for v in rng.uniform(0.04, 0.2, 2) * min(height, width))
+        ink, turn_deg = inks[rng.integers(len(inks))], float(rng.uniform(0, 180))
+        if rng.random() < 0.5:
+            cv2.ellipse(image, center, axes, turn_deg, 0, 360, ink, -1, cv2.LINE_AA)
+        else:
+            corners = cv2.boxPoints((center, (2.0 * axes[0], 2.0 * axes[1]), turn_deg))
+            cv2.fillConvexPoly(image, corners.round().astype(np.int32), ink, cv2.LINE_AA)
+    font = _FONTS[rng.integers(len(_FONTS))]
+    _write(image, str(rng.choice(_WORDS)), (0.08, 0.12, 0.84, 0.7 * band / height), lettering, font)
+    for line in range(4):
+        words = " ".join(str(word).lower() for word in rng.choice(_WORDS, 4))
+        _write(image, words, (0.08, 0.72 + 0.06 * line, 0.84, 0.035), lettering, cv2.FONT_HERSHEY_SIMPLEX)
+    grain = 0.03 * _smooth_noise(rng, height, width, (2, 2))
+    return _to_image(np.float32(image) / 255 + grain[..., None])
+
+
+def glaze(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
+    """Painted ceramics or fruit: a ground colour with soft clouds and small dark flecks (h,w,3).
+
+    Its right half mirrors the left, so that it closes around a round thing.
+    """
+    half = width // 2
+    clouds = _smooth_noise(rng, height, half, (height / 5, half / 4))
+    flecks = np.clip(_smooth_noise(rng, height, half, (4, 4)) - 0.55, 0, 1)
+    left = _to_image(_rgb(color) * (1 + 0.12 * clouds[..., None] - 0.7 * flecks[..., None]))
+    return np.concatenate([left, left[:, ::-1]], axis=1)
 
 
 def _smooth_noise(
@@ -20,71 +86,26 @@ def _smooth_noise(
     return cv2.resize(grid.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def _to_image(rgb: Float[ndarray, "h w 3"]) -> Image:
-    return (np.clip(rgb, 0, 1) * 255).round().astype(np.uint8)
-
-
-def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: Color) -> Image:
-    """Planks along the columns with year rings, fibres and pores between two colours (h,w,3)."""
-    planks = []
-    edges = np.linspace(0, height, 9).round().astype(int)
-    for rows in np.diff(edges):
-        bend = 30 * _smooth_noise(rng, rows, width, (140, 500)) + 6 * _smooth_noise(rng, rows, width, (50, 150))
-        across = np.arange(rows, dtype=np.float32)[:, None] + bend
-        spacing = rng.uniform(26, 44)
-        ring = 0.5 + 0.5 * np.sin(2 * np.pi * across / spacing + 2 * np.sin(across / (1.3 * spacing)))
-        fibre = _smooth_noise(rng, rows, width, (2, 60)) + _smooth_noise(rng, rows, width, (4, 14))
-        pores = np.clip(_smooth_noise(rng, rows, width, (3, 10)) - 0.7, 0, 1)
-        shade = 0.22 * ring**3 + 0.1 * fibre + 1.5 * pores + 0.12 + rng.uniform(-0.09, 0.09)
-        shade[:2] = 0.8
-        planks.append(shade)
-    shade = np.concatenate(planks)[..., None]
-    return _to_image(np.array(light) * (1 - shade) + np.array(dark) * shade)
-
-
-def laminate(rng: np.random.Generator, height: int, width: int, color: Color, contrast: float) -> Image:
-    """A plain table top with faint specks and clouds of the given contrast (h,w,3)."""
-    shade = 0.6 * _smooth_noise(rng, height, width, (3, 3)) + 0.4 * _smooth_noise(
-        rng, height, width, (150, 150)
-    )
-    return _to_image(np.array(color) * (1 + contrast * shade[..., None]))
-
-
-def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
-    """A printed package: a ground colour, a picture of overlapping shapes, a name and small print (h,w,3)."""
-    ground = np.array(color)
-    image = np.ascontiguousarray(_to_image(np.broadcast_to(ground, (height, width, 3))))
-    ink = tuple(int(v) for v in (255 * (ground < 0.5)))
-    band = int(rng.uniform(0.28, 0.4) * height)
-    for _ in range(14):
-        center = (int(rng.uniform(0, width)), int(rng.uniform(band, height)))
-        axes = tuple(int(v) for v in rng.uniform(0.04, 0.2, 2) * min(height, width))
-        shade = tuple(int(v) for v in rng.integers(20, 236, 3))
-        if rng.random() < 0.5:
-            cv2.ellipse(image, center, axes, rng.uniform(0, 180), 0, 360, shade, -1, cv2.LINE_AA)
-        else:
-            corners = cv2.boxPoints((center, (2.0 * axes[0], 2.0 * axes[1]), float(rng.uniform(0, 90))))
-            cv2.fillConvexPoly(image, corners.round().astype(np.int32), shade, cv2.LINE_AA)
-    _text(image, str(rng.choice(_WORDS)), (0.06, 0.8 * band / height), 0.88, ink, _FONTS[rng.integers(3)])
-    for line in range(5):
-        words = " ".join(str(word).lower() for word in rng.choice(_WORDS, 4))
-        _text(image, words, (0.08, 0.97 - 0.05 * line), rng.uniform(0.5, 0.8), ink, cv2.FONT_HERSHEY_SIMPLEX)
-    grain = 0.03 * _smooth_noise(rng, height, width, (2, 2))
-    return _to_image(image / 255 + grain[..., None])
-
-
-def _text(
-    image: Image, words: str, at: tuple[float, float], width: float, ink: tuple[int, ...], font: int
+def _write(
+    image: Image, words: str, within: tuple[float, float, float, float], ink: Color, font: int
 ) -> None:
-    """Write `words` into `image`, its lower left corner and width as fractions of the image."""
-    (natural, _), _ = cv2.getTextSize(words, font, 1.0, 1)
-    scale = width * image.shape[1] / natural
-    origin = (int(at[0] * image.shape[1]), int(at[1] * image.shape[0]))
-    cv2.putText(image, words, origin, font, scale, ink, max(1, round(1.7 * scale)), cv2.LINE_AA)
+    """Draw one line of text into `image`, as large as fits the box (left, top, width, height; fractions)."""
+    rows, columns = image.shape[:2]
+    (width, height), _ = cv2.getTextSize(words, font, 1.0, 2)
+    scale = min(within[2] * columns / width, within[3] * rows / height)
+    at = round(within[0] * columns), round(within[1] * rows + scale * height)
+    cv2.putText(image, words, at, font, scale, ink, max(1, round(2 * scale)), cv2.LINE_AA)
 
 
-def glaze(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
-    """Painted ceramics or fruit: a ground colour with soft clouds and small dark flecks (h,w,3)."""
-    clouds = _smooth_noise(rng, height, width, (height / 5, width / 7))
-    flecks = np.clip(_smooth_noise(rng, height, width, (5, 5)) - 0.45, 0, 1)
-    return _to_image(np.array(color) * (1 + 0.12 * clouds[..., None] - 0.9 * flecks[..., None]))
+def _rgb(color: Color) -> Float[ndarray, "3"]:
+    return np.array(color, np.float32)
+
+
+def _ink(color: Color) -> Color:
+    """The colour in OpenCV's 0 to 255."""
+    r, g, b = (round(255 * channel) for channel in color)
+    return r, g, b
+
+
+def _to_image(rgb: Float[ndarray, "h w 3"]) -> Image:
+    return (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)

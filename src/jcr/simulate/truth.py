@@ -10,13 +10,12 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.files import write_text
+from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
 from jcr.records import Intrinsics
-from jcr.simulate.scenes import Scene
 
-DEPTH_UNIT_M = 1e-4
-"""Metres per count in the 16-bit depth images."""
+_DEPTH_UNIT_M = 1e-4
+"""Metres per count of the 16-bit depth images."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +27,11 @@ class TrueObject:
     height: float
     """Of its highest point above the table, in metres."""
     footprint_in_base: Float[ndarray, "k 2"]
-    """Convex outline seen from straight above, in metres."""
+    """Convex outline seen from straight above: x and y in metres."""
     base_from_box: Float[ndarray, "4 4"]
-    """Centre and axes of the smallest upright box around it."""
+    """Centre and axes of the smallest upright box around it, z up."""
     box_size: Float[ndarray, "3"]
-    """In metres along the axes of that box."""
+    """Along the axes of that box, in metres."""
 
 
 @dataclass(frozen=True)
@@ -40,60 +39,29 @@ class Truth:
     """What a simulated capture should be found to show."""
 
     folder: Path
+    """Of the capture."""
     scene: str
     images: tuple[str, ...]
     """As in capture.json."""
     gripper_from_camera: Float[ndarray, "4 4"]
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """Without the robot's noise."""
+    """Where the gripper was, whatever the robot reported."""
     base_from_camera: Float[ndarray, "n 4 4"]
     intrinsics: Intrinsics
     labels: tuple[str, ...]
-    """Name per label; 0 is nothing of the scene, 1 the table."""
+    """Name per label; 0 is what is no part of the scene, 1 the table."""
     table_height: float
     """z of the table top in the base frame, in metres."""
     workspace_in_base: Float[ndarray, "2 3"]
-    """Lowest and highest corner of the box that a map should cover."""
+    """Lowest and highest corner of the box that a map should cover, in metres."""
     objects: tuple[TrueObject, ...]
 
 
-def write_truth(
-    out: Path,
-    scene: Scene,
-    images: list[str],
-    intrinsics: Intrinsics,
-    gripper_from_camera: Float[ndarray, "4 4"],
-    base_from_gripper: Float[ndarray, "n 4 4"],
-) -> None:
-    """Write truth/scene.json of a capture folder."""
-    objects = []
-    for label, thing in enumerate(scene.objects, start=2):
-        around = thing.oriented_box
-        objects.append(
-            {
-                "name": thing.name,
-                "label": label,
-                "height": thing.height,
-                "footprint_in_base": thing.footprint_in_base.tolist(),
-                "base_from_box": around.base_from_box.tolist(),
-                "box_size": around.size.tolist(),
-            }
-        )
-    content = {
-        "format": "jcr.truth/1",
-        "scene": scene.name,
-        "images": images,
-        "gripper_from_camera": gripper_from_camera.tolist(),
-        "base_from_gripper": base_from_gripper.tolist(),
-        "base_from_camera": (base_from_gripper @ gripper_from_camera).tolist(),
-        "intrinsics": asdict(intrinsics),
-        "labels": list(scene.labels),
-        "table_height": scene.table_height,
-        "workspace_in_base": scene.workspace_in_base.tolist(),
-        "objects": objects,
-        "depth_unit_m": DEPTH_UNIT_M,
-    }
-    write_text(out / "truth" / "scene.json", json.dumps(content, indent=1) + "\n")
+def write_truth(truth: Truth) -> None:
+    """Write truth/scene.json of its capture folder."""
+    content = {"format": "jcr.truth/1", "depth_unit_m": _DEPTH_UNIT_M} | asdict(truth)
+    del content["folder"]
+    write_text(_folder(truth) / "scene.json", json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n")
 
 
 def read_truth(folder: Path) -> Truth:
@@ -102,7 +70,7 @@ def read_truth(folder: Path) -> Truth:
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
-        raise InputError(f"{path}: not found; only folders made by jcr simulate have the truth") from None
+        raise InputError(f"{path}: not found; only captures made by jcr simulate have the truth") from None
     camera = content["intrinsics"]
     return Truth(
         folder=folder,
@@ -129,44 +97,62 @@ def read_truth(folder: Path) -> Truth:
     )
 
 
+def write_depth(truth: Truth, image: int, depth: Float[ndarray, "h w"]) -> None:
+    """Write the depth (m) of one image as a 16-bit PNG in tenths of millimetres."""
+    _write(_path(truth, "depth", image), np.round(depth / _DEPTH_UNIT_M).astype(np.uint16))
+
+
+def write_labels(truth: Truth, image: int, label: UInt8[ndarray, "h w"]) -> None:
+    """Write the labels of one image as a PNG."""
+    _write(_path(truth, "labels", image), label)
+
+
 def true_depth(truth: Truth, image: int) -> Float[ndarray, "h w"]:
-    """Depth along the optical axis at every pixel of one image, in metres; 0 where there is nothing."""
-    return _read(truth, "depth", image) * DEPTH_UNIT_M
+    """Depth along the optical axis at the pixels of one image, in metres; 0 where there is nothing."""
+    return _read(_path(truth, "depth", image)) * _DEPTH_UNIT_M
 
 
 def true_labels(truth: Truth, image: int) -> UInt8[ndarray, "h w"]:
-    """Label of every pixel of one image."""
-    return _read(truth, "labels", image)
+    """Labels of the pixels of one image."""
+    return _read(_path(truth, "labels", image))
 
 
 def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
-    """The visible surface in the base frame: points (n,3) m of all images' pixels, and their labels (n,).
+    """The surface that the images show: points in the base frame (n,3) m, one a pixel, and their labels (n,).
 
-    Only the table and the objects, within the workspace box. InputError without depth images (`--truth scene`).
+    Table and objects within the workspace box. InputError where the depth was not written (`--truth scene`).
     """
     truth = read_truth(folder)
     camera = truth.intrinsics
-    x, y = np.meshgrid(
-        (np.arange(camera.width) - camera.cx) / camera.fx, (np.arange(camera.height) - camera.cy) / camera.fy
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays_in_camera = np.stack(
+        [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(x.shape)], -1
     )
-    rays_in_camera = np.stack([x, y, np.ones_like(x)], -1)
-    points, labels = [], []
-    for k in range(len(truth.images)):
-        label = true_labels(truth, k)
-        seen = label > 0
-        points.append(
-            apply(truth.base_from_camera[k], rays_in_camera[seen] * true_depth(truth, k)[seen][:, None])
-        )
-        labels.append(label[seen].astype(np.int64))
-    points_in_base, label = np.concatenate(points), np.concatenate(labels)
     low, high = truth.workspace_in_base
-    inside = ((points_in_base >= low) & (points_in_base <= high)).all(1)
-    return points_in_base[inside], label[inside]
+    points, labels = [], []
+    for k, base_from_camera in enumerate(truth.base_from_camera):
+        depth, label = true_depth(truth, k), true_labels(truth, k)
+        x_in_base = apply(base_from_camera, depth[..., None] * rays_in_camera)
+        shown = (label > 0) & ((x_in_base >= low) & (x_in_base <= high)).all(-1)
+        points.append(x_in_base[shown])
+        labels.append(label[shown].astype(np.int64))
+    return np.concatenate(points), np.concatenate(labels)
 
 
-def _read(truth: Truth, kind: str, image: int) -> ndarray:
-    path = truth.folder / "truth" / kind / f"{Path(truth.images[image]).stem}.png"
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise InputError(f"{path}: not readable; simulate again with --truth full")
-    return picture
+def _folder(truth: Truth) -> Path:
+    return truth.folder / "truth"
+
+
+def _path(truth: Truth, kind: str, image: int) -> Path:
+    return _folder(truth) / kind / f"{Path(truth.images[image]).stem}.png"
+
+
+def _write(path: Path, pixels: ndarray) -> None:
+    write_bytes(path, cv2.imencode(".png", pixels)[1].tobytes())
+
+
+def _read(path: Path) -> ndarray:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if pixels is None:
+        raise InputError(f"{path}: not readable; simulate the capture again with --truth full")
+    return pixels
