@@ -31,7 +31,7 @@ def rotation_log(rotation: Rotations) -> Vectors:
     return flat.reshape(*rotation.shape[:-2], 3)
 
 
-def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"]:
+def rotation_angle(rotation: Rotations) -> Float[ndarray, "*batch"] | np.floating:
     """Angle of rotation in [0, π] rad, accurate near both ends (unlike arccos of the trace)."""
     return np.linalg.norm(rotation_log(rotation), axis=-1)
 
@@ -43,7 +43,9 @@ def skew(v: Vectors) -> Rotations:
     return out - np.swapaxes(out, -1, -2)
 
 
-def transform(rotation: Rotations, translation: Vectors) -> Transforms:
+def transform(
+    rotation: Float[ndarray, "*#batch 3 3"], translation: Float[ndarray, "*#batch 3"]
+) -> Float[ndarray, "... 4 4"]:
     """Assemble (...,4,4) from rotation (...,3,3) and translation (...,3), which broadcast."""
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     out = np.zeros((*batch, 4, 4))
@@ -97,7 +99,9 @@ def fit_similarity(
     return transform(rotation, mean_a - scale * rotation @ mean_b), scale
 
 
-def rotation_between_deg(a: Rotations, b: Rotations) -> Float[ndarray, "*batch"]:
+def rotation_between_deg(
+    a: Float[ndarray, "*#batch 3 3"], b: Float[ndarray, "*#batch 3 3"]
+) -> Float[ndarray, "..."] | np.floating:
     """Angle in degrees between two (stacks of) rotations."""
     return np.degrees(rotation_angle(np.swapaxes(a, -1, -2) @ b))
 

@@ -187,7 +187,7 @@ def _with_backend(options: RunOptions | None, backend: str | None) -> RunOptions
 
 @contextmanager
 def _run_folder(folder: Path) -> Iterator[Path]:
-    """The folder, made and held: a second run on it is told so, and writes nothing between the first's files."""
+    """The folder, made and held, so that a second run on it writes nothing between the first one's files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")

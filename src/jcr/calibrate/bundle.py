@@ -183,7 +183,7 @@ def _minimise(
 
 
 def _seen_from(bundle: Bundle, problem: _Problem) -> tuple[ndarray, ndarray, ndarray]:
-    """Each observation's point in the gripper, from the camera's centre in gripper axes, and in the camera."""
+    """Each point seen: in the gripper, from the camera's centre in gripper axes, and in the camera."""
     gripper = bundle.base_from_gripper[problem.image]
     from_gripper = bundle.points_in_base[problem.point] - gripper[:, :3, 3]
     in_gripper = np.einsum("kji,kj->ki", gripper[:, :3, :3], from_gripper)

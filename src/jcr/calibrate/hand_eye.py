@@ -53,7 +53,7 @@ def solve_hand_eye(
     fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues)
     back = np.argsort(order)
     used = used_sorted[back]
-    seen = observability(gripper[used], fit.gripper_from_camera, cues)
+    seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     held_out = _held_out(fit, used_sorted)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
     hand_eye = HandEye(

@@ -9,7 +9,7 @@ for general motion, and the sine of the deviation for a nearly degenerate one.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibrate.pose_fit import Cues, Poses
@@ -70,98 +70,98 @@ def excitation(
 def observability(
     base_from_gripper: Poses,
     gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    recon_from_camera: Poses | None = None,
     cues: Cues | None = None,
 ) -> Observability:
-    """The unseen directions named, one cure each; X, where known, tells a look-at orbit from a fixed tool."""
+    """The unseen directions named, one cure each; camera poses, if given, tell an orbit from a fixed tool."""
     n = len(base_from_gripper)
-    found = excitation(base_from_gripper, gripper_from_camera, cues)
-    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
-    threshold = WEAK * min(1.0, max(n - 2, 0.5) / 4)
-    unseen = found.value < threshold
     if n == 2:
         return Observability(
             False,
             ("offset along, and turn about, the one axis that two images share",),
             ("add one image or more, turned by 20° or more about another axis",),
         )
+    found = excitation(base_from_gripper, gripper_from_camera, cues)
+    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
+    few = min(1.0, (n - 2) / 4)
+    unseen = found.value < WEAK * few
     if not unseen.any():
         return Observability(True, (), ())
-    grade = "" if found.value[0] < EXACT * min(1.0, max(n - 2, 0.5) / 4) else "nearly unseen: "
-    names, advice = _explain(base_from_gripper, gripper_from_camera, found, unseen)
+    grade = "" if found.value[0] < EXACT * few else "nearly unseen: "
+    names, advice = _explain(base_from_gripper, recon_from_camera, found, unseen)
     return Observability(False, tuple(grade + name for name in names), advice)
+
+
+Words = tuple[tuple[str, ...], tuple[str, ...]]
+"""Names of what is unseen, and cures."""
 
 
 def _explain(
     base_from_gripper: Poses,
-    gripper_from_camera: Float[ndarray, "4 4"] | None,
+    recon_from_camera: Poses | None,
     found: Excitation,
-    unseen: ndarray,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    rotation = base_from_gripper[:, :3, :3]
+    unseen: Bool[ndarray, "7"],
+) -> Words:
     # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
-    u, length, vt = np.linalg.svd(rotation.mean(0))
+    u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
-    parts = np.linalg.norm(found.direction[unseen][:, :3], axis=0), np.abs(found.direction[unseen])
-    sees_scale = parts[1][:, 6].max() < 0.2
     if still.all():
-        return (
-            "offset of the camera on the gripper in x, y and z: the gripper never rotates (pure translation)",
-        ), ("tilt the wrist by 20° or more, about two different axes, in at least three images",)
+        return ("offset of the camera in x, y and z: the gripper never rotates (pure translation)",), (
+            "tilt the wrist by 20° or more, about two different axes, in at least three images",
+        )
+    loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
     if still.any():
-        axis = u[:, 0]
-        name = f"offset along {_axis_words(axis, 'base')}: all rotations are about it"
-        cure = f"tilt the wrist by 20° or more away from {_axis_words(axis, 'base')} in two images"
-        if unseen.sum() == 1 and sees_scale:
-            return (f"{name} (planar or SCARA motion)",), (
-                cure + ", or give the camera's known height along it",
+        axis = _axis_words(u[:, 0], "base")
+        cure = f"tilt the wrist by 20° or more away from {axis} in two images"
+        if unseen.sum() == 1 and not loses_scale:
+            return (f"offset along {axis}: all rotations are about it (planar or SCARA motion)",), (
+                f"{cure}, or give the camera's known height along it",
             )
-        return (
-            name + " (one fixed axis)",
+        names = (
+            f"offset along {axis}: all rotations are about it (one fixed axis)",
             "scale: the camera moves on circles about one axis only",
-            f"turn of the camera about {_axis_words(axis, 'base')}",
-        )[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height between images")
-    if not sees_scale:
-        return _scale_words(base_from_gripper, gripper_from_camera)
+            f"turn of the camera about {axis}",
+        )
+        return names[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height as well")
+    if loses_scale:
+        return _lost_scale(base_from_gripper, recon_from_camera)
     weakest = found.direction[0]
-    what = "offset" if np.linalg.norm(weakest[:3]) > np.linalg.norm(weakest[3:6]) else "turn"
-    axis = weakest[:3] if what == "offset" else weakest[3:6]
+    what, axis = max(
+        (("offset", weakest[:3]), ("turn", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
+    )
     return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
         "turn the wrist more, about axes at right angles to each other, in three or more images",
     )
 
 
-def _scale_words(
-    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"] | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Words:
     """Scale is lost when a point fixed to the gripper stays where it is: which point, and what moves it."""
-    point = fixed_point(base_from_gripper)
-    cure = "take two or more images 20 % nearer to or farther from that point"
-    if gripper_from_camera is None:
-        return (
-            f"scale: all views turn about one point {np.linalg.norm(point):.2f} m from the gripper's origin",
-        ), (cure,)
-    to_point = point - gripper_from_camera[:3, 3]
-    radius = float(np.linalg.norm(to_point))
-    optical_axis = gripper_from_camera[:3, 2]
-    if radius < 0.03:
+    tool = ", ".join(f"{1e3 * x:.0f}" for x in still_point(base_from_gripper)[0])
+    nearer = "take two or more images 20 % nearer to or farther from the point you look at"
+    if recon_from_camera is None:
+        return (f"scale: all views turn about the one point ({tool}) mm in the gripper frame",), (nearer,)
+    # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
+    in_camera, moves, spread = still_point(recon_from_camera)
+    if moves > 0.5 * spread:
         return ("scale: the camera only turns about its own centre",), (
             "move the camera sideways by 10 cm or more between images",
         )
-    if to_point @ optical_axis > np.cos(np.radians(15)) * radius:
-        return (
-            f"scale and the offset along the optical axis: a look-at orbit at a constant {radius:.2f} m",
-        ), (cure,)
-    where = ", ".join(f"{1e3 * x:.0f}" for x in point)
-    return (f"scale: every view turns about one tool point fixed at ({where}) mm in the gripper frame",), (
+    if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
+        return ("scale and the offset along the optical axis: a look-at orbit at a constant radius",), (
+            nearer,
+        )
+    return (f"scale: all views turn about one tool point fixed at ({tool}) mm in the gripper frame",), (
         "move that point too: take two or more images with it 10 cm away from where it was",
     )
 
 
-def fixed_point(base_from_gripper: Poses) -> Float[ndarray, "3"]:
-    """The point in the gripper frame that moves least in the base, by least squares."""
-    rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]
-    rows = (rotation - rotation.mean(0)).reshape(-1, 3)
-    return np.linalg.lstsq(rows, -(position - position.mean(0)).ravel(), rcond=1e-9)[0]
+def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
+    """The point of frame b that moves least in a, how far it moves, and how far b's origin does (rms)."""
+    rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
+    rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
+    point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]
+    n = len(a_from_b)
+    return point, float(np.linalg.norm(rows @ point + right)) / n**0.5, float(np.linalg.norm(right)) / n**0.5
 
 
 def _axis_words(axis: Float[ndarray, "3"], frame: str) -> str:

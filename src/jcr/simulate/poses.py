@@ -138,14 +138,14 @@ def _pivot(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.ra
     tool_in_gripper = np.array([0.0, 0.0, 0.2])
     base_from_gripper = start @ inverse(gripper_from_camera)
     about_tool = transform(np.eye(3), base_from_gripper[:3, :3] @ tool_in_gripper + base_from_gripper[:3, 3])
-    return about_tool @ transform(_tilts(count, 20, 60, rng), np.zeros(3)) @ inverse(about_tool) @ start
+    return about_tool @ transform(_tilts(count, 20.0, 60.0, rng), np.zeros(3)) @ inverse(about_tool) @ start
 
 
 def _camera_centre(
     count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator
 ) -> Cameras:
     start = _look_at(target[None], *np.array([[180.0], [75.0], [0.6], [rng.uniform(-20, 20)]]))[0]
-    return transform(_tilts(count, 12, 60, rng) @ start[:3, :3], start[:3, 3])
+    return transform(_tilts(count, 12.0, 60.0, rng) @ start[:3, :3], start[:3, 3])
 
 
 def _tilts(count: int, tilt_deg: float, yaw_deg: float, rng: np.random.Generator) -> Float[ndarray, "n 3 3"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.geometry import inverse, rotation_exp, rotation_log, scale_translation, transform
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 
 TARGET_IN_BASE = np.array([0.5, 0.0, 0.0])
@@ -57,7 +57,7 @@ def hand_eye_problem(
 def disturbed(
     a_from_b: Float[ndarray, "n 4 4"], noise: tuple[float, float], rng: np.random.Generator
 ) -> Float[ndarray, "n 4 4"]:
-    """Transforms with Gaussian errors: position in a's axes (m), rotation in b's (rad), one sigma per axis."""
+    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), rotation in b's (rad)."""
     rotation = a_from_b[:, :3, :3] @ rotation_exp(noise[1] * rng.normal(size=(len(a_from_b), 3)))
     return transform(rotation, a_from_b[:, :3, 3] + noise[0] * rng.normal(size=(len(a_from_b), 3)))
 
@@ -66,8 +66,6 @@ def error(
     problem: HandEyeProblem, gripper_from_camera: Float[ndarray, "4 4"], scale: float
 ) -> Float[ndarray, "7"]:
     """True minus found, in records.COVARIANCE_ORDER."""
-    from jcr.geometry import rotation_log
-
     true = problem.gripper_from_camera
     return np.concatenate(
         [
