@@ -1,0 +1,252 @@
+"""Pairwise pointmaps of a capture: an encoder per image, a decoder per ordered pair, a memory budget."""
+
+import logging
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from jcr.errors import InputError
+from jcr.reconstruct.dust3r.network import PATCH, Dust3r, Features
+from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
+from jcr.reconstruct.dust3r.pairs import PairPredictions, complete_pairs, overlapping_pairs, window_pairs
+from jcr.reconstruct.dust3r.preprocess import PreparedImages
+from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, float], None]
+"""Told the stage's name and the fraction of it that is done."""
+
+GB = 1e9
+FEW_IMAGES = 12
+"""Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
+MAX_BATCH = {"cpu": 1, "cuda": 16}
+"""Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Which pairs of images the network sees, and within what memory."""
+
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """complete: all pairs; window: images near each other in the capture's order; robot: all but the pairs
+    that by the robot's poses have no view in common; auto: complete up to 12 images, robot beyond."""
+    window: int = 3
+    """How far apart in the capture's order two images of a pair may be (window only)."""
+    image_size: Literal[512, 224] = 512
+    """Long edge the network sees in pixels; 224 is four to five times faster and coarser."""
+    memory_gb: float = 8.0
+    """Budget on the device that computes, and for the pointmaps in main memory."""
+    cache: Path | None = None
+    """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
+    cache_gb: float = 4.0
+    """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Bytes that predicting pairs will take."""
+
+    weights: int
+    features: int
+    """Of all images."""
+    per_pair: int
+    """Working memory of the decoder and heads, per pair of a batch."""
+    pointmaps: int
+    """Of all pairs, in main memory."""
+
+    def batch(self, budget: float, device: str, pointmaps_in_memory: bool) -> int:
+        """Pairs that fit into `budget` bytes beside what stays; InputError when not even one does."""
+        stays = self.weights + self.features
+        if device == "cpu" and pointmaps_in_memory:
+            stays += self.pointmaps
+        pairs = int((budget - stays) // self.per_pair)
+        if pairs < 1:
+            raise InputError(
+                f"one pair of images needs {(stays + self.per_pair) / GB:.2g} GB on the {device}, the budget "
+                f"is {budget / GB:.2g}; raise --memory-gb, or use --image-size 224"
+            )
+        return min(pairs, MAX_BATCH[device])
+
+
+def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width: int) -> MemoryEstimate:
+    """What predicting `pairs` pairs of `images` images of height x width pixels will take."""
+    weights = sum(tensor.numel() * tensor.element_size() for tensor in network.parameters())
+    pixels, tokens = height * width, height * width // PATCH**2
+    enc_dim, dec_dim = network.decoder_embed.in_features, network.decoder_embed.out_features
+    # Every layer of both views is kept for the heads; a block works on about 12 arrays of its width.
+    blocks = 4 * tokens * (2 * (len(network.dec_blocks) + 1) * dec_dim + 12 * max(enc_dim, dec_dim))
+    # A DPT head's widest moment: 128 channels at full resolution before and after a convolution, its
+    # workspace, and 256 channels at half of it. Measured 0.36 GB at 512x384.
+    head = pixels * 1900 if hasattr(network.downstream_head1, "dpt") else pixels * 32
+    return MemoryEstimate(weights, 4 * images * tokens * enc_dim, blocks + head, pairs * pixels * 8 * 4)
+
+
+def predict_pairs(
+    loaded: LoadedNetwork,
+    images: PreparedImages,
+    names: tuple[str, ...],
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    options: PairOptions | None = None,
+    progress: Progress | None = None,
+) -> tuple[PairPredictions, tuple[str, ...]]:
+    """Pointmaps of the pairs of a capture's images, and notes on what was left out.
+
+    Pairs found in the cache are not computed again. On CUDA that runs out of memory the batch is halved, then
+    the CPU takes over. Raises InputError when one pair does not fit the memory budget.
+    """
+    options = options or PairOptions()
+    count = len(images.colors)
+    predictor = _Predictor(loaded, images, names, options, progress or (lambda stage, fraction: None))
+    graph = options.pair_graph
+    if graph == "auto":
+        graph = "complete" if count <= FEW_IMAGES else "robot"
+    if graph == "complete":
+        return predictor.predict(complete_pairs(count)), ()
+    if graph == "window":
+        return predictor.predict(window_pairs(count, options.window)), ()
+    neighbours = predictor.predict(window_pairs(count, 1))
+    edges, note = overlapping_pairs(neighbours, base_from_gripper)
+    return predictor.predict(edges, neighbours), (note,)
+
+
+class _Predictor:
+    """The state that calls share: encoded images, the size of a batch that fits, the device still in use."""
+
+    def __init__(
+        self,
+        loaded: LoadedNetwork,
+        images: PreparedImages,
+        names: tuple[str, ...],
+        options: PairOptions,
+        progress: Progress,
+    ) -> None:
+        self.loaded, self.images, self.names = loaded, images, names
+        self.network = loaded.network
+        self.device = self.network.mask_token.device
+        self.budget = options.memory_gb * GB
+        self.progress = progress
+        self.tokens: dict[int, Tensor] = {}
+        self.batch = 0
+        self.cache = (
+            PairCache(options.cache or user_cache(), int(options.cache_gb * GB)) if options.cache_gb else None
+        )
+        mixed = self.network.mixed_precision
+        self.key = f"{fingerprint(self.network)} {self.device.type} {mixed}".encode()
+        self.image_keys = [blake2b(image.tobytes()).digest() for image in images.colors]
+
+    def predict(self, edges: Int[ndarray, "e 2"], known: PairPredictions | None = None) -> PairPredictions:
+        """Pointmaps of `edges`, from `known` or the cache where they are there."""
+        height, width = self.images.colors.shape[1:3]
+        estimate = estimate_memory(self.network, len(self.images.colors), len(edges), height, width)
+        # Pointmaps that would fill half the budget live in a file that the system pages in and out.
+        in_memory = estimate.pointmaps <= self.budget / 2
+        self.batch = estimate.batch(self.budget, self.device.type, in_memory)
+        shapes = ((height, width, 3), (height, width)) * 2
+        arrays = [_new_array((len(edges), *shape), in_memory) for shape in shapes]
+        rows = {} if known is None else {tuple(edge): row for row, edge in enumerate(known.edges.tolist())}
+        missing = []
+        for e, edge in enumerate(edges.tolist()):
+            found = None
+            if known is not None and (row := rows.get(tuple(edge))) is not None:
+                found = [known.pts3d[row], known.conf[row], known.pts3d_in_other_view[row], known.conf2[row]]
+            elif self.cache is not None:
+                found = self.cache.read(self._pair_key(edge), shapes)
+            if found is None:
+                missing.append(e)
+            else:
+                for array, values in zip(arrays, found, strict=True):
+                    array[e] = values
+        needed = np.setdiff1d(edges[missing], list(self.tokens))
+        self._in_batches("encode images", needed, self._encode)
+        self._in_batches(
+            "predict pairs", np.array(missing, dtype=np.int64), lambda part: self._decode(part, edges, arrays)
+        )
+        if self.cache is not None:
+            self.cache.prune()
+        return PairPredictions(
+            edges,
+            *arrays,
+            images=self.names,
+            colors=self.images.colors,
+            intrinsics=self.images.intrinsics,
+            grid=self.images.grid,
+            is_metric=self.loaded.is_metric,
+        )
+
+    def _pair_key(self, edge: list[int]) -> str:
+        return blake2b(
+            self.key + b"".join(self.image_keys[image] for image in edge), digest_size=20
+        ).hexdigest()
+
+    @torch.inference_mode()
+    def _encode(self, rows: Int[ndarray, " b"]) -> None:
+        images = torch.from_numpy(self.images.colors[rows]).to(self.device).permute(0, 3, 1, 2)
+        tokens = self.network.encode((images / 255 - 0.5) / 0.5).tokens
+        self.tokens.update(zip(rows.tolist(), tokens.split(1), strict=True))
+
+    @torch.inference_mode()
+    def _decode(self, rows: Int[ndarray, " b"], edges: Int[ndarray, "e 2"], arrays: list[ndarray]) -> None:
+        height, width = self.images.colors.shape[1:3]
+        grid = (height // PATCH, width // PATCH)
+        view1, view2 = self.network.decode(
+            *(Features(torch.cat([self.tokens[row] for row in edges[rows, side]]), grid) for side in (0, 1))
+        )
+        for array, values in zip(arrays, (*view1, *view2), strict=True):
+            array[rows] = values.cpu().numpy()
+        if self.cache is not None:
+            for row in rows:
+                self.cache.write(self._pair_key(edges[row].tolist()), [array[row] for array in arrays])
+
+    def _in_batches(self, stage: str, rows: Int[ndarray, " r"], work: Callable[[ndarray], None]) -> None:
+        """Do `work` on `rows` in batches as large as memory turns out to allow."""
+        done = 0
+        while done < len(rows):
+            part = rows[done : done + self.batch]
+            try:
+                work(part)
+            except torch.cuda.OutOfMemoryError:
+                fits = False
+            else:
+                fits = True
+            if fits:
+                done += len(part)
+                self.progress(stage, done / len(rows))
+            else:
+                # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
+                self._ask_less()
+
+    def _ask_less(self) -> None:
+        if self.batch > 1:
+            self.batch //= 2
+            logger.warning(
+                "out of memory on the %s: going on with %d pairs at a time", self.device, self.batch
+            )
+        elif self.device.type == "cuda":
+            logger.warning("one pair does not fit on the %s: going on, slowly, on the CPU", self.device)
+            self.device = torch.device("cpu")
+            self.network.to(self.device)
+            self.tokens = {row: tokens.cpu() for row, tokens in self.tokens.items()}
+        else:
+            raise InputError(
+                "out of memory with one pair of images; close other programs or use --image-size 224"
+            )
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+
+
+def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
+    """Uninitialised float32, in memory or in a nameless file that goes with the array."""
+    if in_memory:
+        return np.empty(shape, np.float32)
+    with tempfile.TemporaryFile() as stream:
+        return np.memmap(stream, np.float32, "w+", shape=shape)
