@@ -1,4 +1,4 @@
-"""The calibration from poses: known answers, invariances, outliers, coverage, motions that show too little."""
+"""The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
 
 import cv2
 import numpy as np
@@ -159,7 +159,8 @@ UNSEEN = {
     "one-axis": "one fixed axis",
     "planar": "planar or SCARA",
     "orbit": "look-at orbit",
-    "pivot": "tool point",
+    # A tool point that happens to lie on the optical axis makes an orbit of the pivot.
+    "pivot": "all views turn about one",
     "camera-centre": "its own centre",
 }
 

@@ -147,9 +147,10 @@ def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Wo
             "move the camera sideways by 10 cm or more between images",
         )
     if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
-        return ("scale and the offset along the optical axis: a look-at orbit at a constant radius",), (
-            nearer,
-        )
+        return (
+            "scale and the offset along the optical axis: all views turn about one point on it "
+            "(look-at orbit at a constant radius)",
+        ), (nearer,)
     return (f"scale: all views turn about one tool point fixed at ({tool}) mm in the gripper frame",), (
         "move that point too: take two or more images with it 10 cm away from where it was",
     )

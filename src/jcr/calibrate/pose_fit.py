@@ -149,6 +149,17 @@ def fit_poses(
     return PoseFit(x, scale, z, r_t, r_r, (sigma_t, sigma_r), dof, hessian, hat)
 
 
+def pose_information(
+    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"], noise: tuple[float, float]
+) -> Float[ndarray, "n 13 13"]:
+    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its picture shows."""
+    # Any frame and unit of the reconstruction will do: the base's, in metres.
+    camera = base_from_gripper @ gripper_from_camera
+    _, _, j_t, j_r = _residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
+    j = np.concatenate([j_t / noise[0], j_r / noise[1]], axis=1)
+    return np.swapaxes(j, 1, 2) @ j
+
+
 def predict(
     x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
 ) -> Poses:
