@@ -7,8 +7,10 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibrate.bundle import Adjusted, adjust, lens_of, median_reprojection
+from jcr.calibrate.conventions import better_reading, explained
+from jcr.calibrate.cues import height_cue, length_cue
 from jcr.calibrate.hand_eye import judged, solve_hand_eye
-from jcr.calibrate.pose_fit import deleted_residuals, widening
+from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
 from jcr.calibrate.residuals import paper_residuals
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
@@ -24,6 +26,10 @@ class CalibrateOptions:
 
     robot_noise: tuple[float, float] | None = None
     """One-sigma noise of the gripper poses per axis, MM DEG; estimated from the data when left out."""
+    known_height: float | None = None
+    """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
+    known_length: tuple[str, float, float, float, float, float] | None = None
+    """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
     bundle_adjustment: bool = True
     """Refine with the image correspondences; without, the camera poses alone decide."""
 
@@ -43,13 +49,16 @@ def calibrate(
     noise = None
     if options.robot_noise is not None:
         noise = (options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1])))
-    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise)
+    cues = _cues(capture, reconstruction, options)
+    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues)
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
+    if not hand_eye.converged:
+        return _investigated(hand_eye, gripper, camera)
     used = hand_eye.inliers
     tracks = _of_images(reconstruction.tracks, used)
     if (
         not options.bundle_adjustment
-        or not hand_eye.observability.observable
+        or cues is not None  # bundle adjustment knows the robot's scale and height alone
         or len(tracks.image) < MIN_OBSERVATIONS
         or used.sum() < 3
     ):
@@ -64,6 +73,29 @@ def calibrate(
         refine_lens=capture.intrinsics is None,
     )
     return judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
+
+
+def _cues(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:
+    if options.known_height is None and options.known_length is None:
+        return None
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    scale = offset = None
+    if options.known_height is not None:
+        offset = height_cue(gripper, options.known_height / 1e3)
+    if options.known_length is not None:
+        image, *ends, length_mm = options.known_length
+        scale = length_cue(capture, reconstruction, image, np.array(ends).reshape(2, 2), length_mm / 1e3)
+    return Cues(scale, offset)
+
+
+def _investigated(
+    hand_eye: HandEye, gripper: Float[ndarray, "m 4 4"], camera: Float[ndarray, "m 4 4"]
+) -> HandEye:
+    """A fit that failed, with the reading of the poses that would fit, if there is one."""
+    found = better_reading(gripper, camera)
+    if found is None:
+        return hand_eye
+    return replace(hand_eye, warnings=(explained(found), *hand_eye.warnings))
 
 
 def _of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:

@@ -18,6 +18,7 @@ from jcr.errors import InputError, NotTrustedError
 COMMANDS = {
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
+    "check": "reads and judges a capture before any heavy work",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
     "compare": "difference of two calibrations in mm and degrees",

@@ -1,9 +1,13 @@
 """The back ends: each makes the same Reconstruction of a capture. One file and one row here is a new one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Literal
+
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.progress import Progress
@@ -60,7 +64,31 @@ def reconstruct(
     name = chosen(options)
     if name not in BACKENDS:
         raise InputError(f"--backend {name}: no such back end; there are {', '.join(BACKENDS)}")
-    return BACKENDS[name].reconstruct(capture, options, progress)
+    # By name, so that the order of the frames changes nothing.
+    order = np.argsort(np.array(capture.images), kind="stable")
+    by_name = replace(
+        capture,
+        images=tuple(capture.images[k] for k in order),
+        base_from_gripper=capture.base_from_gripper[order],
+    )
+    return _of_capture(BACKENDS[name].reconstruct(by_name, options, progress), order)
+
+
+def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
+    """The reconstruction with its images in the capture's own order, of which row k was taken as order[k]."""
+    image_index = order[reconstruction.image_index]
+    rows = np.argsort(image_index)
+    row_of = np.argsort(rows)
+    tracks = reconstruction.tracks
+    return replace(
+        reconstruction,
+        image_index=image_index[rows],
+        recon_from_camera=reconstruction.recon_from_camera[rows],
+        points_in_recon=reconstruction.points_in_recon[rows],
+        confidence=reconstruction.confidence[rows],
+        colors=reconstruction.colors[rows],
+        tracks=replace(tracks, image=row_of[tracks.image]),
+    )
 
 
 def chosen(options: ReconstructOptions) -> str:

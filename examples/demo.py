@@ -1,0 +1,34 @@
+"""The main job on the bundled capture: calibrate the camera, map the table, and hold both against the truth."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+import jcr
+from jcr.cli.result import summary
+from jcr.geometry import fit_similarity, rotation_between_deg
+from jcr.progress import progress_bars
+
+root = Path(__file__).parent.parent
+start = time.perf_counter()
+capture = jcr.read_capture(root / "examples/tabletop")
+with progress_bars() as progress:
+    result = jcr.run(capture, root / "out/demo", progress=progress)
+seconds = time.perf_counter() - start
+
+hand_eye = result.hand_eye
+truth = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])
+centers = (capture.base_from_gripper @ truth)[:, :3, 3][result.reconstruction.image_index]
+_, true_scale = fit_similarity(centers, result.reconstruction.recon_from_camera[:, :3, 3])
+error_mm = 1e3 * np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - truth[:3, 3])
+error_deg = rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth[:3, :3])
+
+print()
+print(summary(result))
+print(
+    f"against the truth: {error_mm:.3f} mm, {error_deg:.4f}°, scale {100 * (hand_eye.scale / true_scale - 1):+.3f} %"
+    f" ({seconds:.0f} s)"
+)
+print(f"report: {result.out / 'report.html'}")

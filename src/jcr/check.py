@@ -1,0 +1,119 @@
+"""Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.calibrate.conventions import better_reading, explained
+from jcr.calibrate.hand_eye import solve_hand_eye
+from jcr.calibrate.next_poses import ASSUMED_NOISE, NextPose, next_poses
+from jcr.calibrate.observability import observability
+from jcr.capture.images import read_image
+from jcr.errors import NotTrustedError
+from jcr.geometry import inverse, rotation_angle
+from jcr.progress import Progress
+from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.lens import fold_distance_px
+from jcr.records import Capture, HandEye, Observability
+
+BLURRED = 0.25
+"""Share of the median image's sharpness below which an image is called blurred."""
+DARK, BRIGHT = 12, 243
+"""Mean grey levels of 255 beyond which an image shows nothing."""
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What is known of a capture before it is calibrated."""
+
+    sharpness: Float[ndarray, " n"]
+    """Variance of the Laplacian, relative to the median image's."""
+    largest_move_m: float
+    largest_turn_rad: float
+    """Between any two gripper poses."""
+    observability: Observability
+    expected_std: Float[ndarray, "7"]
+    """records.COVARIANCE_ORDER, for the noise that was given or assumed."""
+    suggestions: tuple[NextPose, ...]
+    hand_eye: HandEye | None
+    """From sparse features, where the pictures were looked at and registered."""
+    faults: tuple[str, ...]
+    """Why a calibration of this capture would not be trusted."""
+    remarks: tuple[str, ...]
+
+
+def check(
+    capture: Capture,
+    suggest: int = 0,
+    look: bool = True,
+    robot_noise: tuple[float, float] | None = None,
+    reach: Float[ndarray, "2 3"] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Examination:
+    """Examine a capture; with `look` its pictures are registered sparsely to hold the poses against them.
+
+    `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis.
+    """
+    gripper = capture.base_from_gripper
+    motion = inverse(gripper)[:, None] @ gripper[None]
+    move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
+    turn = float(rotation_angle(motion[..., :3, :3]).max())
+    brightness, sharpness = _looks(capture)
+    remarks = list(_picture_remarks(capture, brightness, sharpness))
+    if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
+        remarks.append(
+            f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
+        )
+    if move < 5e-3 and turn > np.radians(5):
+        remarks.append(
+            f"the gripper moves by at most {1e3 * move:.2g} mm while it turns by {np.degrees(turn):.0f}°: "
+            "positions that were divided by 1000 look so"
+        )
+    hand_eye, faults = None, []
+    if look:
+        try:
+            found = reconstruct(capture, ColmapOptions(seed=seed, dense=False), progress)
+        except NotTrustedError as error:
+            remarks.append(str(error))
+        else:
+            used = gripper[found.image_index]
+            hand_eye = solve_hand_eye(used, found.recon_from_camera, robot_noise=robot_noise)
+            if (reading := better_reading(used, found.recon_from_camera)) is not None:
+                faults.append(explained(reading))
+            faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
+            remarks += [*found.notes]
+    trusted = hand_eye is not None and hand_eye.converged
+    x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
+    seen = hand_eye.observability if hand_eye is not None else observability(gripper)
+    if hand_eye is None:
+        faults += [f"{name}; {cure}" for name, cure in zip(seen.unobservable, seen.advice, strict=False)]
+    noise = robot_noise or ASSUMED_NOISE
+    if hand_eye is not None and trusted and robot_noise is None:
+        noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
+    expected, suggestions = next_poses(gripper, suggest, x, noise, reach, seed)
+    return Examination(
+        sharpness, move, turn, seen, expected, tuple(suggestions), hand_eye, tuple(faults), tuple(remarks)
+    )
+
+
+def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
+    """Mean grey level and relative sharpness of every image."""
+    import cv2
+
+    brightness, sharpness = [], []
+    for name in capture.images:
+        grey = cv2.cvtColor(read_image(capture.folder / name), cv2.COLOR_RGB2GRAY)
+        brightness.append(float(grey.mean()))
+        sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
+    return np.array(brightness), np.array(sharpness) / max(float(np.median(sharpness)), 1e-9)
+
+
+def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):
+    for name, grey, sharp in zip(capture.images, brightness, sharpness, strict=True):
+        if not DARK < grey < BRIGHT:
+            yield f"{name} is nearly {'black' if grey <= DARK else 'white'}; expose it anew"
+        elif sharp < BLURRED:
+            yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"

@@ -1,0 +1,147 @@
+"""`jcr check`: reads and judges a capture before any heavy work."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+if TYPE_CHECKING:
+    from jcr.check import Examination
+    from jcr.records import Capture
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Judge a capture: files, units, motion, observability, convention of the poses, what to add.
+
+    Exit status 3 when a calibration of it would not be trusted, with the reason and the cure.
+
+    examples:
+      jcr check captures/table
+      jcr check captures/table --suggest 3 --robot-noise 0.1 0.05
+      jcr check captures/table --poses-only --json
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Folder of the capture."""
+    suggest: int = 0
+    """Propose so many gripper poses that would shrink the uncertainty most."""
+    poses_only: bool = False
+    """Do not register the pictures (seconds) to hold the poses against them."""
+    robot_noise: tuple[float, float] | None = None
+    """One-sigma noise of the gripper poses per axis, MM DEG; left out: found, or 0.5 mm and 0.1°."""
+    reach: tuple[float, float, float, float, float, float] | None = None
+    """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
+    seed: int = 0
+    """Seed of the registration and of the proposals."""
+    json: bool = False
+    """Print the findings as JSON."""
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Examine the capture and print what was found."""
+    from jcr.capture.read import read_capture
+    from jcr.check import check
+    from jcr.errors import InputError
+    from jcr.progress import progress_bars
+
+    if arguments.suggest < 0:
+        raise InputError(f"--suggest {arguments.suggest}: give how many poses to propose, 0 or more")
+    noise = arguments.robot_noise
+    if noise is not None and min(noise) <= 0:
+        raise InputError(f"--robot-noise {noise[0]} {noise[1]}: give two positive numbers, mm and degrees")
+    capture = read_capture(arguments.capture)
+    with progress_bars(arguments.quiet) as progress:
+        found = check(
+            capture,
+            arguments.suggest,
+            not arguments.poses_only,
+            None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+            None if arguments.reach is None else np.array(arguments.reach).reshape(2, 3),
+            arguments.seed,
+            progress,
+        )
+    if arguments.json:
+        sys.stdout.write(json.dumps(_as_json(capture, found)) + "\n")
+    else:
+        sys.stdout.write(_as_text(capture, found))
+    if found.faults:
+        sys.stderr.write(f"error: {found.faults[0]}\n")
+        return 3
+    return 0
+
+
+def _as_text(capture: "Capture", found: "Examination") -> str:
+    width, height = capture.image_size
+    lens = "given" if capture.intrinsics is not None else "unknown, to be estimated"
+    turn = np.degrees(found.largest_turn_rad)
+    lines = [
+        f"{len(capture)} images of {width}x{height}, intrinsics {lens}",
+        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and turns by up to {turn:.0f}°",
+        f"expected uncertainty: {_std(found.expected_std)}",
+    ]
+    if found.hand_eye is not None:
+        noise = found.hand_eye.robot_noise
+        agreement = f"{1e3 * noise.translation:.2f} mm and {np.degrees(noise.rotation):.3f}°"
+        lines.append(
+            f"poses and pictures agree to {agreement} per axis "
+            f" ({int(found.hand_eye.inliers.sum())} of {len(capture)} images)"
+        )
+    lines += [f"fault: {fault}" for fault in found.faults]
+    lines += [f"remark: {remark}" for remark in found.remarks]
+    for k, pose in enumerate(found.suggestions, start=1):
+        matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True)
+        lines += [
+            f"add pose {k}: {1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.turned_rad):.0f}° from that of "
+            f"{capture.images[pose.like]}; then {_std(pose.expected_std)}; base_from_gripper:",
+            *(f"  {row}" for row in matrix.splitlines()),
+        ]
+    if not found.faults:
+        lines.append("good to calibrate")
+    return "\n".join(lines) + "\n"
+
+
+def _std(std: np.ndarray) -> str:
+    offset = " ".join(f"{1e3 * value:.2g}" for value in std[:3])
+    turn = " ".join(f"{np.degrees(value):.2g}" for value in std[3:6])
+    return f"± {offset} mm, {turn} °, scale {100 * std[6]:.2g} %"
+
+
+def _as_json(capture: "Capture", found: "Examination") -> dict[str, Any]:
+    noise = None if found.hand_eye is None else found.hand_eye.robot_noise
+    return {
+        "images": [
+            {"image": name, "sharpness": float(sharp)}
+            for name, sharp in zip(capture.images, found.sharpness, strict=True)
+        ],
+        "largest_move_mm": 1e3 * found.largest_move_m,
+        "largest_turn_deg": float(np.degrees(found.largest_turn_rad)),
+        "observability": {
+            "observable": found.observability.observable,
+            "unobservable": list(found.observability.unobservable),
+            "advice": list(found.observability.advice),
+        },
+        "expected_std": found.expected_std.tolist(),
+        "robot_noise": None
+        if noise is None
+        else {
+            "translation_mm": 1e3 * noise.translation,
+            "rotation_deg": float(np.degrees(noise.rotation)),
+        },
+        "suggestions": [
+            {
+                "base_from_gripper": pose.base_from_gripper.tolist(),
+                "expected_std": pose.expected_std.tolist(),
+                "like": capture.images[pose.like],
+            }
+            for pose in found.suggestions
+        ],
+        "faults": list(found.faults),
+        "remarks": list(found.remarks),
+    }
