@@ -15,6 +15,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
+from jcr.progress import Progress
 from jcr.reconstruct.dust3r.network import PATCH, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
 from jcr.reconstruct.dust3r.pairs import PairPredictions, complete_pairs, overlapping_pairs, window_pairs
@@ -22,9 +23,6 @@ from jcr.reconstruct.dust3r.preprocess import PreparedImages
 from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, float], None]
-"""Told the stage's name and the fraction of it that is done."""
 
 GB = 1e9
 FEW_IMAGES = 12

@@ -5,6 +5,7 @@ edges stay its outer edges, which is what Pillow's resize does); a crop subtract
 half pixel shifts the principal point by (1 − s)/2 pixels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,12 +60,14 @@ class ImageGrid:
         return Intrinsics(grid.fx / sx, grid.fy / sy, float(cx), float(cy), width, height)
 
 
-def image_grid(original_size: tuple[int, int], long_edge: int = 512) -> ImageGrid:
+def image_grid(
+    original_size: tuple[int, int], long_edge: int = 512, patch: int = PATCH, keep_square: bool = False
+) -> ImageGrid:
     """The published resize and crop for an image of `original_size` (width, height).
 
     512: the long edge becomes 512 and both edges are cropped around the centre to multiples of the patch; a
-    square image is cropped to 4:3, the network having seen none. 224: the short edge becomes 224, then a
-    square is cropped.
+    square image is cropped to 4:3, DUSt3R having seen none. 224: the short edge becomes 224, then a square is
+    cropped.
     """
     width, height = original_size
     longest = max(width, height)
@@ -74,8 +77,8 @@ def image_grid(original_size: tuple[int, int], long_edge: int = 512) -> ImageGri
     if long_edge == 224:
         half = (min(center),) * 2
     else:
-        half = tuple(2 * c // PATCH * (PATCH // 2) for c in center)
-        if resized[0] == resized[1]:
+        half = tuple(2 * c // patch * (patch // 2) for c in center)
+        if resized[0] == resized[1] and not keep_square:
             half = (half[0], 3 * half[0] // 4)
     corner = (center[0] - half[0], center[1] - half[1])
     return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
@@ -107,10 +110,12 @@ class PreparedImages:
         return distort(self.lens, (undistorted_px - [k.cx, k.cy]) / [k.fx, k.fy])
 
 
-def prepare_images(capture: Capture, long_edge: int = 512) -> PreparedImages:
+def prepare_images(
+    capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
+) -> PreparedImages:
     """Read, undistort where the lens is known, resize and crop the images of a capture.
 
-    Raises InputError for an image that cannot be read.
+    `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
     """
     lens, notes = capture.intrinsics, []
     if lens is not None and (fold := fold_distance_px(lens)) is not None:
@@ -120,7 +125,7 @@ def prepare_images(capture: Capture, long_edge: int = 512) -> PreparedImages:
     if lens is not None and lens.distortion != NO_DISTORTION:
         pinhole = pinhole_inside(lens, max(lens.width, lens.height))
     size = capture.image_size if pinhole is None else (pinhole.width, pinhole.height)
-    grid = image_grid(size, long_edge)
+    grid = grid_of(size)
     width, height = grid.size
     colors = np.empty((len(capture), height, width, 3), np.uint8)
     for row, name in enumerate(capture.images):
