@@ -30,7 +30,7 @@ class SimulateOptions:
     """Objects and table: a mix on wood; 8 or 7 items on a plain light table; 7 on a plain dark one; tape,
     box, mug and toolbox for measuring."""
     images: int = 12
-    """How many images (the pattern `two` has 2)."""
+    """How many images; of the pattern `varied` fewer are the first ones of more (`two` has 2)."""
     pattern: Pattern = "varied"
     """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
     pure translation, a turntable, xyz + yaw (SCARA), turning about a tool point or about the camera's centre,
@@ -131,7 +131,7 @@ def _pinhole(rng: np.random.Generator) -> Intrinsics:
 def _capture_json(truth: Truth, options: SimulateOptions, rng: np.random.Generator) -> dict[str, object]:
     camera = truth.intrinsics
     known = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
-    reported = _with_robot_noise(truth.base_from_gripper, *options.robot_noise, rng)
+    reported = with_robot_noise(truth.base_from_gripper, *options.robot_noise, rng)
     return {
         "frames": [
             {"image": image, "base_from_gripper": matrix.tolist()}
@@ -142,7 +142,7 @@ def _capture_json(truth: Truth, options: SimulateOptions, rng: np.random.Generat
     }
 
 
-def _with_robot_noise(
+def with_robot_noise(
     base_from_gripper: Float[ndarray, "n 4 4"],
     translation_mm: float,
     rotation_deg: float,
@@ -150,7 +150,7 @@ def _with_robot_noise(
 ) -> Float[ndarray, "n 4 4"]:
     """What a robot of that accuracy reports: x + dx and exp(dr)·R, independent Gaussians in every axis."""
     reported = base_from_gripper.copy()
-    shift, turn = rng.normal(size=(2, len(reported), 3))
+    shift, turn = rng.normal(size=(len(reported), 2, 3)).swapaxes(0, 1)
     reported[:, :3, 3] += 1e-3 * translation_mm * shift
     reported[:, :3, :3] = rotation_exp(np.radians(rotation_deg) * turn) @ reported[:, :3, :3]
     return reported

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+Triple = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -17,7 +19,7 @@ class Mesh:
     """Texture coordinates: u along the columns, v up the rows."""
     faces: Int[ndarray, "f 3"]
 
-    def moved(self, offset: Sequence[float]) -> "Mesh":
+    def moved(self, offset: Triple) -> "Mesh":
         """The mesh shifted by `offset` (3,) m."""
         return Mesh(self.vertices + np.asarray(offset), self.uv, self.faces)
 
@@ -51,7 +53,7 @@ _SIDES = {
 }
 
 
-def box(size: Sequence[float], sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
+def box(size: Triple, sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
     """Sides of a box of `size` (x, y, z) m standing on z = 0; each shows the whole texture."""
     half = np.asarray(size) / 2
     square = np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]])
@@ -63,7 +65,7 @@ def box(size: Sequence[float], sides: Sequence[str] = tuple(_SIDES)) -> Mesh:
     return _joined(meshes)
 
 
-def revolved(*profiles: Sequence[Sequence[float]], segments: int = 48) -> Mesh:
+def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Mesh:
     """Solid of revolution about z of profiles [(radius, z), …] m, outside on the right hand going along them.
 
     Within a profile the surface is shaded smooth; between profiles there is an edge.

@@ -239,7 +239,7 @@ def fruit(rng: np.random.Generator) -> TableObject:
     # It ends below the rim of its dimple: the height of an apple is that of its flesh.
     foot, tip = float(z[-1]), float(z[-1]) + 0.2 * radius
     stalk = revolved([(0.002, foot), (0.002, tip)], [(0.002, tip), (0.0, tip)], segments=8)
-    flesh = revolved(list(zip(r, z, strict=True)))
+    flesh = revolved(list(zip(r.tolist(), z.tolist(), strict=True)))
     return TableObject(
         "apple",
         (Part(flesh, color, textures.glaze(rng, 256, 512, color), shine=0.2), Part(stalk, (0.3, 0.2, 0.1))),
@@ -250,16 +250,18 @@ def toolbox(rng: np.random.Generator) -> TableObject:
     """A toolbox: body, lid with a sticker and a grip, latches."""
     x, y, z = rng.uniform((0.24, 0.12, 0.08), (0.28, 0.14, 0.10))
     color, sticker = _paint(rng), _paint(rng)
-    lid = np.array([x + 0.008, y + 0.008, 0.03])
+    lid = (x + 0.008, y + 0.008, 0.03)
     top = z + lid[2]
     parts = [
         Part(box((x, y, z), ("+x", "-x", "-z")), color, textures.glaze(rng, 256, 512, color)),
         Part(box((x, y, z), ("+y", "-y")), color, textures.printed(rng, 320, 800, color)),
-        Part(box(lid).moved((0, 0, z)), _BLACK, textures.glaze(rng, 400, 800, _BLACK)),
-        Part(box((0.45 * x, 0.026, 0.024)).moved((0, 0, top)), color, textures.glaze(rng, 64, 256, color)),
+        Part(box(lid).moved((0.0, 0.0, z)), _BLACK, textures.glaze(rng, 400, 800, _BLACK)),
+        Part(
+            box((0.45 * x, 0.026, 0.024)).moved((0.0, 0.0, top)), color, textures.glaze(rng, 64, 256, color)
+        ),
     ]
     for side in (-1, 1):
-        label = box((0.6 * x, 0.24 * y, 0.0005)).moved((0, side * 0.3 * y, top))
+        label = box((0.6 * x, 0.24 * y, 0.0005)).moved((0.0, side * 0.3 * y, top))
         parts.append(Part(label, sticker, textures.printed(rng, 96, 512, sticker)))
         for end in (-1, 1):
             latch = box((0.03, 0.006, 0.04)).moved((end * 0.3 * x, side * (y / 2 + 0.006), z - 0.02))

@@ -93,9 +93,11 @@ def _aims(
 
 
 def _varied(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    views = _VIEWS[np.arange(count) % len(_VIEWS)]
-    azimuth, elevation, distance, roll = (views + rng.uniform(-1, 1, (count, 4)) * (12, 4, 0.04, 15)).T
-    return _look_at(_aims(count, target, 0.04, rng), azimuth, elevation, distance, roll)
+    # Row by row, so that fewer images are the first ones of more.
+    jitter = rng.uniform(-1, 1, (count, 7))
+    views = _VIEWS[np.arange(count) % len(_VIEWS)] + jitter[:, :4] * (12, 4, 0.04, 15)
+    aim = target + jitter[:, 4:] * (0.04, 0.04, 0.025) + (0.0, 0.0, 0.025)
+    return _look_at(aim, *views.T)
 
 
 def _two(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:

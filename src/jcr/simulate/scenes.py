@@ -86,7 +86,7 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     things = [CATALOGUE[thing](looks) for thing in recipe.objects]
     top = _table_top(looks, table or recipe.table, recipe.plain_table)
     body = Part(box(_TABLE_SIZE, ("+x", "-x", "+y", "-y", "-z")), (0.45, 0.42, 0.38))
-    parts = tuple(replace(part, mesh=part.mesh.moved((0, 0, -_TABLE_SIZE[2]))) for part in (top, body))
+    parts = tuple(replace(part, mesh=part.mesh.moved((0.0, 0.0, -_TABLE_SIZE[2]))) for part in (top, body))
     light = center + [lamp.uniform(-0.7, 0.3), lamp.uniform(-0.6, 0.6), lamp.uniform(1.4, 1.8)]
     return Scene(name, parts, center, _placed(layout, things, center), light)
 

@@ -7,8 +7,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-Image = UInt8[ndarray, "h w 3"]
+Image = UInt8[ndarray, "_ _ 3"]
+"""RGB."""
 Color = tuple[float, float, float]
+"""Red, green, blue, 0 to 1."""
+Ink = tuple[int, int, int]
+"""Red, green, blue, 0 to 255."""
 
 _WORDS = ("COFFEE", "RICE", "TEA", "OATS", "CORN", "SOUP", "PASTA", "SALT", "COCOA", "BEANS", "PLUM", "MINT")
 _FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SIMPLEX)
@@ -17,16 +21,15 @@ _FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SI
 def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: Color) -> Image:
     """Planks along the rows with year rings, fibres and pores between two colours (h,w,3)."""
     planks = []
-    edges = np.linspace(0, height, 9).round().astype(int)
-    for rows in np.diff(edges):
-        bend = 30 * _smooth_noise(rng, rows, width, (140, 500)) + 6 * _smooth_noise(
-            rng, rows, width, (50, 150)
-        )
+    for plank in np.array_split(np.arange(height), 8):
+        rows = len(plank)
+        bend = 30 * _smooth_noise(rng, rows, width, (140.0, 500.0))
+        bend += 6 * _smooth_noise(rng, rows, width, (50.0, 150.0))
         across = np.arange(rows, dtype=np.float32)[:, None] + bend
         spacing = np.float32(rng.uniform(26, 44))
         ring = 0.5 + 0.5 * np.sin(2 * np.pi * across / spacing + 2 * np.sin(across / (1.3 * spacing)))
-        fibre = _smooth_noise(rng, rows, width, (2, 60)) + _smooth_noise(rng, rows, width, (4, 14))
-        pores = np.clip(_smooth_noise(rng, rows, width, (3, 10)) - 0.7, 0, 1)
+        fibre = _smooth_noise(rng, rows, width, (2.0, 60.0)) + _smooth_noise(rng, rows, width, (4.0, 14.0))
+        pores = np.clip(_smooth_noise(rng, rows, width, (3.0, 10.0)) - 0.7, 0, 1)
         shade = 0.22 * ring**3 + 0.1 * fibre + 1.5 * pores + np.float32(0.12 + rng.uniform(-0.09, 0.09))
         # The gap to the next plank.
         shade[:2] = 0.8
@@ -37,7 +40,7 @@ def wood(rng: np.random.Generator, height: int, width: int, light: Color, dark: 
 
 def laminate(rng: np.random.Generator, height: int, width: int, color: Color, contrast: float) -> Image:
     """A plain table top with faint specks and clouds of that contrast (h,w,3)."""
-    specks, clouds = (_smooth_noise(rng, height, width, (cell, cell)) for cell in (4, 150))
+    specks, clouds = (_smooth_noise(rng, height, width, (cell, cell)) for cell in (4.0, 150.0))
     return _to_image(_rgb(color) * (1 + np.float32(contrast) * (0.5 * specks + 0.5 * clouds)[..., None]))
 
 
@@ -62,7 +65,7 @@ def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> 
     for line in range(4):
         words = " ".join(str(word).lower() for word in rng.choice(_WORDS, 4))
         _write(image, words, (0.08, 0.72 + 0.06 * line, 0.84, 0.035), lettering, cv2.FONT_HERSHEY_SIMPLEX)
-    grain = 0.03 * _smooth_noise(rng, height, width, (2, 2))
+    grain = 0.03 * _smooth_noise(rng, height, width, (2.0, 2.0))
     return _to_image(np.float32(image) / 255 + grain[..., None])
 
 
@@ -73,7 +76,7 @@ def glaze(rng: np.random.Generator, height: int, width: int, color: Color) -> Im
     """
     half = width // 2
     clouds = _smooth_noise(rng, height, half, (height / 5, half / 4))
-    flecks = np.clip(_smooth_noise(rng, height, half, (4, 4)) - 0.55, 0, 1)
+    flecks = np.clip(_smooth_noise(rng, height, half, (4.0, 4.0)) - 0.55, 0, 1)
     left = _to_image(_rgb(color) * (1 + 0.12 * clouds[..., None] - 0.7 * flecks[..., None]))
     return np.concatenate([left, left[:, ::-1]], axis=1)
 
@@ -86,9 +89,7 @@ def _smooth_noise(
     return cv2.resize(grid.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def _write(
-    image: Image, words: str, within: tuple[float, float, float, float], ink: Color, font: int
-) -> None:
+def _write(image: Image, words: str, within: tuple[float, float, float, float], ink: Ink, font: int) -> None:
     """Draw one line of text into `image`, as large as fits the box (left, top, width, height; fractions)."""
     rows, columns = image.shape[:2]
     (width, height), _ = cv2.getTextSize(words, font, 1.0, 2)
@@ -101,8 +102,7 @@ def _rgb(color: Color) -> Float[ndarray, "3"]:
     return np.array(color, np.float32)
 
 
-def _ink(color: Color) -> Color:
-    """The colour in OpenCV's 0 to 255."""
+def _ink(color: Color) -> Ink:
     r, g, b = (round(255 * channel) for channel in color)
     return r, g, b
 

@@ -1,0 +1,278 @@
+"""Simulated captures: the truth agrees with the geometry, pictures with the truth, files with both."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse, rotation_exp, rotation_log, skew, transform
+from jcr.records import Intrinsics
+from jcr.simulate.capture import SimulateOptions, simulate, with_robot_noise
+from jcr.simulate.poses import gripper_poses, random_hand_eye
+from jcr.simulate.render import render
+from jcr.simulate.scenes import RECIPES, make_scene
+from jcr.simulate.truth import read_truth, true_depth, true_labels, truth_points
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop"
+CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
+
+
+@pytest.fixture(scope="module")
+def tabletop(tmp_path_factory):
+    return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_objects_stand_on_the_table_and_apart(name):
+    for seed in range(3):
+        scene = make_scene(name, seed)
+        boxes = []
+        for thing, true in zip(scene.objects, scene.true_objects, strict=True):
+            surface = np.concatenate(
+                [apply(thing.base_from_object, part.mesh.vertices) for part in thing.parts]
+            )
+            assert surface[:, 2].min() == pytest.approx(scene.table_height, abs=1e-12)
+            assert surface[:, 2].max() - scene.table_height == pytest.approx(true.height, abs=1e-12)
+            in_box = apply(inverse(true.base_from_box), surface)
+            np.testing.assert_allclose(np.abs(in_box).max(0), true.box_size / 2, atol=1e-6)
+            boxes.append(cv2.convexHull(true.footprint_in_base.astype(np.float32)))
+            low, high = scene.workspace_in_base
+            assert ((surface >= low) & (surface <= high)).all()
+        for k, first in enumerate(boxes):
+            assert all(cv2.intersectConvexConvex(first, second)[0] == 0 for second in boxes[:k])
+
+
+# Dimension of what (translation, rotation, log scale) the poses leave free, scale unknown.
+@pytest.mark.parametrize(
+    ("pattern", "free"),
+    [
+        ("varied", 0),
+        ("orbit", 1),
+        ("translation", 3),
+        ("one-axis", 3),
+        ("planar", 1),
+        ("pivot", 1),
+        ("camera-centre", 1),
+        ("two", 2),
+    ],
+)
+def test_each_pattern_hides_what_it_is_named_for(pattern, free):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        gripper_from_camera = random_hand_eye(rng)
+        table_in_base = np.array([0.5, 0.0, 0.02])
+        base_from_gripper = gripper_poses(pattern, 12, table_in_base, gripper_from_camera, rng)
+        rotation, offset = gripper_from_camera[:3, :3], gripper_from_camera[:3, 3]
+        rows = []
+        # A X = X B: the derivatives of log R_A - R log R_B and of (I - R_A) t - t_A + λ R t_B.
+        for i, j in zip(*np.triu_indices(len(base_from_gripper), 1), strict=True):
+            a = inverse(base_from_gripper[i]) @ base_from_gripper[j]
+            b = inverse(gripper_from_camera) @ a @ gripper_from_camera
+            moved = rotation @ b[:3, 3]
+            rows.append(np.c_[np.zeros((3, 3)), skew(rotation @ rotation_log(b[:3, :3])), np.zeros(3)])
+            rows.append(np.c_[np.eye(3) - a[:3, :3], -skew(moved), moved])
+        values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
+        assert 7 - (values > 1e-9 * values[0]).sum() == free
+        assert 0.03 <= np.linalg.norm(offset) <= 0.12
+
+
+@pytest.mark.gl
+def test_depth_and_labels_are_those_of_the_pixel_centers():
+    scene = make_scene("tabletop", 0)
+    rng = np.random.default_rng(0)
+    gripper_from_camera = random_hand_eye(rng)
+    base_from_camera = (
+        gripper_poses("varied", 4, scene.table_center_in_base, gripper_from_camera, rng) @ gripper_from_camera
+    )
+    carton = scene.true_objects[scene.labels.index("carton") - 2]
+    x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones(x.shape)], -1)
+    for matrix, view in zip(
+        base_from_camera, render(scene, CAMERA, base_from_camera, textured=False), strict=True
+    ):
+        assert view.depth is not None and view.label is not None
+        x_in_base = apply(matrix, view.depth[..., None] * rays)
+        # 5 µm: a shift of the grid by a twentieth of a pixel would already show as 50 µm.
+        np.testing.assert_allclose(x_in_base[view.label == 1][:, 2], scene.table_height, atol=5e-6)
+        in_box = apply(inverse(carton.base_from_box), x_in_base[view.label == carton.label])
+        assert len(in_box) > 500
+        np.testing.assert_allclose((np.abs(in_box) - carton.box_size / 2).max(1), 0.0, atol=5e-6)
+
+
+@pytest.mark.gl
+def test_pictures_show_points_where_they_project():
+    scene = make_scene("tabletop", 0)
+    square, columns, rows = 0.05, 19, 24
+    checks = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 200 + 30).astype(np.uint8)
+    checks = np.repeat(np.kron(checks, np.ones((100, 100), np.uint8))[..., None], 3, axis=-1)
+    board = replace(scene.table[0], texture=checks)
+    scene = replace(scene, table=(board, scene.table[1]), objects=())
+    corners = np.stack(
+        np.meshgrid(np.arange(1, columns), np.arange(1, rows), [0.0], indexing="ij"), -1
+    ).reshape(-1, 3)
+    corners = (corners - [columns / 2, rows / 2, 0]) * square + scene.table_center_in_base
+    rng = np.random.default_rng(1)
+    still = np.eye(4)
+    base_from_camera = gripper_poses("varied", 4, scene.table_center_in_base, still, rng)
+    errors = []
+    for matrix, view in zip(
+        base_from_camera, render(scene, CAMERA, base_from_camera, with_truth=False), strict=True
+    ):
+        in_camera = apply(inverse(matrix), corners)
+        px = in_camera[:, :2] / in_camera[:, 2:] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
+        px = px[((px > 15) & (px < [CAMERA.width - 16, CAMERA.height - 16])).all(1)]
+        gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        corners_px = np.ascontiguousarray(px[:, None], np.float32)
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+        seen = cv2.cornerSubPix(gray, corners_px, (6, 6), (-1, -1), criteria)[:, 0]
+        errors.append(seen - px)
+    error = np.concatenate(errors)
+    assert len(error) > 300
+    assert np.abs(error.mean(0)).max() < 0.02
+    assert np.sqrt((error**2).sum(1).mean()) < 0.1
+
+
+@pytest.mark.gl
+def test_capture_and_truth_agree(tabletop):
+    truth = read_truth(tabletop)
+    capture = json.loads((tabletop / "capture.json").read_text())
+    reference = json.loads((tabletop / "reference.json").read_text())
+    assert [frame["image"] for frame in capture["frames"]] == list(truth.images)
+    reported = np.array([frame["base_from_gripper"] for frame in capture["frames"]])
+    np.testing.assert_array_equal(reported, truth.base_from_gripper)
+    np.testing.assert_array_equal(reference["gripper_from_camera"], truth.gripper_from_camera)
+    np.testing.assert_allclose(reported @ truth.gripper_from_camera, truth.base_from_camera, atol=1e-15)
+    for k, image in enumerate(truth.images):
+        assert cv2.imread(str(tabletop / image)).shape == (480, 640, 3)
+        assert true_depth(truth, k).shape == true_labels(truth, k).shape == (480, 640)
+    points, labels = truth_points(tabletop)
+    # Every object is seen up to its top: none rises above its height, none sinks into the table.
+    for thing in truth.objects:
+        height = points[labels == thing.label][:, 2] - truth.table_height
+        assert height.max() == pytest.approx(thing.height, abs=5e-4)
+        assert height.min() > -2e-4
+    table = points[labels == 1]
+    assert np.abs(table[:, 2] - truth.table_height).max() < 2e-4
+
+
+@pytest.mark.gl
+def test_the_bundled_example_is_what_its_command_makes(tabletop):
+    for name in ("capture.json", "reference.json", "truth/scene.json"):
+        bundled, made = (json.loads((folder / name).read_text()) for folder in (EXAMPLE, tabletop))
+        if name == "capture.json":
+            assert bundled["source"]["options"].pop("truth") == "scene"
+            made["source"]["options"].pop("truth")
+        assert bundled == made
+    for image in read_truth(EXAMPLE).images:
+        bundled, made = (cv2.imread(str(folder / image)).astype(int) for folder in (EXAMPLE, tabletop))
+        # Another OpenGL may round and filter a little differently.
+        assert np.abs(bundled - made).mean() < 2
+
+
+@pytest.mark.gl
+def test_same_seed_same_bytes_and_fewer_images_are_the_first_ones(tabletop, tmp_path):
+    fewer = simulate(tmp_path / "fewer", SimulateOptions(seed=1, images=4))
+    files = [path.relative_to(fewer) for path in fewer.rglob("*.*g")]
+    assert len(files) == 3 * 4
+    for name in files:
+        assert (fewer / name).read_bytes() == (tabletop / name).read_bytes(), name
+    frames, first = (
+        json.loads((folder / "capture.json").read_text())["frames"] for folder in (tabletop, fewer)
+    )
+    assert frames[:4] == first
+    assert make_scene("tabletop", 2).true_objects[0].height != read_truth(fewer).objects[0].height
+
+
+@pytest.mark.gl
+def test_robot_noise_is_in_the_report_and_not_in_the_pictures(tabletop, tmp_path):
+    options = SimulateOptions(
+        seed=1, images=2, robot_noise=(2.0, 0.5), unknown_intrinsics=True, truth="scene"
+    )
+    noisy = simulate(tmp_path / "noisy", options)
+    truth, capture = read_truth(noisy), json.loads((noisy / "capture.json").read_text())
+    for image in truth.images:
+        assert (noisy / image).read_bytes() == (tabletop / image).read_bytes()
+    np.testing.assert_array_equal(truth.base_from_gripper, read_truth(tabletop).base_from_gripper[:2])
+    assert capture["intrinsics"] is None
+    reported = np.array([frame["base_from_gripper"] for frame in capture["frames"]])
+    assert (np.abs(reported[:, :3, 3] - truth.base_from_gripper[:, :3, 3]).max(1) > 1e-4).all()
+
+
+def test_robot_noise_has_the_sigma_asked_for_in_every_axis():
+    true = transform(rotation_exp(np.random.default_rng(0).normal(size=(4000, 3))), np.array([0.4, 0.1, 0.3]))
+    reported = with_robot_noise(true, 2.0, 0.5, np.random.default_rng(1))
+    shift = reported[:, :3, 3] - true[:, :3, 3]
+    turn = rotation_log(reported[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1))
+    # The sigma of 4000 draws is known to 1.1 %; their mean to 1.6 % of it.
+    np.testing.assert_allclose(shift.std(0), 2e-3, rtol=0.05)
+    np.testing.assert_allclose(np.degrees(turn).std(0), 0.5, rtol=0.05)
+    assert np.abs(shift.mean(0)).max() < 1.5e-4
+
+
+@pytest.mark.gl
+def test_texture_is_what_features_hold_to(tabletop, tmp_path):
+    right = {}
+    plain = simulate(tmp_path / "plain", SimulateOptions(images=2, texture=False, seed=1))
+    for folder in (tabletop, plain):
+        truth = read_truth(folder)
+        first, second = (cv2.imread(str(folder / image), cv2.IMREAD_GRAYSCALE) for image in truth.images[:2])
+        sift = cv2.SIFT.create()
+        (at, described), (at_other, other) = (
+            sift.detectAndCompute(first, None),
+            sift.detectAndCompute(second, None),
+        )
+        pairs = [
+            m for m, n in cv2.BFMatcher().knnMatch(described, other, k=2) if m.distance < 0.75 * n.distance
+        ]
+        x = np.array([at[m.queryIdx].pt for m in pairs]).reshape(-1, 2)
+        y = np.array([at_other[m.trainIdx].pt for m in pairs]).reshape(-1, 2)
+        camera = truth.intrinsics
+        column, row = x.round().astype(int).T
+        rays = np.c_[(x - [camera.cx, camera.cy]) / camera.fx, np.ones(len(x))]
+        second_from_first = inverse(truth.base_from_camera[1]) @ truth.base_from_camera[0]
+        in_second = apply(second_from_first, true_depth(truth, 0)[row, column][:, None] * rays)
+        projected = in_second[:, :2] / in_second[:, 2:] * camera.fx + [camera.cx, camera.cy]
+        right[folder] = int((np.linalg.norm(projected - y, axis=1) < 2).sum())
+    assert right[tabletop] > 100
+    assert right[plain] < 10
+
+
+def test_options_that_mean_nothing_are_refused_in_one_line(tmp_path):
+    for options in (
+        SimulateOptions(images=0),
+        SimulateOptions(seed=-1),
+        SimulateOptions(robot_noise=(-1.0, 0.0)),
+        SimulateOptions(jpeg_quality=0),
+        SimulateOptions(vignetting=2.0),
+    ):
+        with pytest.raises(InputError, match="give 0|give 1"):
+            simulate(tmp_path / "out", options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("keep")
+    with pytest.raises(InputError, match="exists already"):
+        simulate(tmp_path / "full")
+    with pytest.raises(InputError, match="only captures made by jcr simulate"):
+        read_truth(tmp_path / "full")
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+@pytest.mark.gl
+def test_command_line(tmp_path):
+    jcr = [sys.executable, "-c", "from jcr.cli import main; main()", "simulate"]
+    command = [*jcr, str(tmp_path / "out"), "--images", "2", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, json.loads(done.stdout)) == (0, {"capture": str(tmp_path / "out")})
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1
+    # A machine without OpenGL: the cure is named, and nothing is left behind.
+    command[len(jcr)] = str(tmp_path / "blind")
+    blind = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MUJOCO_GL": "disable"})
+    assert blind.returncode == 2 and "apt-get install" in blind.stderr and blind.stderr.count("\n") == 1
+    assert not (tmp_path / "blind").exists()
