@@ -1,9 +1,10 @@
-"""jcr simulate: a simulated capture with ground truth."""
+"""`jcr simulate`: a simulated capture with ground truth."""
 
 import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -24,16 +25,16 @@ class Arguments:
       jcr simulate captures/orbit --pattern orbit --unknown-intrinsics
     """
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[Path, tyro.conf.Positional]
     """New folder to write."""
-    options: SimulateOptions = field(default_factory=SimulateOptions)
+    simulate: SimulateOptions = field(default_factory=SimulateOptions)
     json: bool = False
     """Print the result as JSON on stdout."""
 
 
 def main(arguments: Arguments) -> int:
     """Write the capture and say where."""
-    out = simulate(arguments.out, arguments.options)
+    out = simulate(arguments.out, arguments.simulate)
     if arguments.json:
         sys.stdout.write(json.dumps({"capture": str(out)}) + "\n")
     else:

@@ -38,7 +38,7 @@ class SimulateOptions:
     seed: int = 0
     """Objects, layout, textures, lamp, lens, hand-eye and poses all follow from it."""
     texture: bool = True
-    """Off: every surface has one uniform colour, so that image features find nothing to hold."""
+    """Print and grain on the surfaces; without, each has one uniform colour, with nothing for features."""
     table: TableName | None = None
     """Light or dark table top (None: as the scene has it)."""
     robot_noise: tuple[float, float] = (0.0, 0.0)
@@ -77,6 +77,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions()) -> Path:
     truth = Truth(
         folder=out,
         scene=scene.name,
+        seed=options.seed,
         images=tuple(f"images/{k:02d}.{suffix}" for k in range(len(base_from_gripper))),
         gripper_from_camera=gripper_from_camera,
         base_from_gripper=base_from_gripper,

@@ -169,7 +169,7 @@ def mug(rng: np.random.Generator) -> TableObject:
     )
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
     path = np.stack(
-        [radius + 0.028 * np.cos(angle), 0 * angle, 0.52 * height + 0.3 * height * np.sin(angle)], -1
+        [radius - 0.002 + 0.03 * np.cos(angle), 0 * angle, 0.52 * height + 0.3 * height * np.sin(angle)], -1
     )
     picture = _wrap(textures.printed(rng, 320, 320, color))
     return TableObject(
@@ -253,7 +253,7 @@ def toolbox(rng: np.random.Generator) -> TableObject:
     lid = (x + 0.008, y + 0.008, 0.03)
     top = z + lid[2]
     parts = [
-        Part(box((x, y, z), ("+x", "-x", "-z")), color, textures.glaze(rng, 256, 512, color)),
+        Part(box((x, y, z), ("+x", "-x", "+z", "-z")), color, textures.glaze(rng, 256, 512, color)),
         Part(box((x, y, z), ("+y", "-y")), color, textures.printed(rng, 320, 800, color)),
         Part(box(lid).moved((0.0, 0.0, z)), _BLACK, textures.glaze(rng, 400, 800, _BLACK)),
         Part(

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import transform
+from jcr.geometry import apply, inverse, transform
 from jcr.simulate import textures
-from jcr.simulate.meshes import box
+from jcr.simulate.meshes import box, winding_number
 from jcr.simulate.objects import CATALOGUE, Part, TableObject
 from jcr.simulate.truth import TrueObject
 
@@ -89,6 +89,22 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     parts = tuple(replace(part, mesh=part.mesh.moved((0.0, 0.0, -_TABLE_SIZE[2]))) for part in (top, body))
     light = center + [lamp.uniform(-0.7, 0.3), lamp.uniform(-0.6, 0.6), lamp.uniform(1.4, 1.8)]
     return Scene(name, parts, center, _placed(layout, things, center), light)
+
+
+def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
+    """Label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
+    table_frame = transform(np.eye(3), scene.table_center_in_base)
+    solids = [(table_frame, scene.table), *((thing.base_from_object, thing.parts) for thing in scene.objects)]
+    labels = np.zeros(len(x_in_base), np.int64)
+    for label, (base_from_solid, parts) in enumerate(solids, start=1):
+        x_in_solid = apply(inverse(base_from_solid), x_in_base)
+        corners = np.concatenate([part.mesh.vertices for part in parts])
+        near = ((x_in_solid >= corners.min(0)) & (x_in_solid <= corners.max(0))).all(1)
+        turns = sum(
+            (winding_number(part.mesh, x_in_solid[near]) for part in parts), start=np.zeros(near.sum())
+        )
+        labels[np.flatnonzero(near)[turns > 0.5]] = label
+    return labels
 
 
 def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:

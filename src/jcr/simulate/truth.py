@@ -41,6 +41,8 @@ class Truth:
     folder: Path
     """Of the capture."""
     scene: str
+    seed: int
+    """Of the scene: `make_scene` makes its meshes again."""
     images: tuple[str, ...]
     """As in capture.json."""
     gripper_from_camera: Float[ndarray, "4 4"]
@@ -75,6 +77,7 @@ def read_truth(folder: Path) -> Truth:
     return Truth(
         folder=folder,
         scene=content["scene"],
+        seed=content["seed"],
         images=tuple(content["images"]),
         gripper_from_camera=np.array(content["gripper_from_camera"]),
         base_from_gripper=np.array(content["base_from_gripper"]),
