@@ -14,6 +14,7 @@ from jcr.geometry import inverse, transform
 from jcr.reconstruct.dust3r import predict
 from jcr.reconstruct.dust3r.network import Dust3r
 from jcr.reconstruct.dust3r.pairs import (
+    PairOptions,
     PairPredictions,
     complete_pairs,
     overlapping_pairs,
@@ -21,7 +22,7 @@ from jcr.reconstruct.dust3r.pairs import (
     window_pairs,
     write_pairs,
 )
-from jcr.reconstruct.dust3r.predict import PairOptions, estimate_memory, predict_pairs
+from jcr.reconstruct.dust3r.predict import estimate_memory, predict_pairs
 from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid
 from jcr.reconstruct.dust3r.weights import LoadedNetwork
 from jcr.records import Intrinsics

@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import save_file
 
 from jcr.errors import InputError
-from jcr.reconstruct.dust3r import weights
+from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.network import Dust3r
-from jcr.reconstruct.dust3r.weights import fingerprint, is_cached, load_weights
+from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
 
 CONFIG = {
     "head_type": "dpt",
@@ -186,8 +186,9 @@ def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    hub_id = weights.CHECKPOINTS["dust3r"].hub_id
-    assert not is_cached(hub_id)
+    checkpoint = CHECKPOINTS["dust3r"]
+    hub_id = checkpoint.hub_id
+    assert not checkpoint.is_cached()
     with pytest.raises(InputError, match="not in the cache and not to be had from the hub"):
         load_weights(hub_id)
     repository = tmp_path / f"models--{hub_id.replace('/', '--')}"
@@ -195,7 +196,7 @@ def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
     (repository / "refs" / "main").write_text("0" * 40)
     (repository / "snapshots").mkdir()
     write_folder(repository / "snapshots" / ("0" * 40), network)
-    assert is_cached(hub_id)
+    assert checkpoint.is_cached()
     loaded = load_weights(hub_id)
     assert "CC BY-NC-SA 4.0" in loaded.licence
     assert_same_output(network, loaded.network)

@@ -3,6 +3,7 @@
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -24,6 +25,36 @@ from jcr.records import Intrinsics
 
 ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 3}
 """Keys every file has, and their dimensions; the names are those of DUSt3R's own output."""
+
+
+FEW_IMAGES = 12
+"""Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Which pairs of images the network sees, and within what memory."""
+
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """complete: all pairs; window: images near each other in the capture's order; robot: all but the pairs
+    that by the robot's poses have no view in common; auto: complete up to 12 images, robot beyond."""
+    window: int = 3
+    """How far apart in the capture's order two images of a pair may be (window only)."""
+    image_size: Literal[512, 224] = 512
+    """Long edge that the network sees, in pixels; 224 has a quarter of the pixels to compute."""
+    memory_gb: float = 8.0
+    """Budget on the device that computes, and for the pointmaps in main memory."""
+    cache: Path | None = None
+    """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
+    cache_gb: float = 4.0
+    """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
+
+    def __post_init__(self) -> None:
+        for name, value, least in (("window", self.window, 1), ("memory-gb", self.memory_gb, 1e-9)):
+            if value < least:
+                raise InputError(f"--{name} {value}: must be positive")
+        if self.cache_gb < 0:
+            raise InputError(f"--cache-gb {self.cache_gb}: give a size, or 0 for no cache")
 
 
 @dataclass(frozen=True)
@@ -77,14 +108,18 @@ def read_pairs(path: Path) -> PairPredictions:
 
     Raises InputError for a file that is missing, damaged, lacks an array, or has shapes that do not agree.
     """
+    return pairs_from_arrays(read_arrays(path), str(path))
+
+
+def read_arrays(path: Path) -> dict[str, ndarray]:
+    """All arrays of an npz file; InputError where it is missing or damaged."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; `jcr predict CAPTURE {path.name}` writes one")
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = dict(file)
+            return dict(file)
     except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: no readable npz file ({error}); write it again with numpy.savez") from None
-    return pairs_from_arrays(arrays, str(path))
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
@@ -130,18 +165,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
                 raise InputError(
                     f"{source}: {name}[{edge}] is negative somewhere; a confidence is at least 0"
                 )
-    intrinsics = grid = None
-    if "intrinsics" in arrays:
-        if arrays["intrinsics"].shape != (4,) or not (arrays["intrinsics"][:2] > 0).all():
-            raise InputError(f"{source}: intrinsics must be fx, fy, cx, cy of the {width}x{height} grid")
-        fx, fy, cx, cy = (float(value) for value in arrays["intrinsics"])
-        intrinsics = Intrinsics(fx, fy, cx, cy, width, height)
-    if "grid" in arrays:
-        if arrays["grid"].shape != (4, 2) or tuple(arrays["grid"][3]) != (width, height):
-            raise InputError(
-                f"{source}: grid must be the rows original size, resized size, crop corner, {width, height}"
-            )
-        grid = ImageGrid(*((int(x), int(y)) for x, y in arrays["grid"]))
+    intrinsics, grid = camera_of_arrays(arrays, (width, height), source)
     colors = arrays.get("colors")
     if colors is not None and (colors.shape != (image_count, height, width, 3) or colors.dtype != np.uint8):
         raise InputError(f"{source}: colors must be uint8 of shape {(image_count, height, width, 3)}")
@@ -154,6 +178,25 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
         grid=grid,
         is_metric=bool(arrays.get("is_metric", False)),
     )
+
+
+def camera_of_arrays(
+    arrays: dict[str, ndarray], size: tuple[int, int], source: str
+) -> tuple[Intrinsics | None, ImageGrid | None]:
+    """`intrinsics` and `grid` of a file for pointmaps of `size` (width, height); InputError if wrong."""
+    intrinsics = grid = None
+    if "intrinsics" in arrays:
+        if arrays["intrinsics"].shape != (4,) or not (arrays["intrinsics"][:2] > 0).all():
+            raise InputError(f"{source}: intrinsics must be fx, fy, cx, cy of the {size[0]}x{size[1]} grid")
+        fx, fy, cx, cy = (float(value) for value in arrays["intrinsics"])
+        intrinsics = Intrinsics(fx, fy, cx, cy, *size)
+    if "grid" in arrays:
+        if arrays["grid"].shape != (4, 2) or tuple(arrays["grid"][3]) != size:
+            raise InputError(
+                f"{source}: grid must be original size, resized size, crop corner and {size[0]}, {size[1]}"
+            )
+        grid = ImageGrid(*((int(x), int(y)) for x, y in arrays["grid"]))
+    return intrinsics, grid
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:

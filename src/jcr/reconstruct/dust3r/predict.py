@@ -5,8 +5,6 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2b
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -18,36 +16,22 @@ from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.network import PATCH, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
-from jcr.reconstruct.dust3r.pairs import PairPredictions, complete_pairs, overlapping_pairs, window_pairs
+from jcr.reconstruct.dust3r.pairs import (
+    FEW_IMAGES,
+    PairOptions,
+    PairPredictions,
+    complete_pairs,
+    overlapping_pairs,
+    window_pairs,
+)
 from jcr.reconstruct.dust3r.preprocess import PreparedImages
 from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
 
 logger = logging.getLogger(__name__)
 
 GB = 1e9
-FEW_IMAGES = 12
-"""Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
 MAX_BATCH = {"cpu": 1, "cuda": 16}
 """Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
-
-
-@dataclass(frozen=True)
-class PairOptions:
-    """Which pairs of images the network sees, and within what memory."""
-
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """complete: all pairs; window: images near each other in the capture's order; robot: all but the pairs
-    that by the robot's poses have no view in common; auto: complete up to 12 images, robot beyond."""
-    window: int = 3
-    """How far apart in the capture's order two images of a pair may be (window only)."""
-    image_size: Literal[512, 224] = 512
-    """Long edge the network sees in pixels; 224 is four to five times faster and coarser."""
-    memory_gb: float = 8.0
-    """Budget on the device that computes, and for the pointmaps in main memory."""
-    cache: Path | None = None
-    """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
-    cache_gb: float = 4.0
-    """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
 
 
 @dataclass(frozen=True)

@@ -117,23 +117,37 @@ def prepare_images(
 
     `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
     """
-    lens, notes = capture.intrinsics, []
-    if lens is not None and (fold := fold_distance_px(lens)) is not None:
-        lens = replace(lens, distortion=NO_DISTORTION)
-        notes.append(f"the stored distortion folds over at {fold:.0f} px from the centre: not used")
+    lens, notes = usable_lens(capture.intrinsics)
     pinhole = lens
     if lens is not None and lens.distortion != NO_DISTORTION:
         pinhole = pinhole_inside(lens, max(lens.width, lens.height))
-    size = capture.image_size if pinhole is None else (pinhole.width, pinhole.height)
-    grid = grid_of(size)
+    grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
+    return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, notes)
+
+
+def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
+    """The lens without a distortion that folds over inside the frame, and a note where it does."""
+    if lens is None or (fold := fold_distance_px(lens)) is None:
+        return lens, ()
+    note = f"the stored distortion folds over at {fold:.0f} px from the centre: not used"
+    return replace(lens, distortion=NO_DISTORTION), (note,)
+
+
+def read_colors(
+    capture: Capture, grid: ImageGrid, lens: Intrinsics | None, pinhole: Intrinsics | None
+) -> UInt8[ndarray, "n h w 3"]:
+    """The images of a capture on a grid, made images of `pinhole` first where the lens is distorted.
+
+    Raises InputError for an image that cannot be read.
+    """
     width, height = grid.size
     colors = np.empty((len(capture), height, width, 3), np.uint8)
     for row, name in enumerate(capture.images):
         image = read_image(capture.folder / name)
-        if lens is not None and pinhole is not None and pinhole is not lens:
+        if lens is not None and pinhole is not None and lens.distortion != NO_DISTORTION:
             image = undistort_image(image, lens, pinhole)
         colors[row] = resize_and_crop(image, grid)
-    return PreparedImages(colors, grid, lens, pinhole, tuple(notes))
+    return colors
 
 
 def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:

@@ -19,30 +19,8 @@ import torch
 from torch import Tensor
 
 from jcr.errors import InputError
+from jcr.reconstruct.checkpoints import CHECKPOINTS, HUB_FILES, licence_of
 from jcr.reconstruct.dust3r.network import Dust3r
-
-CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
-HUB_FILES = ("config.json", "model.safetensors")
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Weights published on the hub."""
-
-    hub_id: str
-    licence: str
-    is_metric: bool
-
-
-CHECKPOINTS = {
-    "dust3r": Checkpoint("naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", CC_BY_NC_SA, is_metric=False),
-    "mast3r": Checkpoint(
-        "naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
-        f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
-        is_metric=True,
-    ),
-}
-UNKNOWN_LICENCE = f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
 
 
 @dataclass(frozen=True)
@@ -64,13 +42,11 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
     licence is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
     """
     path = Path(source)
-    known = {checkpoint.hub_id: checkpoint.licence for checkpoint in CHECKPOINTS.values()}
     if not path.exists() and re.fullmatch(r"[\w.-]+/[\w.-]+", str(source)) and path.suffix not in _READERS:
         path = _download(str(source))
     elif not path.exists():
-        raise InputError(
-            f"{source}: no such weights; give a file, a folder or a hub id such as {next(iter(known))}"
-        )
+        example = CHECKPOINTS["dust3r"].hub_id
+        raise InputError(f"{source}: no such weights; give a file, a folder or a hub id such as {example}")
     if path.is_dir():
         path = _file_in(path)
     if path.suffix not in _READERS:
@@ -84,16 +60,9 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
-    licence = known.get(str(source), UNKNOWN_LICENCE)
+    licence = licence_of(str(source))
     _announce(str(source), licence)
     return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r))
-
-
-def is_cached(hub_id: str) -> bool:
-    """Whether a hub id's files are on this machine, without asking the network."""
-    from huggingface_hub import try_to_load_from_cache
-
-    return all(isinstance(try_to_load_from_cache(hub_id, name), str) for name in HUB_FILES)
 
 
 def fingerprint(network: Dust3r) -> str:

@@ -1,0 +1,70 @@
+"""`jcr predict`: pairwise pointmaps of a network, as a file."""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jcr.reconstruct.dust3r.pairs import PairOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Predict the pointmaps of a capture's pairs of images, for `jcr align` or `--backend predictions`.
+
+    examples:
+      jcr predict captures/table pairs.npz --backend mast3r
+      jcr predict captures/table pairs.npz --weights DUSt3R_ViTLarge_BaseDecoder_512_dpt.pth --device cuda
+      jcr predict captures/long pairs.npz --pair-graph window --window 4 --memory-gb 6
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Folder of the capture."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """npz file to write (docs/predictions.md)."""
+    backend: Literal["dust3r", "mast3r"] = "dust3r"
+    """Whose weights, where --weights names none."""
+    weights: str | None = None
+    """Path or hub id."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the network runs."""
+    pairs: PairOptions = field(default_factory=PairOptions)
+    json: bool = False
+    """Print the result as JSON on stdout."""
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Predict and write the file."""
+    from jcr.capture.read import read_capture
+    from jcr.errors import InputError
+    from jcr.progress import progress_bars
+    from jcr.reconstruct.backends import ReconstructOptions, device_of
+    from jcr.reconstruct.dust3r.backend import Dust3rOptions, predict
+    from jcr.reconstruct.dust3r.pairs import write_pairs
+
+    if arguments.out.suffix != ".npz":
+        raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")
+    capture = read_capture(arguments.capture)
+    options = Dust3rOptions(
+        arguments.backend,
+        arguments.weights,
+        device_of(ReconstructOptions(device=arguments.device)),
+        arguments.pairs,
+    )
+    with progress_bars(arguments.quiet) as progress:
+        _, predictions, notes = predict(capture, options, progress)
+    write_pairs(arguments.out, predictions)
+    count, height, width = predictions.conf.shape
+    for note in notes:
+        sys.stderr.write(f"{note}\n")
+    if arguments.json:
+        result = {"file": str(arguments.out), "pairs": count, "width": width, "height": height}
+        sys.stdout.write(json.dumps(result | {"metric": predictions.is_metric, "notes": notes}) + "\n")
+    else:
+        sys.stdout.write(f"{arguments.out}: {count} pairs of {width}x{height} pixels\n")
+    return 0
