@@ -8,32 +8,9 @@ import jcr
 from jcr.calibrate.bundle import adjust, median_reprojection
 from jcr.calibrate.pose_fit import widening
 from jcr.calibrate.projection import parameters, project
-from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics, Tracks
+from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
-
-LENS = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (-0.08, 0.05, 1e-3, -5e-4, 0.01))
-
-
-def observed(problem: HandEyeProblem, rng: np.random.Generator, points: int, noise_px: float) -> Tracks:
-    """Points scattered over the table, seen by every camera that has them in its image."""
-    x_in_base = np.column_stack(
-        [rng.uniform(0.25, 0.75, points), rng.uniform(-0.25, 0.25, points), rng.uniform(0.0, 0.12, points)]
-    )
-    base_from_camera = problem.true_base_from_gripper @ problem.gripper_from_camera
-    image, point, pixels = [], [], []
-    for i, camera in enumerate(base_from_camera):
-        x = apply(inverse(camera), x_in_base)
-        px = project(x, parameters(LENS))[0]
-        seen = np.flatnonzero((px > 0).all(1) & (px < [LENS.width, LENS.height]).all(1) & (x[:, 2] > 0))
-        image.append(np.full(len(seen), i))
-        point.append(seen)
-        pixels.append(px[seen] + noise_px * rng.normal(size=(len(seen), 2)))
-    # The reconstruction's frame, from the first camera's: recon = R (x / λ) + t.
-    recon_from_base_axes = problem.recon_from_camera[0, :3, :3] @ base_from_camera[0, :3, :3].T
-    about = (x_in_base - base_from_camera[0, :3, 3]) / problem.scale
-    in_recon = about @ recon_from_base_axes.T + problem.recon_from_camera[0, :3, 3]
-    return Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), in_recon)
 
 
 def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options):
