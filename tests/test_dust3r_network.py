@@ -128,6 +128,17 @@ def test_a_batch_of_pairs_equals_its_pairs_one_by_one() -> None:
             torch.testing.assert_close(view.points[0], batched.points[row], **TOLERANCE)
 
 
+@pytest.mark.parametrize("name", ["tiny_dpt12_mixed_48x64_64x48", "tiny_linear_48x64_b1"])
+@torch.inference_mode()
+def test_features_made_for_many_pairs_give_the_same_pointmaps(name: str) -> None:
+    truth, network = fixture(name)
+    kept1, kept2 = (network.encode(truth[image], many_pairs=True) for image in ("img1", "img2"))
+    assert (kept1.finest[0] is None) == ("linear" in name)
+    view1, view2 = network.decode(kept1, kept2)
+    torch.testing.assert_close(view1.points, truth["pts3d"], **TOLERANCE)
+    torch.testing.assert_close(view2.points, truth["pts3d_in_other_view"], **TOLERANCE)
+
+
 @torch.inference_mode()
 def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
     truth, network = fixture("tiny_dpt12_48x64_b1")

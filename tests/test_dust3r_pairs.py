@@ -79,7 +79,7 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
 ) -> None:
     encoded, decoded = [], []
     encode, decode = loaded.network.encode, loaded.network.decode
-    monkeypatch.setattr(loaded.network, "encode", lambda x: encoded.append(len(x)) or encode(x))
+    monkeypatch.setattr(loaded.network, "encode", lambda x, **how: encoded.append(len(x)) or encode(x, **how))
     monkeypatch.setattr(loaded.network, "decode", lambda a, b: decoded.append(len(a.tokens)) or decode(a, b))
     first = predicted(loaded, images, options(tmp_path))
     assert (sum(encoded), sum(decoded)) == (4, 12)

@@ -25,10 +25,14 @@ Rotary = Float[Tensor, "2 n 2 frequencies"]
 
 
 class Features(NamedTuple):
-    """An encoded image: tokens (b,n,c) and the shape (rows, columns) of their grid."""
+    """Encoded images: all that one image alone gives, whatever it is paired with."""
 
     tokens: Tensor
+    """(b,n,c)"""
     grid: tuple[int, int]
+    """Rows and columns of tokens."""
+    finest: tuple[Tensor | None, Tensor | None] = (None, None)
+    """A DPT head's finest level (b,256,h/4,w/4) as first and as second view; None: made for each pair."""
 
 
 class Pointmap(NamedTuple):
@@ -135,8 +139,11 @@ class Dust3r(nn.Module):
                 view.confidence[rows] = part.confidence.mT if lies else part.confidence
         return view1, view2
 
-    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Features:
-        """Tokens of images in [-1, 1]; each image needs this once, however many pairs it is in."""
+    def encode(self, images: Float[Tensor, "b 3 h w"], many_pairs: bool = False) -> Features:
+        """Features of images in [-1, 1]; each image needs this once, however many pairs it is in.
+
+        With `many_pairs` the heads' finest level is made here too, a fifth of a head's work, and kept.
+        """
         if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
                 f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
@@ -148,15 +155,20 @@ class Dust3r(nn.Module):
             x = self.patch_embed(images).float()
             for block in self.enc_blocks:
                 x = block(x, rotary)
-            return Features(self.enc_norm(x), grid)
+            tokens = self.enc_norm(x)
+            if not many_pairs:
+                return Features(tokens, grid)
+            as_map = tokens.mT.unflatten(-1, grid)
+            finest = (self.downstream_head1.finest(as_map), self.downstream_head2.finest(as_map))
+            return Features(tokens, grid, finest)
 
     def decode(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
         """Pointmaps of both images in the first one's camera frame; (1, 2) does not give (2, 1)."""
         with self._autocast(features1.tokens):
             layers1, layers2 = self.decoder_layers(features1, features2)
             return (
-                self.downstream_head1(layers1, features1.grid),
-                self.downstream_head2(layers2, features2.grid),
+                self.downstream_head1(layers1, features1.grid, features1.finest[0]),
+                self.downstream_head2(layers2, features2.grid, features2.finest[1]),
             )
 
     def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
@@ -293,7 +305,10 @@ class LinearHead(nn.Module):
         super().__init__()
         self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
-    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+    def finest(self, tokens: FeatureMap) -> None:
+        """Nothing here comes from one image alone."""
+
+    def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
         return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
@@ -305,9 +320,13 @@ class DptHead(nn.Module):
         self.layers = (0, dec_depth // 2, 3 * dec_depth // 4, dec_depth)
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
-    def forward(self, layers: list[Tensor], grid: tuple[int, int]) -> Pointmap:
+    def finest(self, tokens: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
+        """The finest level, from the encoder's tokens: the one part in which the other image has no say."""
+        return self.dpt.finest(tokens)
+
+    def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
         maps = [layers[layer].mT.unflatten(-1, grid) for layer in self.layers]
-        return pointmap(self.dpt(maps))
+        return pointmap(self.dpt(maps, finest))
 
 
 class Dpt(nn.Module):
@@ -339,9 +358,14 @@ class Dpt(nn.Module):
             nn.Conv2d(128, 4, 1),
         )
 
-    def forward(self, maps: list[Tensor]) -> Float[Tensor, "b 4 h w"]:
-        levels = [resize(x) for resize, x in zip(self.act_postprocess, maps, strict=True)]
-        x = self.head[:4](self.scratch(levels))
+    def finest(self, x: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
+        return self.scratch.refinenet1.resConfUnit1(self.scratch.layer1_rn(self.act_postprocess[0](x)))
+
+    def forward(self, maps: list[Tensor], finest: Tensor | None = None) -> Float[Tensor, "b 4 h w"]:
+        if finest is None:
+            finest = self.finest(maps[0])
+        coarser = [resize(x) for resize, x in zip(self.act_postprocess[1:], maps[1:], strict=True)]
+        x = self.head[:4](self.scratch(finest, coarser))
         # bfloat16 keeps 8 bits, too few for a coordinate: the last map is made in float32.
         with torch.autocast(x.device.type, enabled=False):
             return self.head[4](x.float())
@@ -357,24 +381,27 @@ class Scratch(nn.Module):
         self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = self.layer_rn
         self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(width) for _ in range(4))
 
-    def forward(self, levels: list[Tensor]) -> FeatureMap:
-        level1, level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn, levels, strict=True))
+    def forward(self, finest: Tensor, coarser: list[Tensor]) -> FeatureMap:
+        level2, level3, level4 = (conv(x) for conv, x in zip(self.layer_rn[1:], coarser, strict=True))
         # Of an odd grid the stride-2 level comes out a row or column too large.
         x = self.refinenet4(level4)[..., : level3.shape[-2], : level3.shape[-1]]
-        return self.refinenet1(self.refinenet2(self.refinenet3(x, level3), level2), level1)
+        x = self.refinenet3(x + self.refinenet3.resConfUnit1(level3))
+        x = self.refinenet2(x + self.refinenet2.resConfUnit1(level2))
+        return self.refinenet1(x + finest)
 
 
 class Fusion(nn.Module):
-    """Add a finer level to a coarser one, refine, and double the resolution."""
+    """Refine the sum of a level and its coarser ones, and double the resolution.
+
+    `resConfUnit1` refines the level before it is added, which is done outside; the coarsest needs none.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.resConfUnit1, self.resConfUnit2 = ResidualUnit(width), ResidualUnit(width)
         self.out_conv = nn.Conv2d(width, width, 1)
 
-    def forward(self, x: FeatureMap, finer: FeatureMap | None = None) -> Float[Tensor, "b c 2*h 2*w"]:
-        if finer is not None:
-            x = x + self.resConfUnit1(finer)
+    def forward(self, x: FeatureMap) -> Float[Tensor, "b c 2*h 2*w"]:
         # A 1x1 convolution commutes with bilinear upsampling; before it, it costs a quarter.
         x = self.out_conv(self.resConfUnit2(x))
         return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.network import PATCH, Dust3r, Features
+from jcr.reconstruct.dust3r.network import PATCH, DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
 from jcr.reconstruct.dust3r.pairs import (
     FEW_IMAGES,
@@ -69,8 +69,11 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
     blocks = 4 * tokens * (2 * (len(network.dec_blocks) + 1) * dec_dim + 12 * max(enc_dim, dec_dim))
     # A DPT head's widest moment: 128 channels at full resolution before and after a convolution, its
     # workspace, and 256 channels at half of it. Measured 0.36 GB at 512x384.
-    head = pixels * 1900 if hasattr(network.downstream_head1, "dpt") else pixels * 32
-    return MemoryEstimate(weights, 4 * images * tokens * enc_dim, blocks + head, pairs * pixels * 8 * 4)
+    dpt = isinstance(network.downstream_head1, DptHead)
+    head = pixels * 1900 if dpt else pixels * 32
+    finest = 2 * 256 * pixels // 16 if dpt else 0
+    features = 4 * images * (tokens * enc_dim + finest)
+    return MemoryEstimate(weights, features, blocks + head, pairs * pixels * 8 * 4)
 
 
 def predict_pairs(
@@ -117,7 +120,7 @@ class _Predictor:
         self.device = self.network.mask_token.device
         self.budget = options.memory_gb * GB
         self.progress = progress
-        self.tokens: dict[int, Tensor] = {}
+        self.features: dict[int, Features] = {}
         self.batch = 0
         self.cache = (
             PairCache(options.cache or user_cache(), int(options.cache_gb * GB)) if options.cache_gb else None
@@ -148,7 +151,7 @@ class _Predictor:
             else:
                 for array, values in zip(arrays, found, strict=True):
                     array[e] = values
-        needed = np.setdiff1d(edges[missing], list(self.tokens))
+        needed = np.setdiff1d(edges[missing], list(self.features))
         self._in_batches("encode images", needed, self._encode)
         self._in_batches(
             "predict pairs", np.array(missing, dtype=np.int64), lambda part: self._decode(part, edges, arrays)
@@ -173,16 +176,17 @@ class _Predictor:
     @torch.inference_mode()
     def _encode(self, rows: Int[ndarray, " b"]) -> None:
         images = torch.from_numpy(self.images.colors[rows]).to(self.device).permute(0, 3, 1, 2)
-        tokens = self.network.encode((images / 255 - 0.5) / 0.5).tokens
-        self.tokens.update(zip(rows.tolist(), tokens.split(1), strict=True))
+        features = self.network.encode((images / 255 - 0.5) / 0.5, many_pairs=True)
+        for k, row in enumerate(rows.tolist()):
+            self.features[row] = _each(lambda x, k=k: x[k : k + 1], features)
 
     @torch.inference_mode()
     def _decode(self, rows: Int[ndarray, " b"], edges: Int[ndarray, "e 2"], arrays: list[ndarray]) -> None:
-        height, width = self.images.colors.shape[1:3]
-        grid = (height // PATCH, width // PATCH)
-        view1, view2 = self.network.decode(
-            *(Features(torch.cat([self.tokens[row] for row in edges[rows, side]]), grid) for side in (0, 1))
+        first, second = (
+            _each(lambda *x: torch.cat(x), *(self.features[image] for image in edges[rows, side].tolist()))
+            for side in (0, 1)
         )
+        view1, view2 = self.network.decode(first, second)
         for array, values in zip(arrays, (*view1, *view2), strict=True):
             array[rows] = values.cpu().numpy()
         if self.cache is not None:
@@ -217,13 +221,24 @@ class _Predictor:
             logger.warning("one pair does not fit on the %s: going on, slowly, on the CPU", self.device)
             self.device = torch.device("cpu")
             self.network.to(self.device)
-            self.tokens = {row: tokens.cpu() for row, tokens in self.tokens.items()}
+            self.features = {row: _each(Tensor.cpu, features) for row, features in self.features.items()}
         else:
             raise InputError(
                 "out of memory with one pair of images; close other programs or use --image-size 224"
             )
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
+
+
+def _each(function: Callable[..., Tensor], *features: Features) -> Features:
+    """Features whose tensors are `function` of those of `features`."""
+
+    def gathered(*parts: Tensor | None) -> Tensor | None:
+        there = [part for part in parts if part is not None]
+        return function(*there) if there else None
+
+    finest1, finest2 = (gathered(*(f.finest[view] for f in features)) for view in (0, 1))
+    return Features(function(*(f.tokens for f in features)), features[0].grid, (finest1, finest2))
 
 
 def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
