@@ -1,0 +1,113 @@
+"""What all pairs say about chosen pixels of one image, laid out for vector arithmetic."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.reconstruct.dust3r.alignment import Pinhole
+from jcr.reconstruct.dust3r.pairs import PairPredictions
+
+CELL_SIDE = 4
+"""Residuals are correlated over an image; their cell means on a 4x4 grid tell by how much."""
+
+
+@dataclass(frozen=True)
+class ImageObservations:
+    """Pointmaps of one image, seen from the cameras of other images (`second` views) and from its own.
+
+    The `k` pointmaps come second views first. Components run before pixels, float32, for speed.
+    """
+
+    image: int
+    pixel_offset: Float[ndarray, "2 m"]
+    """x, y minus the principal point, y divided by fy/fx: over fx they are the ray at unit depth."""
+    cell: Float[ndarray, "m c"]
+    """1 where pixel m lies in coarse cell c."""
+    pair: Int[ndarray, " k"]
+    observer: Int[ndarray, " k"]
+    """The image in whose camera frame the pointmap is."""
+    second: Bool[ndarray, " k"]
+    direction: Float[ndarray, "k 3 m"]
+    """Unit vectors to the predicted points, in the observer's camera frame."""
+    log_range: Float[ndarray, "k m"]
+    """Log of the points' distance to the observer, in the pair's unit."""
+    weight: Float[ndarray, "k m"]
+
+    @property
+    def second_count(self) -> int:
+        """Number of second views, which come first."""
+        return int(self.second.sum())
+
+
+def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " m"]]:
+    """Flat indices per image: the most confident pixel (over all pairs) in each of about `count` equal cells.
+
+    Equal cells keep the whole field of view, which a plain ranking by confidence would give up.
+    """
+    height, width = predictions.conf.shape[1:]
+    side = np.sqrt(max(1.0, height * width / count))
+    rows, columns = max(1, round(height / side)), max(1, round(width / side))
+    cell = (np.arange(height)[:, None] * rows // height) * columns + np.arange(width) * columns // width
+    total = np.zeros((predictions.image_count, height * width), np.float32)
+    for (first, second), conf, conf2 in zip(
+        predictions.edges, predictions.conf, predictions.conf2, strict=True
+    ):
+        total[first] += conf.ravel()
+        total[second] += conf2.ravel()
+    by_cell = np.argsort(cell.ravel(), kind="stable")
+    starts = np.searchsorted(cell.ravel()[by_cell], np.arange(rows * columns))
+    chosen = []
+    for confidence in total:
+        sorted_confidence = confidence[by_cell]
+        best = np.maximum.reduceat(sorted_confidence, starts)
+        is_best = np.flatnonzero(sorted_confidence == best[cell.ravel()[by_cell]])
+        _, first_best = np.unique(cell.ravel()[by_cell[is_best]], return_index=True)
+        chosen.append(by_cell[is_best[first_best]])
+    return chosen
+
+
+def weight_is_log(predictions: PairPredictions) -> bool:
+    """Whether confidences follow DUSt3R, from 1 up and weighing log C as published; else they are weights."""
+    return float(predictions.conf.max()) > 1.0
+
+
+def observe(
+    predictions: PairPredictions,
+    pinhole: Pinhole,
+    image: int,
+    pixels: Int[ndarray, " m"] | slice,
+    log_weight: bool,
+) -> ImageObservations:
+    """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
+    count, height, width = predictions.conf.shape
+    as_second = np.flatnonzero(predictions.edges[:, 1] == image)
+    as_first = np.flatnonzero(predictions.edges[:, 0] == image)
+    sources: Sequence[tuple[ndarray, ndarray, ndarray]] = (
+        (as_second, predictions.pts3d_in_other_view, predictions.conf2),
+        (as_first, predictions.pts3d, predictions.conf),
+    )
+    points = np.stack([view[e].reshape(-1, 3)[pixels].T for edges, view, _ in sources for e in edges])
+    confidence = np.stack([conf[e].ravel()[pixels] for edges, _, conf in sources for e in edges])
+    distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
+    usable = distance > 1e-12
+    distance[~usable] = 1.0
+    weight = np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
+    flat = np.arange(height * width)[pixels]
+    y, x = np.divmod(flat, width)
+    cx, cy = pinhole.principal_point_px
+    coarse = (y * CELL_SIDE // height) * CELL_SIDE + x * CELL_SIDE // width
+    pair = np.concatenate([as_second, as_first])
+    return ImageObservations(
+        image=image,
+        pixel_offset=np.stack([x - cx, (y - cy) / pinhole.aspect]).astype(np.float32),
+        cell=(coarse[:, None] == np.arange(CELL_SIDE**2)).astype(np.float32),
+        pair=pair,
+        observer=predictions.edges[pair, 0],
+        second=np.arange(len(pair)) < len(as_second),
+        direction=points / distance[:, None],
+        log_range=np.log(distance),
+        weight=np.where(usable, weight, np.float32(0.0)),
+    )
