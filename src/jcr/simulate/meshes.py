@@ -102,7 +102,7 @@ def tube(path: Float[ndarray, "n 3"], radius: float, segments: int = 12) -> Mesh
 def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
     """How often the surface winds around each point: 1 within a closed one, 0 outside; parts add up.
 
-    Sum of the triangles' solid angles (van Oosterom and Strackee 1983, eq. 8) over 4π, as Jacobson et al. 2013.
+    The triangles' solid angles (van Oosterom and Strackee 1983, eq. 8) over 4π, as in Jacobson et al. 2013.
     """
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     # With the corners seen from x, a' = a - x, both the volume a'·(b'×c') and a'·b' are polynomials in x.
