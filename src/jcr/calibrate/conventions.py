@@ -13,15 +13,18 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.calibrate.closed_form import motions
 from jcr.calibrate.hand_eye import solve_hand_eye
 from jcr.calibrate.pose_fit import Poses
-from jcr.geometry import fit_similarity, inverse, rotation_angle, rotation_exp, skew, transform
+from jcr.geometry import fit_similarity, inverse, rotation_exp, skew, transform
 
 SOLVED = 24
 """At most so many readings are solved in full, the most congruent ones."""
 SAME_ANGLE = np.radians(0.1)
 """Relabelled axes keep every angle: among readings this alike, the usual mistakes are solved first."""
+FITS = 3.0
+"""mm; poses that agree with the pictures to this need no other reading."""
+CONGRUENT = np.radians(1.5)
+"""Readings whose angles miss the cameras' by less than this are worth solving."""
 BETTER = 3.0
 """A reading is named when it fits so many times better than the poses as given."""
 MIN_SHARE = 0.8
@@ -62,14 +65,23 @@ def better_reading(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[
     """The reading that fits far better than the poses as given, and those; None when there is none."""
     n = len(base_from_gripper)
     candidates = list(_candidates(base_from_gripper))
-    given, others = candidates[0], candidates[1:]
-    camera_angle = rotation_angle(motions(recon_from_camera)[..., :3, :3])
-    others.insert(0, _vectors_taken_as_radians(base_from_gripper, camera_angle))
-    others[1:1] = _angles_taken_as_radians(base_from_gripper, recon_from_camera)
-    gaps = np.array([_incongruence(candidate, camera_angle) for candidate in others])
+    as_given = _solved(candidates[0], recon_from_camera)
+    if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
+        return None
+    others = candidates[1:]
+    camera_angle = _angles(recon_from_camera)
+    gaps = [_incongruence(candidate, camera_angle) for candidate in others]
+    if min(gaps) > CONGRUENT:
+        # Lost turns take seconds to find again: only where no cheaper reading has the cameras' angles.
+        unwrapped = [
+            _vectors_taken_as_radians(base_from_gripper, camera_angle),
+            *_angles_taken_as_radians(base_from_gripper, recon_from_camera),
+        ]
+        others += unwrapped
+        gaps += [_incongruence(candidate, camera_angle) for candidate in unwrapped]
+    gaps = np.array(gaps)
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     readings = [_solved(others[k], recon_from_camera) for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
-    as_given = _solved(given, recon_from_camera)
     least = min(reading.misfit for reading in readings)
     best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
     if best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit:
@@ -100,9 +112,16 @@ def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
 
 def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
     """Typical difference (rad) between the angles of gripper and camera motions."""
-    angle = rotation_angle(motions(candidate.base_from_gripper)[..., :3, :3])
-    gap = np.abs(angle - camera_angle[np.ix_(candidate.image, candidate.image)])
-    return float(np.quantile(gap[np.triu_indices(len(angle), 1)], 0.6))
+    gap = np.abs(
+        _angles(candidate.base_from_gripper) - camera_angle[np.ix_(candidate.image, candidate.image)]
+    )
+    return float(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
+
+
+def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
+    """Angles (rad) of all relative rotations, by their traces: rough near 0 and π, but quick."""
+    flat = a_from_b[:, :3, :3].reshape(-1, 9)
+    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
 
 
 def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:

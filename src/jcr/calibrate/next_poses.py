@@ -70,7 +70,7 @@ def _candidates(
     x: Float[ndarray, "4 4"],
     reach: Float[ndarray, "2 3"] | None,
     rng: np.random.Generator,
-) -> Poses:
+) -> Float[ndarray, "k 4 4"]:
     """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
     camera = base_from_gripper @ x
     axis, center = camera[:, :3, 2], camera[:, :3, 3]

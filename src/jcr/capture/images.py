@@ -36,7 +36,9 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise InputError(f"{path}: no such image; correct its name in the capture or add the file") from None
     except InputError:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
 
 

@@ -1,0 +1,186 @@
+"""Reading a capture: what is sound is read as it is, and each fault is named with its place and cure."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import jcr
+from jcr.capture.images import read_image
+
+
+@pytest.fixture
+def capture(tmp_path: Path, tabletop: Path) -> Path:
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    (folder / "images").mkdir()
+    for name in ("00.jpg", "01.jpg", "02.jpg", "03.jpg"):
+        shutil.copy(tabletop / "images" / name, folder / "images" / name)
+    content = json.loads((tabletop / "capture.json").read_text())
+    content["frames"] = content["frames"][:4]
+    (folder / "capture.json").write_text(json.dumps(content))
+    return folder
+
+
+def edit(folder: Path, change) -> None:
+    file = folder / "capture.json"
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+def pose(content: dict, k: int = 1) -> np.ndarray:
+    return np.array(content["frames"][k]["base_from_gripper"])
+
+
+def set_pose(content: dict, matrix: np.ndarray, k: int = 1) -> None:
+    content["frames"][k]["base_from_gripper"] = np.asarray(matrix).tolist()
+
+
+def scale_all(content: dict, factor: float) -> None:
+    for k in range(4):
+        matrix = pose(content, k)
+        matrix[:3, 3] *= factor
+        set_pose(content, matrix, k)
+
+
+def test_a_sound_capture_is_read_as_it_is(capture: Path):
+    content = json.loads((capture / "capture.json").read_text())
+    read = jcr.read_capture(capture)
+    assert read.images == tuple(frame["image"] for frame in content["frames"])
+    assert np.allclose(read.base_from_gripper[2], content["frames"][2]["base_from_gripper"], atol=1e-9)
+    assert read.image_size == (640, 480)
+    assert read.intrinsics is not None and read.intrinsics.fx == content["intrinsics"]["fx"]
+    assert len(jcr.read_capture(capture / "capture.json")) == 4
+
+
+def test_unknown_intrinsics_and_other_keys_are_fine(capture: Path):
+    edit(capture, lambda c: c.update(intrinsics=None, anything={"else": 1}))
+    assert jcr.read_capture(capture).intrinsics is None
+
+
+def test_exif_rotation_is_honoured(capture: Path):
+    for k in range(4):
+        file = capture / "images" / f"{k:02d}.jpg"
+        upright = read_image(file)
+        exif = Image.Exif()
+        exif[0x0112] = 6  # the camera was turned: rotate by 90° clockwise to show
+        Image.fromarray(np.rot90(upright)).save(file.with_suffix(".png"), exif=exif)
+        assert (read_image(file.with_suffix(".png")) == upright).all()
+        file.unlink()
+    edit(capture, lambda c: [f.update(image=f["image"].replace("jpg", "png")) for f in c["frames"]])
+    assert jcr.read_capture(capture).image_size == (640, 480)
+
+
+def test_sixteen_bit_grey_and_cmyk_are_read(tmp_path: Path):
+    ramp = np.tile(np.linspace(0, 65535, 64).astype(np.uint16), (48, 1))
+    Image.fromarray(ramp).save(tmp_path / "grey.png")
+    assert np.allclose(read_image(tmp_path / "grey.png")[0, :, 1], ramp[0] // 256, atol=1)
+    Image.new("CMYK", (64, 48), (0, 255, 255, 0)).save(tmp_path / "red.jpg")
+    assert read_image(tmp_path / "red.jpg")[0, 0, 0] > 200
+
+
+def truncate(capture: Path) -> None:
+    file = capture / "images/01.jpg"
+    file.write_bytes(file.read_bytes()[:2000])
+
+
+def shrink(capture: Path) -> None:
+    file = capture / "images/01.jpg"
+    Image.open(file).resize((320, 240)).save(file)
+
+
+def link_out(capture: Path) -> None:
+    (capture.parent / "secret.jpg").write_bytes((capture / "images/01.jpg").read_bytes())
+    (capture / "images/01.jpg").unlink()
+    (capture / "images/01.jpg").symlink_to(capture.parent / "secret.jpg")
+
+
+FAULTS = {
+    "no capture.json": (lambda c: (c / "capture.json").unlink(), "holds no capture.json"),
+    "not JSON": (lambda c: (c / "capture.json").write_text("{'frames': []"), "not JSON at line 1"),
+    "not UTF-8": (lambda c: (c / "capture.json").write_bytes(b'{"frames": "\xff"}'), "not UTF-8"),
+    "deeply nested": (lambda c: (c / "capture.json").write_text("[" * 100_000), "nested too deeply"),
+    "key twice": (lambda c: (c / "capture.json").write_text('{"frames": [], "frames": []}'), "appears twice"),
+    "a list": (lambda c: (c / "capture.json").write_text("[]"), 'no list "frames"'),
+    "two frames": (lambda c: edit(c, lambda j: j.update(frames=j["frames"][:2])), "2 frames; at least 3"),
+    "image missing": (lambda c: (c / "images/01.jpg").unlink(), r"01\.jpg: no such image"),
+    "image truncated": (truncate, r"01\.jpg: not a readable image"),
+    "image empty": (lambda c: (c / "images/01.jpg").write_bytes(b""), r"01\.jpg: not a readable image"),
+    "text as image": (lambda c: (c / "images/01.jpg").write_text("hello"), r"01\.jpg: not a readable image"),
+    "wrong size": (shrink, r"01\.jpg: 320x240 pixels, but images/00\.jpg has 640x480"),
+    "same picture": (
+        lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
+        r"01\.jpg: the same picture as images/00\.jpg",
+    ),
+    "pose missing": (
+        lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
+        r"4 images but 3 gripper poses; add base_from_gripper to images/01\.jpg",
+    ),
+    "image name missing": (
+        lambda c: edit(c, lambda j: j["frames"][1].pop("image")),
+        'frame 1 has no "image"',
+    ),
+    "image twice": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(image="images/00.jpg")),
+        "more than once",
+    ),
+    "millimetres": (lambda c: edit(c, lambda j: scale_all(j, 1000)), "look like millimetres"),
+    "pose of NaN": (lambda c: edit(c, lambda j: set_pose(j, np.full((4, 4), np.nan))), "frame 1 .*NaN"),
+    "pose scaled": (
+        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([2, 2, 2, 1]))),
+        "frame 1 .*scaled by 2",
+    ),
+    "pose reflected": (
+        lambda c: edit(c, lambda j: set_pose(j, pose(j) @ np.diag([1, 1, -1, 1]))),
+        "frame 1 .*reflection",
+    ),
+    "pose transposed": (lambda c: edit(c, lambda j: set_pose(j, pose(j).T)), "frame 1 .*transposed"),
+    "pose of three rows": (lambda c: edit(c, lambda j: set_pose(j, pose(j)[:3])), r"shape \(3, 4\)"),
+    "pose of words": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(base_from_gripper="here")),
+        "frame 1 .*4x4",
+    ),
+    "lens outside": (lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)), "outside the 640x480"),
+    "lens short": (lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])), "not the five"),
+    "lens negative": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)), "must be positive"),
+    "path outside": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(image="../x.jpg")),
+        r"frame 1: '\.\./x\.jpg' leads out",
+    ),
+    "path absolute": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(image="/etc/passwd")),
+        "no path inside the capture",
+    ),
+    "path with NUL": (
+        lambda c: edit(c, lambda j: j["frames"][1].update(image="a\0b")),
+        "no path inside the capture",
+    ),
+    "link outside": (link_out, "leads out"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_one_line_with_place_and_cure(capture: Path, fault: str):
+    plant, words = FAULTS[fault]
+    plant(capture)
+    with pytest.raises(jcr.InputError, match=words) as error:
+        jcr.read_capture(capture)
+    assert "\n" not in str(error.value)
+    assert str(capture) in str(error.value)
+
+
+def test_a_decompression_bomb_is_refused_before_it_is_unpacked(tmp_path: Path):
+    Image.new("1", (20_000, 20_000)).save(tmp_path / "bomb.png")
+    with pytest.raises(jcr.InputError, match="million pixels"):
+        read_image(tmp_path / "bomb.png")
+
+
+def test_an_animation_is_refused(tmp_path: Path):
+    frames = [Image.new("RGB", (64, 48), color) for color in ("red", "green")]
+    frames[0].save(tmp_path / "two.gif", save_all=True, append_images=frames[1:])
+    with pytest.raises(jcr.InputError, match="holds 2 pictures"):
+        read_image(tmp_path / "two.gif")
