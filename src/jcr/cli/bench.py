@@ -1,10 +1,12 @@
 """`jcr bench`: the tables and timings that the README quotes."""
 
+import os
 import platform
 import sys
 from dataclasses import dataclass
 from datetime import date
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -49,17 +51,9 @@ def main(arguments: Arguments) -> int:
 
 def heading(name: str) -> str:
     """What a reader needs to judge and repeat the numbers."""
-    import os
-
-    import numpy
-    import scipy
-    import torch
-
-    from jcr import __version__
-
+    versions = ", ".join(f"{name} {version(name)}" for name in ("jcr", "numpy", "scipy", "torch", "pycolmap"))
     return (
         f"# jcr bench {name}\n\n"
         f"{date.today().isoformat()}, {platform.machine()}, {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}, jcr {__version__}, numpy {numpy.__version__}, "
-        f"scipy {scipy.__version__}, torch {torch.__version__}\n\n"
+        f"{platform.python_version()}, {versions}\n\n"
     )

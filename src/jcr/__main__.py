@@ -1,0 +1,5 @@
+"""`python -m jcr` is `jcr`."""
+
+from jcr.cli import main
+
+main()

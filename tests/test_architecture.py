@@ -1,0 +1,76 @@
+"""Imports run one way: read from the source, so that a shortcut is found on the day it is taken."""
+
+import ast
+from pathlib import Path
+
+SOURCE = Path(__file__).parent.parent / "src" / "jcr"
+LAYERS = [
+    {"errors"},
+    {"geometry", "records", "files", "progress"},
+    {"capture"},
+    {"reconstruct"},
+    {"calibrate"},
+    {"represent", "segment"},
+    {"export"},
+    {"simulate"},
+    {"report"},
+    {"check", "pipeline"},
+    {"bench"},
+    {"cli"},
+    {"__main__"},
+]
+LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
+# The report shows what the pipeline found, and names its type; the pipeline calls it at run time.
+TYPE_ONLY = {("report", "pipeline")}
+TORCH_ROOMS = {"reconstruct", "represent", "segment", "bench"}
+
+
+def imports(file: Path) -> list[tuple[str, bool]]:
+    """Modules that a file imports, with whether only for type checking."""
+    found = []
+
+    def visit(node: ast.AST, typing: bool) -> None:
+        for child in ast.iter_child_nodes(node):
+            inside = typing or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
+            if isinstance(child, ast.Import):
+                found.extend((alias.name, inside) for alias in child.names)
+            elif isinstance(child, ast.ImportFrom) and child.module:
+                found.append((child.module, inside))
+            visit(child, inside)
+
+    visit(ast.parse(file.read_text()), False)
+    return found
+
+
+def room(file: Path) -> str:
+    return file.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def test_every_room_has_its_layer():
+    rooms = {room(file) for file in SOURCE.rglob("*.py")} - {"__init__"}
+    assert rooms == set(LEVEL)
+
+
+def test_imports_run_one_way():
+    against = []
+    for file in SOURCE.rglob("*.py"):
+        mine = room(file)
+        if mine == "__init__":
+            continue
+        for module, typing in imports(file):
+            if not module.startswith("jcr."):
+                continue
+            other = module.split(".")[1]
+            if other != mine and LEVEL[other] >= LEVEL[mine] and not (typing and (mine, other) in TYPE_ONLY):
+                against.append(f"{file.relative_to(SOURCE)} imports {module}")
+    assert not against
+
+
+def test_torch_stays_where_networks_are():
+    outside = [
+        str(file.relative_to(SOURCE))
+        for file in SOURCE.rglob("*.py")
+        if any(module.split(".")[0] == "torch" for module, _ in imports(file))
+        and room(file) not in TORCH_ROOMS
+    ]
+    assert not outside

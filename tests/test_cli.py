@@ -1,0 +1,149 @@
+"""The command line through a subprocess, on the bundled capture and on faults."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.cli import COMMANDS
+
+
+def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "jcr", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
+    """The bundled capture, run once."""
+    out = tmp_path_factory.mktemp("run") / "tabletop"
+    finished = run_jcr("run", tabletop, out, "--quiet")
+    assert finished.returncode == 0, finished.stderr
+    assert "report:" in finished.stdout
+    return out
+
+
+def test_the_bundled_capture_is_calibrated_to_a_fraction_of_a_millimetre(done: Path, tabletop: Path):
+    compared = run_jcr("compare", done, tabletop, "--json")
+    assert compared.returncode == 0
+    difference = json.loads(compared.stdout)
+    assert difference["translation_mm"] < 1.0
+    assert difference["rotation_deg"] < 0.1
+    assert max(difference["sigmas"]) < 4.0
+
+
+def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
+    names = {path.name for path in done.iterdir()}
+    assert {
+        "calibration.json",
+        "reconstruction.npz",
+        "cloud.ply",
+        "map.safetensors",
+        "report.html",
+        "log.txt",
+    } <= names
+    assert not [name for name in names if ".part" in name]
+    content = json.loads((done / "calibration.json").read_text())
+    assert content["format"] == "jcr.calibration/1"
+    assert content["converged"] is True
+    assert np.shape(content["uncertainty"]["covariance"]) == (7, 7)
+    assert len(content["images"]) == 12
+
+
+def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabletop: Path):
+    before = json.loads((done / "calibration.json").read_text())
+    stamp = (done / "reconstruction.npz").stat().st_mtime_ns
+    again = run_jcr("calibrate", tabletop, done, "--quiet", "--json")
+    after = json.loads(again.stdout)
+    assert (done / "reconstruction.npz").stat().st_mtime_ns == stamp
+    assert after["gripper_from_camera"] == before["gripper_from_camera"]
+    assert after["scale"] == before["scale"]
+
+
+def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
+    truth = json.loads((tabletop / "truth" / "scene.json").read_text())
+    table = truth["table_height"]
+    capture = jcr.read_capture(tabletop)
+    over = capture.base_from_gripper[:, :2, 3].mean(0)
+    points = tmp_path / "points.csv"
+    points.write_text(f"x,y,z\n{over[0]},{over[1]},{table + 0.3}\n9,9,9\n")
+    answered = run_jcr("query", done, points, "--json")
+    assert answered.returncode == 0, answered.stderr
+    answers = json.loads(answered.stdout)
+    assert "occupancy" in json.dumps(answers)
+
+
+def test_scale_is_metric_to_half_a_percent(done: Path, tabletop: Path):
+    from jcr.geometry import fit_similarity
+    from jcr.reconstruct.file import read_reconstruction
+
+    reconstruction = read_reconstruction(done / "reconstruction.npz")
+    truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    centers = (jcr.read_capture(tabletop).base_from_gripper @ truth)[reconstruction.image_index, :3, 3]
+    _, scale = fit_similarity(centers, reconstruction.recon_from_camera[:, :3, 3])
+    assert json.loads((done / "calibration.json").read_text())["scale"] == pytest.approx(scale, rel=5e-3)
+
+
+def test_check_finds_the_bundled_capture_good_and_a_planted_mistake_bad(tabletop: Path, tmp_path: Path):
+    good = run_jcr("check", tabletop, "--quiet", "--suggest", 1)
+    assert good.returncode == 0, good.stderr
+    assert "good to calibrate" in good.stdout and "add pose 1" in good.stdout
+
+    shutil.copytree(tabletop, tmp_path / "bad")
+    file = tmp_path / "bad" / "capture.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["base_from_gripper"] = np.linalg.inv(frame["base_from_gripper"]).tolist()
+    file.write_text(json.dumps(content))
+    bad = run_jcr("check", tmp_path / "bad", "--quiet")
+    assert bad.returncode == 3
+    assert "inverses" in bad.stderr and bad.stderr.count("\n") == 1
+
+
+def test_every_command_has_help_with_examples():
+    assert all(name in run_jcr("--help").stdout for name in COMMANDS)
+    for name in COMMANDS:
+        helped = run_jcr(name, "--help")
+        assert helped.returncode == 0, helped.stderr
+        assert "examples:" in helped.stdout, name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["fly"], "no command"),
+        (["run"], "required"),
+        (["run", "nowhere", "out"], "nowhere"),
+        (["run", "nowhere", "out", "--backend", "magic"], "magic"),
+        (["compare", "nowhere", "nowhere"], "nowhere"),
+        (["query", "nowhere", "nowhere"], "nowhere"),
+        (["map", "nowhere"], "nowhere"),
+        (["bench", "everything"], "everything"),
+    ],
+)
+def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list[str], words: str):
+    finished = run_jcr(*arguments, cwd=tmp_path)
+    assert finished.returncode == 2
+    assert finished.stderr.startswith("error: ") and finished.stderr.count("\n") == 1
+    assert words in finished.stderr
+    assert "Traceback" not in finished.stderr
+    assert not list(tmp_path.iterdir()) or arguments[0] == "map"
+
+
+def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: Path, tabletop: Path):
+    from PIL import Image
+
+    shutil.copytree(tabletop, tmp_path / "plain")
+    for k, file in enumerate(sorted((tmp_path / "plain" / "images").iterdir())):
+        Image.new("RGB", (640, 480), (120 + k, 120, 120)).save(file)
+    finished = run_jcr("run", tmp_path / "plain", tmp_path / "out", "--quiet")
+    assert finished.returncode == 3
+    assert finished.stderr.startswith("error: ") and finished.stderr.count("\n") == 1
+    content = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert content["converged"] is False and content["gripper_from_camera"] is None
+    assert content["warnings"]
