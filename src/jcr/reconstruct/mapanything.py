@@ -5,7 +5,7 @@ down, z forward, poses recon_from_camera, pixel (0, 0) a centre.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ LONG_EDGE, PATCH = 518, 14
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
+@runtime_checkable
 class Model(Protocol):
     """What is asked of the package's model."""
 

@@ -79,7 +79,8 @@ def fit_pinhole(
         weights.append(confidence[k, v, u][there])
     ray, pixel, trust = (np.concatenate(parts) for parts in (rays, pixels, weights))
     if len(ray) < max(100, 0.5 * (confidence[:, v, u] > 0).sum()):
-        return Intrinsics(width, width, (width - 1) / 2, (height - 1) / 2, width, height), float("inf")
+        guess = Intrinsics(float(width), float(width), (width - 1) / 2, (height - 1) / 2, width, height)
+        return guess, float("inf")
     focal, center = np.empty(2), np.empty(2)
     misfit = np.zeros_like(ray)
     for _ in range(5):
