@@ -103,10 +103,10 @@ def build_map(
     progress: Progress | None = None,
 ) -> RunResult:
     """Cloud, map and report again, from the capture and the calibration that the run folder `out` names."""
+    state = _read_state(Path(out))
+    if "capture" not in state:
+        raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
     with _run_folder(Path(out)) as folder:
-        state = _read_state(folder)
-        if "capture" not in state:
-            raise InputError(f"{folder}: holds no run; make one with `jcr run` or `jcr calibrate`")
         capture = read_capture(state["capture"])
         options = RunOptions(
             ReconstructOptions(**state["options"]["reconstruct"]),

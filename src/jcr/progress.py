@@ -10,8 +10,8 @@ Progress = Callable[[str, float], None]
 
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
-    """Yield the callable that stages report to; nothing is drawn when `quiet`."""
-    if quiet:
+    """Yield the callable that stages report to; bars are drawn on a terminal, unless `quiet`."""
+    if quiet or not sys.stderr.isatty():
         yield lambda stage, fraction: None
         return
     from rich.console import Console
@@ -25,11 +25,15 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=Console(file=sys.stderr)) as bars:
+    bars = Progress(*columns, console=Console(file=sys.stderr))
 
-        def report(stage: str, fraction: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=fraction)
+    def report(stage: str, fraction: float) -> None:
+        if stage not in tasks:
+            bars.start()  # with the first stage: an error before it is a line of its own
+            tasks[stage] = bars.add_task(stage, total=1.0)
+        bars.update(tasks[stage], completed=fraction)
 
+    try:
         yield report
+    finally:
+        bars.stop()
