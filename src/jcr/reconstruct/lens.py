@@ -73,12 +73,14 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)
     rays = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    folded = np.less_equal(np.linalg.det(_jacobian(lens, rays)), 0.0)
+    folded = np.linalg.det(_jacobian(lens, rays)) <= 0
     x_px = distort(lens, rays)
     outside = ((x_px < -0.5) | (x_px > [lens.width - 0.5, lens.height - 0.5])).any(-1)
-    folded[-1] = outside[-1] = True  # a ray that is still in the frame at 84° counts as folded
-    first_folded, first_outside = folded.argmax(0), outside.argmax(0)
-    bad = (first_folded < first_outside) | (first_outside == len(radius) - 1)
+    # A ray that is still in the frame at the widest angle counts as folded there.
+    first_folded, first_outside = (
+        np.where(event.any(0), event.argmax(0), len(radius) - 1) for event in (folded, outside)
+    )
+    bad = first_folded <= first_outside
     if not bad.any():
         return None
     at_fold = x_px[first_folded[bad], bad.nonzero()[0]]
@@ -104,7 +106,8 @@ def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
     u, v = np.linspace(-0.5, lens.width - 0.5, 100), np.linspace(-0.5, lens.height - 0.5, 100)
     left, right = (undistort(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (-0.5, lens.width - 0.5))
     top, bottom = (undistort(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (-0.5, lens.height - 0.5))
-    x0, x1, y0, y1 = left.max(), right.min(), top.max(), bottom.min()
+    x0, x1 = float(left.max()), float(right.min())
+    y0, y1 = float(top.max()), float(bottom.min())
     scale = long_side_px / max((x1 - x0) * lens.fx, (y1 - y0) * lens.fy)
     width, height = round((x1 - x0) * lens.fx * scale), round((y1 - y0) * lens.fy * scale)
     fx, fy = width / (x1 - x0), height / (y1 - y0)
