@@ -19,6 +19,7 @@ COMMANDS = {
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
     "check": "reads and judges a capture before any heavy work",
+    "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
     "compare": "difference of two calibrations in mm and degrees",

@@ -15,6 +15,7 @@ import tyro
 from jcr.errors import InputError
 
 BENCHES = {
+    "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
     "run": "the whole job on the bundled capture: time and memory of each stage",
 }

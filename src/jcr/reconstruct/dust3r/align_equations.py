@@ -96,18 +96,22 @@ def measure_noise(observations: ImageObservations, r: Residuals) -> Noise:
     across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
     along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
     weight = observations.weight * agreement(r, Noise(across, along, across, along))
+    across_inflation = _inflation(observations, weight, r.across)
+    return Noise(across, along, across_inflation, _inflation(observations, weight, r.along[:, None]))
+
+
+def _inflation(
+    o: ImageObservations, weight: Float[ndarray, "k m"], parts: Float[ndarray, "k c m"]
+) -> Float[ndarray, " k"]:
+    """Variance of residuals' cell means over what independent residuals would have (the design effect)."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
-    cell_total = weight @ observations.cell
-
-    def inflation(parts: Float[ndarray, "k c m"]) -> Float[ndarray, " k"]:
-        weighted = weight[:, None] * parts
-        variance = np.einsum("kcm,kcm->k", weighted, parts) / total
-        means = (weighted @ observations.cell) / np.maximum(cell_total, 1e-12)[:, None]
-        variance_of_means = np.einsum("kcg,kcg,kg->k", means, means, cell_total) / total
-        per_cell = observations.weight.shape[1] / CELL_SIDE**2
-        return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
-
-    return Noise(across, along, inflation(r.across), inflation(r.along[:, None]))
+    cell_total = weight @ o.cell
+    weighted = weight[:, None] * parts
+    variance = np.einsum("kcm,kcm->k", weighted, parts) / total
+    means = (weighted @ o.cell) / np.maximum(cell_total, 1e-12)[:, None]
+    variance_of_means = np.einsum("kcg,kcg,kg->k", means, means, cell_total) / total
+    per_cell = weight.shape[1] / CELL_SIDE**2
+    return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
 
 
 def agreement(r: Residuals, noise: Noise) -> Float[ndarray, "k m"]:
@@ -173,12 +177,12 @@ class Layout:
 
 
 def depth_equations(
-    observations: ImageObservations, r: Residuals, noise: Noise
+    r: Residuals, noise: Noise, weight: Float[ndarray, "k m"]
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
     """Gauss-Newton hessian and gradient of the log depths alone, every pointmap an independent witness."""
-    robust = observations.weight * agreement(r, noise) / r.distance
-    w_across = robust / noise.across[:, None] ** 2
-    w_along = robust / noise.along[:, None] ** 2
+    weight = weight / r.distance
+    w_across = weight / noise.across[:, None] ** 2
+    w_along = weight / noise.along[:, None] ** 2
     along_arm = _dot(r.toward, r.depth_arm)
     hessian = (w_along - w_across) / r.distance * along_arm**2
     hessian += w_across / r.distance * (r.depth_arm**2).sum(axis=0)
@@ -196,7 +200,6 @@ class ImageEquations:
     depth_hessian: Float[ndarray, " m"]
     depth_gradient: Float[ndarray, " m"]
     coupling: Float[ndarray, "c m"]
-    cost: float
 
     def depth_step(self, local_step: Float[ndarray, " c"]) -> Float[ndarray, " m"]:
         """Change of log depth once the local unknowns have moved."""
@@ -217,30 +220,18 @@ def image_equations(observations: ImageObservations, r: Residuals, noise: Noise)
     the directions an unknown moves the point in: twist (I, −[X]), depth (the arm), focal.
     """
     o, n = observations, observations.second_count
-    robust = o.weight * agreement(r, noise)
+    # Of mean 1, so that the hessian is the information in the pointmaps.
+    robust = o.weight / np.maximum(o.weight.mean(), np.float32(1e-12)) * agreement(r, noise)
     w_across = robust / (noise.across**2 * noise.across_inflation)[:, None]
     w_along = robust / (noise.along**2 * noise.along_inflation)[:, None]
     alpha = w_across / r.distance**2
     beta = w_along / r.distance**2 - alpha
     toward, arm, focal_arm = r.toward, r.depth_arm, r.focal_arm
-
-    def pull(v: Float[ndarray, "3 m"]) -> Float[ndarray, "k 3 m"]:
-        """(α I + β x̂ x̂ᵀ) v."""
-        return alpha[:, None] * v + (beta * _dot(toward, v))[:, None] * toward
-
-    def twist(force: Float[ndarray, "k 3 m"]) -> Float[ndarray, "k 6 m"]:
-        """(I, −[X])ᵀ applied to forces at the modelled points."""
-        out = np.empty((len(force), 6, force.shape[2]), np.float32)
-        out[:, :3] = force
-        for c, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), start=3):
-            out[:, c] = r.x_in_recon[a] * force[:, b] - r.x_in_recon[b] * force[:, a]
-        return out
-
-    depth_pull, focal_pull = pull(arm), pull(focal_arm)
+    depth_pull, focal_pull = _pull(alpha, beta, toward, arm), _pull(alpha, beta, toward, focal_arm)
     scale_pull = -w_along / r.distance
     residual_force = (w_along * r.along / r.distance)[:, None] * toward
     residual_force -= (w_across / r.distance)[:, None] * r.across
-    screw = twist(toward[:n])
+    screw = _moments(r.x_in_recon, toward[:n])
 
     maps = len(o.pair)
     size = 6 * n + maps + 1
@@ -250,7 +241,7 @@ def image_equations(observations: ImageObservations, r: Residuals, noise: Noise)
     hessian[twists[:, :, None], twists[:, None, :]] = (screw * beta[:n, None]) @ screw.transpose(0, 2, 1)
     hessian[twists[:, :, None], twists[:, None, :]] += _isotropic(alpha[:n], r.x_in_recon)
     hessian[twists, scales[:n, None]] = np.einsum("km,kcm->kc", scale_pull[:n], screw)
-    hessian[twists, -1] = twist(focal_pull[:n]).sum(axis=2)
+    hessian[twists, -1] = _moments(r.x_in_recon, focal_pull[:n]).sum(axis=2)
     hessian[scales, scales] = w_along.sum(axis=1)
     hessian[scales, -1] = np.einsum("km,km->k", scale_pull, _dot(toward, focal_arm))
     hessian[-1, -1] = np.vdot(focal_pull.sum(axis=0), focal_arm)
@@ -259,14 +250,14 @@ def image_equations(observations: ImageObservations, r: Residuals, noise: Noise)
 
     gradient = np.concatenate(
         [
-            twist(residual_force[:n]).sum(axis=2).ravel(),
+            _moments(r.x_in_recon, residual_force[:n]).sum(axis=2).ravel(),
             -(w_along * r.along).sum(axis=1),
             [np.vdot(residual_force.sum(axis=0), focal_arm)],
         ]
     )
     coupling = np.concatenate(
         [
-            twist(depth_pull[:n]).reshape(6 * n, arm.shape[1]),
+            _moments(r.x_in_recon, depth_pull[:n]).reshape(6 * n, arm.shape[1]),
             scale_pull * _dot(toward, arm),
             (depth_pull.sum(axis=0) * focal_arm).sum(axis=0)[None],
         ]
@@ -280,8 +271,26 @@ def image_equations(observations: ImageObservations, r: Residuals, noise: Noise)
         depth_hessian=depth_hessian,
         depth_gradient=(residual_force.sum(axis=0) * arm).sum(axis=0),
         coupling=coupling,
-        cost=float((w_across * r.across_squared + w_along * r.along**2).sum()),
     )
+
+
+def _pull(
+    alpha: Float[ndarray, "k m"],
+    beta: Float[ndarray, "k m"],
+    toward: Float[ndarray, "k 3 m"],
+    v: Float[ndarray, "3 m"],
+) -> Float[ndarray, "k 3 m"]:
+    """(α I + β x̂ x̂ᵀ) v."""
+    return alpha[:, None] * v + (beta * _dot(toward, v))[:, None] * toward
+
+
+def _moments(x: Float[ndarray, "3 m"], force: Float[ndarray, "n 3 m"]) -> Float[ndarray, "n 6 m"]:
+    """(I, −[X])ᵀ applied to forces at points X: force and moment, what a twist feels."""
+    out = np.empty((len(force), 6, x.shape[1]), np.float32)
+    out[:, :3] = force
+    for row, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)), start=3):
+        out[:, row] = x[a] * force[:, b] - x[b] * force[:, a]
+    return out
 
 
 def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[ndarray, "n 6 6"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
 
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.align_depth import fused_depth
 from jcr.reconstruct.dust3r.align_equations import (
@@ -31,7 +31,8 @@ COARSE_TOLERANCE = 1e-3
 FINE_TOLERANCE = 1e-4
 """Of the last step (rad, or relative): a tenth of what the noise of predictions leaves."""
 ITERATIONS = 30
-DEPTH_CHUNK = 16384
+DEPTH_CHUNK = 4096
+"""Pixels at a time, so that the arrays of a chunk stay in the cache."""
 CONTRADICTION = 4.0
 """A pair whose residual is this many times the median one is named to the user."""
 
@@ -39,7 +40,10 @@ CONTRADICTION = 4.0
 class Cameras(Protocol):
     """What is free about the cameras: each way of tying them takes its own step."""
 
-    recon_from_camera: Float[ndarray, "n 4 4"]
+    @property
+    def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
+        """Where they stand now."""
+        ...
 
     def step(
         self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
@@ -60,7 +64,7 @@ class FreeCameras:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
         scales = layout.scales
         held = hessian.copy()
-        held[scales, scales] += hessian.diagonal()[scales].mean()
+        held[np.ix_(scales, scales)] += hessian.diagonal()[scales].mean()
         step = np.zeros(layout.size)
         step[6:] = -np.linalg.solve(held[6:, 6:], gradient[6:])
         self.recon_from_camera = moved(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
@@ -170,7 +174,7 @@ def gauss_newton(
 def dense_alignment(
     problem: Problem, solution: Solution, begin: float, progress: Progress | None = None
 ) -> Alignment:
-    """The record of a solution, with the depth of every pixel."""
+    """The record of a solution, in its own recon frame, with the depth of every pixel."""
     predictions, state = problem.predictions, solution.state
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)
@@ -184,7 +188,7 @@ def dense_alignment(
     focal = np.exp(state.log_focal)
     residual, notes = _pair_residuals(predictions, solution)
     return Alignment(
-        recon_from_camera=inverse(state.recon_from_camera[0]) @ state.recon_from_camera,
+        recon_from_camera=state.recon_from_camera,
         focal_px=np.stack([focal, focal * problem.pinhole.aspect], axis=1),
         principal_point_px=problem.pinhole.principal_point_px,
         depth=depth.reshape(count, height, width),

@@ -1,0 +1,82 @@
+"""`jcr align`: global alignment alone, from pairwise pointmaps to cameras, focal lengths and depth."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jcr.reconstruct.dust3r.alignment import AlignOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Align pairwise pointmaps into one reconstruction.
+
+    PAIRS.npz is what `jcr predict` writes: edges (E,2), pts3d and pts3d_in_other_view (E,H,W,3), conf and conf2
+    (E,H,W). RESULT.npz gets poses (N,4,4), camera to recon; focals (N,); depth and confidence (N,H,W);
+    principal_point (2,); pair_scale and pair_residual (E,).
+
+    examples:
+      jcr align out/pairs.npz out/aligned.npz
+      jcr align out/pairs.npz out/published.npz --method adam
+      jcr align out/pairs.npz out/aligned.npz --focal own --principal-point-px 255.5 191.5
+    """
+
+    pairs: Annotated[Path, tyro.conf.Positional]
+    """Pairwise pointmaps to read."""
+    result: Annotated[Path, tyro.conf.Positional]
+    """Alignment to write."""
+    options: AlignOptions = field(default_factory=AlignOptions)
+    json: bool = False
+    """Print time, residuals and notes as JSON on stdout."""
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Read, align, write."""
+    import json
+
+    import numpy as np
+
+    from jcr.files import written_whole
+    from jcr.progress import progress_bars
+    from jcr.reconstruct.dust3r.align import align
+    from jcr.reconstruct.dust3r.pairs import read_pairs
+
+    predictions = read_pairs(arguments.pairs)
+    with progress_bars(arguments.quiet) as progress:
+        alignment = align(predictions, arguments.options, progress)
+    with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
+        np.savez(
+            stream,
+            poses=alignment.recon_from_camera,
+            focals=alignment.focal_px[:, 0],
+            depth=alignment.depth,
+            confidence=alignment.confidence,
+            principal_point=np.array(alignment.principal_point_px),
+            pair_scale=alignment.pair_scale,
+            pair_residual=alignment.pair_residual,
+        )
+    for note in alignment.notes:
+        sys.stderr.write(f"note: {note}\n")
+    residual = float(np.median(alignment.pair_residual))
+    if arguments.json:
+        facts = {
+            "result": str(arguments.result),
+            "method": alignment.method,
+            "seconds": alignment.seconds,
+            "images": len(alignment.depth),
+            "pairs": len(alignment.pair_scale),
+            "pair_residual": residual,
+            "notes": list(alignment.notes),
+        }
+        sys.stdout.write(json.dumps(facts) + "\n")
+    else:
+        sys.stdout.write(
+            f"{arguments.result}: {len(alignment.depth)} images from {len(alignment.pair_scale)} pairs in "
+            f"{alignment.seconds:.2f} s, residual of the middle pair {100 * residual:.2g} % of the distance\n"
+        )
+    return 0
