@@ -1,0 +1,216 @@
+"""report.html: one file that says whether to trust a calibration, hands it over, and shows what was found."""
+
+import json
+import platform
+from collections.abc import Sequence
+from html import escape
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jcr.calibrate.file import CalibrationFile
+from jcr.geometry import Transforms, scale_translation
+from jcr.records import Capture
+from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
+from jcr.report.images import images_section, lens_of, residuals_section
+from jcr.report.map import map_section
+from jcr.report.markup import PAGE, filled, significant
+from jcr.report.samples import sample_surface
+from jcr.report.scene3d import scene_section
+from jcr.report.transform import transform_section
+
+if TYPE_CHECKING:
+    from jcr.pipeline import RunResult
+
+SURFACE_POINTS = 80_000
+"""Sampled from the map, at most."""
+
+
+def report_html(capture: Capture, result: "RunResult") -> str:
+    """The report of a run as one HTML page that loads nothing else.
+
+    Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
+    become unreadable.
+    """
+    calibration, hand_eye = result.calibration, result.hand_eye
+    base_from_camera = hand_eye.base_from_recon @ scale_translation(
+        result.reconstruction.recon_from_camera, hand_eye.scale
+    )
+    surface = None if result.scene is None else sample_surface(result.scene, SURFACE_POINTS)
+    sections = [
+        _verdict(calibration),
+        _tiles(calibration),
+        _warnings(calibration),
+        transform_section(hand_eye),
+        scene_section(capture, result, base_from_camera, surface),
+        images_section(capture, result),
+        residuals_section(capture, result),
+        _uncertainty(calibration),
+        filled("before_after.html", panels=_before_after(capture, result, base_from_camera)),
+        ""
+        if result.scene is None or surface is None
+        else map_section(result, result.scene, surface, base_from_camera),
+        _details(result),
+    ]
+    return filled(
+        "page.html",
+        name=escape(capture.folder.resolve().name),
+        about=f"{len(capture)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
+        style=(PAGE / "page.css").read_text(),
+        sections="\n".join(sections),
+        scene3d=(PAGE / "scene3d.js").read_text(),
+        copy=(PAGE / "copy.js").read_text(),
+    )
+
+
+def _verdict(calibration: CalibrationFile) -> str:
+    held_out, uncertainty = calibration.held_out, calibration.uncertainty
+    miss = ""
+    if held_out is not None:
+        miss = f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
+    if not calibration.converged:
+        kind, reason = "bad", calibration.warnings[0] if calibration.warnings else "no reason was recorded"
+        headline = f"<b>Do not trust this calibration:</b> {escape(reason)}."
+    elif miss:
+        kind = "good"
+        headline = f"<b>Trusted:</b> images left out of the calibration are predicted to {miss} on average."
+    else:
+        kind = "good"
+        headline = "<b>Trusted</b> by its own account: nothing speaks against it, nor could a held-out image."
+    if held_out is None:
+        believe = "There were too few images to leave one out and see how well the others predict it."
+        if uncertainty is not None:
+            believe += f" By its own account the offset is known {escape(uncertainty.worst)} (one σ)."
+    elif not calibration.observability.observable:
+        # An error along a direction that no motion shows changes no prediction.
+        believe = f"Its held-out error of {miss} is no comfort: what no motion shows, no image can miss."
+    else:
+        believe = (
+            f"Held-out error, the number to believe: {miss} ({escape(held_out.how)}). The residuals of a fit "
+            "shrink with few images even where it is wrong."
+        )
+    return f'<section class="verdict {kind}"><h2>{headline}</h2><p>{believe}</p></section>'
+
+
+def _tiles(calibration: CalibrationFile) -> str:
+    tiles = []
+    if (held_out := calibration.held_out) is not None:
+        pixels = "" if held_out.reprojection_px is None else f" · {significant(held_out.reprojection_px)} px"
+        degrees = f"{significant(held_out.rotation_deg)}°"
+        tiles.append(("Held-out error", f"{significant(held_out.translation_mm)} mm", degrees + pixels))
+    if (uncertainty := calibration.uncertainty) is not None:
+        direction = uncertainty.worst.partition(":")[0]
+        offset_variance = np.array(uncertainty.covariance)[:3, :3]
+        worst_mm = significant(1e3 * float(np.sqrt(np.linalg.norm(offset_variance, 2))))
+        worst_deg = significant(max(uncertainty.rotation_std_deg))
+        tiles.append(("Offset, 1 σ", f"±{worst_mm} mm", f"at worst, {direction}"))
+        tiles.append(("Orientation, 1 σ", f"±{worst_deg}°", "at worst, about gripper axes"))
+        if calibration.scale is not None:
+            percent = significant(uncertainty.scale_std_percent)
+            tiles.append(("Scale", significant(calibration.scale, 4), f"m per unit, ±{percent}\u00a0%"))
+    used, all_images = sum(image.used for image in calibration.images), len(calibration.images)
+    tiles.append(
+        (
+            "Images used",
+            f"{used} of {all_images}",
+            f"{all_images - used} rejected" if used < all_images else "",
+        )
+    )
+    if (noise := calibration.robot_noise) is not None:
+        how = "estimated" if noise.estimated else "as given"
+        degrees = f"{significant(noise.rotation_deg)}° per axis, {how}"
+        tiles.append(("Robot's noise, 1 σ", f"{significant(noise.translation_mm)} mm", degrees))
+    cells = [
+        f'<div class="tile"><div class="name">{name}</div><div class="number">{escape(number)}</div>'
+        f'<div class="more">{escape(more)}</div></div>'
+        for name, number, more in tiles
+    ]
+    return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _warnings(calibration: CalibrationFile) -> str:
+    # What the verdict already says is not said twice.
+    warnings = calibration.warnings[0 if calibration.converged else 1 :]
+    if not warnings:
+        return ""
+    items = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
+    return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
+
+
+def _uncertainty(calibration: CalibrationFile) -> str:
+    observed, uncertainty = calibration.observability, calibration.uncertainty
+    says = ["<p>The motions show every direction of the calibration: offset, orientation and scale.</p>"]
+    if not observed.observable:
+        pairs = zip(observed.unobservable, observed.advice, strict=False)
+        items = "".join(f"<li><b>{escape(name)}</b>; cure: {escape(cure)}</li>" for name, cure in pairs)
+        says = [f"<p>The motions leave unseen:</p><ul>{items}</ul>"]
+    if uncertainty is not None:
+        offset = _spreads("offset along", uncertainty.translation_std_mm, " mm")
+        turn = _spreads("turn about", uncertainty.rotation_std_deg, "°")
+        says += [
+            f'<div class="columns">{offset}{turn}</div>',
+            '<p class="soft">One standard deviation, axes of the gripper frame. Least certain is the offset '
+            f"{escape(uncertainty.worst)}; scale ±{significant(uncertainty.scale_std_percent)} %.</p>",
+        ]
+    return f'<section id="uncertainty"><h2>What the images can tell</h2>{"".join(says)}</section>'
+
+
+def _spreads(name: str, std: Sequence[float], unit: str) -> str:
+    """A bar each axis, as wide as ± one standard deviation against the largest of them."""
+    rows = []
+    for axis, value in zip("xyz", std, strict=True):
+        half = 50 * value / (max(std) or 1.0)
+        bar = f'<i style="left:{50 - half:.1f}%;width:{2 * half:.1f}%"></i><b></b>'
+        rows.append(
+            f'<tr><th>{name} {axis}</th><td><div class="track centred">{bar}</div></td>'
+            f"<td>±{significant(value)}{unit}</td></tr>"
+        )
+    return f'<table class="spread"><tbody>{"".join(rows)}</tbody></table>'
+
+
+def _before_after(capture: Capture, result: "RunResult", base_from_camera: Transforms) -> str:
+    grippers, lens = capture.base_from_gripper, lens_of(result)
+    before, rows = result.reconstruction.recon_from_camera, result.reconstruction.image_index
+    return "".join(
+        [
+            camera_figure("Before: own frame and unit", grippers, before, None, lens, OBLIQUE),
+            camera_figure("After calibration and rescaling", grippers, base_from_camera, rows, lens, OBLIQUE),
+            camera_figure("Before, from above", grippers, before, None, lens, ABOVE),
+            camera_figure("After, from above", grippers, base_from_camera, rows, lens, ABOVE),
+        ]
+    )
+
+
+def _details(result: "RunResult") -> str:
+    calibration, timings = result.calibration, result.calibration.timings_s
+    blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
+    blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
+    if (lens := calibration.intrinsics) is not None:
+        blocks["Lens"] = {
+            "size": f"{lens.width} × {lens.height} px",
+            "focal length": f"{lens.fx:.2f}, {lens.fy:.2f} px",
+            "principal point": f"{lens.cx:.2f}, {lens.cy:.2f} px",
+            "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
+        }
+    if result.scene is not None:
+        blocks["Map"] = result.scene.history
+    for stage, options in _options(result.out).items():
+        blocks[f"Options: {stage}"] = {name: str(value) for name, value in options.items()}
+    packages = ("numpy", "scipy", "torch", "pycolmap")
+    blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}
+    blocks["Versions"] |= {name: metadata.version(name) for name in packages}
+    columns = []
+    for title, rows in blocks.items():
+        items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())
+        columns.append(f"<div><h3>{escape(title)}</h3><dl>{items}</dl></div>")
+    return f'<section id="details"><h2>Details</h2><div class="columns">{"".join(columns)}</div></section>'
+
+
+def _options(out: Path) -> dict[str, dict[str, Any]]:
+    """The options that the run folder's run.json names, a stage each; none in a folder without one."""
+    try:
+        return json.loads((out / "run.json").read_text())["options"]
+    except (OSError, ValueError, KeyError):
+        return {}

@@ -1,0 +1,72 @@
+"""The section that shows the trained map: from the cameras' places, and cut open."""
+
+from html import escape
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import apply, inverse
+from jcr.report.figures import label_colors, picture_url, rendered_points, slice_figure
+from jcr.report.images import THUMBNAIL, shown_names
+from jcr.report.markup import filled
+from jcr.report.samples import CLEARANCE, SurfacePoints, point_size, slices
+from jcr.represent.scene import SceneMap
+
+if TYPE_CHECKING:
+    from jcr.pipeline import RunResult
+
+PAIRS = 4
+"""Images that are shown beside the map."""
+
+
+def map_section(
+    result: "RunResult",
+    scene: SceneMap,
+    surface: SurfacePoints,
+    base_from_camera: Float[ndarray, "m 4 4"],
+) -> str:
+    """Sampled points in predicted colour and class beside the images, and two slices of the occupancy."""
+    level, upright = slices(scene, surface)
+    above = f"{100 * CLEARANCE:.0f} cm above the support"
+    return filled(
+        "map.html",
+        size=" × ".join(f"{side:.2f}" for side in scene.box[1] - scene.box[0]),
+        unknown=f"{100 * surface.unknown_share:.0f}",
+        pairs=_pairs(result, scene, surface, base_from_camera),
+        slices=slice_figure(f"Occupancy at z = {level.at:.3f} m, {above}", level, upright.at, "upright slice")
+        + slice_figure(f"Occupancy at y = {upright.at:.3f} m", upright, level.at, "level slice"),
+    )
+
+
+def _pairs(
+    result: "RunResult",
+    scene: SceneMap,
+    surface: SurfacePoints,
+    base_from_camera: Float[ndarray, "m 4 4"],
+) -> str:
+    reconstruction = result.reconstruction
+    lens = reconstruction.pointmap_intrinsics
+    size = (THUMBNAIL, round(THUMBNAIL * lens.height / lens.width))
+    used = np.flatnonzero(result.hand_eye.inliers)
+    chosen = used[np.linspace(0, len(used) - 1, min(PAIRS, len(used))).round().astype(int)]
+    side = point_size(surface.points_in_base)
+    names = shown_names(result.calibration.images)
+    colors, caption = [surface.color], "photograph; points of predicted occupancy over ½, in predicted colour"
+    if len(scene.label_names) > 1:
+        colors.append(label_colors(len(scene.label_names))[surface.label])
+        caption += "; the same by predicted label"
+    figures = []
+    for k in chosen:
+        photograph = cv2.resize(reconstruction.colors[k], size, interpolation=cv2.INTER_AREA)
+        x_in_camera = apply(inverse(base_from_camera[k]), surface.points_in_base)
+        urls = [picture_url(photograph, "JPEG")]
+        urls += [picture_url(rendered_points(x_in_camera, c, side, lens, THUMBNAIL), "WEBP") for c in colors]
+        name = escape(names[int(reconstruction.image_index[k])])
+        pictures = "".join(f'<img src="{url}" alt="{name}">' for url in urls)
+        figures.append(
+            f'<figure><div class="pair">{pictures}</div><figcaption>{name}: {caption}</figcaption></figure>'
+        )
+    return "".join(figures)

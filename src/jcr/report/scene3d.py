@@ -1,0 +1,143 @@
+"""The 3D view: what page/scene3d.js draws, packed small enough to live in the page."""
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.geometry import apply_similarity
+from jcr.records import Capture
+from jcr.report.figures import label_colors
+from jcr.report.images import image_numbers, lens_of, shown_names
+from jcr.report.markup import filled
+from jcr.report.samples import SurfacePoints, point_size
+
+if TYPE_CHECKING:
+    from jcr.pipeline import RunResult
+
+POINTS = 60_000
+"""Of each layer, at most."""
+TRACK_COLOR = (229, 40, 40)
+
+
+@dataclass(frozen=True)
+class PointLayer:
+    """Points of one kind, which the reader shows or hides."""
+
+    name: str
+    points_in_base: Float[ndarray, "n 3"]
+    color: UInt8[ndarray, "n 3"]
+
+
+def scene_section(
+    capture: Capture,
+    result: "RunResult",
+    base_from_camera: Float[ndarray, "m 4 4"],
+    surface: SurfacePoints | None,
+) -> str:
+    """Cameras, grippers and points in the base frame, to be turned by hand."""
+    layers, legend = _layers(result, surface)
+    tracked = apply_similarity(
+        result.hand_eye.base_from_recon,
+        result.hand_eye.scale,
+        result.reconstruction.tracks.points_in_recon,
+    )
+    red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
+    tracks = PointLayer("tracked features", tracked, red)
+    views = _views(capture, result, base_from_camera)
+    data = {
+        **_packed_layers([*layers, tracks], base_from_camera[:, :3, 3]),
+        "views": views,
+        "lens": asdict(lens_of(result)),
+    }
+    checks = [("cameras", "cameras", True), ("grippers", "grippers", True), ("grid", "base and grid", True)]
+    checks.append(("tracks", "tracked features (red)", not layers))
+    return filled(
+        "scene3d.html",
+        layers="".join(
+            _choice(f'type="radio" name="scene-layer" value="{k}"', name, k == 0)
+            for k, name in enumerate([layer.name for layer in layers] + ["no points"] * bool(layers))
+        ),
+        checks="".join(_choice(f'type="checkbox" id="scene-{key}"', name, on) for key, name, on in checks),
+        through="".join(
+            f'<option value="{k}">through {escape(view["name"])}</option>'
+            for k, view in enumerate(views)
+            if view["camera"]
+        ),
+        legend=legend,
+        # A name that holds </script> must not end the element it stands in.
+        data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
+    )
+
+
+def _choice(attributes: str, name: str, on: bool) -> str:
+    return f"<label><input {attributes}{' checked' if on else ''}>{name}</label>"
+
+
+def _layers(result: "RunResult", surface: SurfacePoints | None) -> tuple[list[PointLayer], str]:
+    """The layers to choose from, and the legend of the labels."""
+    layers, legend = [], ""
+    if surface is not None and result.scene is not None:
+        x, names = surface.points_in_base[:POINTS], result.scene.label_names
+        layers.append(PointLayer("map, predicted colour", x, surface.color[:POINTS]))
+        if len(names) > 1:
+            palette = label_colors(len(names))
+            layers.append(PointLayer("map, predicted label", x, palette[surface.label[:POINTS]]))
+            items = (
+                f'<span><i class="swatch" style="background:rgb({r},{g},{b})"></i>{escape(name)}</span>'
+                for name, (r, g, b) in zip(names, palette.tolist(), strict=True)
+            )
+            legend = f'<div class="legend">labels: {"".join(items)}</div>'
+    if (cloud := result.cloud) is not None:
+        some = np.random.default_rng(0).permutation(len(cloud.points_in_base))[:POINTS]
+        layers.append(PointLayer("points as measured", cloud.points_in_base[some], cloud.color[some]))
+    return layers, legend
+
+
+def _packed_layers(
+    layers: Sequence[PointLayer], centers_in_base: Float[ndarray, "m 3"]
+) -> dict[str, list[Any]]:
+    """The points in their common box, as 16-bit steps through it."""
+    everything = np.vstack([layer.points_in_base for layer in layers] + [centers_in_base])
+    # A few stray points far away must not take the resolution, and the view, from all others.
+    low, high = np.percentile(everything, [1, 99], axis=0)
+    margin = 0.25 * (high - low) + 0.05
+    box = np.stack([low - margin, high + margin])
+    return {"box": box.round(4).tolist(), "layers": [_packed(layer, box.round(4)) for layer in layers]}
+
+
+def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
+    low, high = box
+    inside = ((layer.points_in_base >= low) & (layer.points_in_base <= high)).all(1)
+    x = layer.points_in_base[inside]
+    steps = (x - low) / (high - low) * 65535
+    return {
+        "name": layer.name,
+        "size": point_size(x),
+        "xyz": base64.b64encode(steps.round().astype("<u2").tobytes()).decode(),
+        "rgb": base64.b64encode(layer.color[inside].tobytes()).decode(),
+    }
+
+
+def _views(
+    capture: Capture, result: "RunResult", base_from_camera: Float[ndarray, "m 4 4"]
+) -> list[dict[str, Any]]:
+    """Per image its name, its numbers, and three rows of where its gripper and its camera (or null) were."""
+    row_of = {int(row): k for k, row in enumerate(result.reconstruction.image_index)}
+    images = result.calibration.images
+    return [
+        {
+            "name": name,
+            "used": image.used,
+            "caption": image_numbers(image) if image.used else f"rejected: {image.reason}",
+            "gripper": capture.base_from_gripper[i, :3].round(6).tolist(),
+            "camera": base_from_camera[row_of[i], :3].round(6).tolist() if i in row_of else None,
+        }
+        for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
+    ]

@@ -1,0 +1,59 @@
+"""The section that hands the transform over, in every notation, ready to copy."""
+
+import json
+from html import escape
+
+from jcr.records import HandEye
+from jcr.report.markup import filled, significant
+from jcr.report.notations import (
+    Notation,
+    matrix_json,
+    notations,
+    static_transform_publisher,
+    urdf_origin,
+)
+
+PARENT, CHILD = "tool0", "camera_color_optical_frame"
+"""Frame names of the ROS line, where the reader puts their own."""
+
+
+def transform_section(hand_eye: HandEye) -> str:
+    """Matrix, quaternion, angles and rotation vector with their uncertainty; lines for ROS and URDF."""
+    x = hand_eye.gripper_from_camera
+    ros, urdf = static_transform_publisher(PARENT, CHILD, x), urdf_origin(x)
+    return filled(
+        "transform.html",
+        matrix="\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in x),
+        copy_matrix=_copy_button(matrix_json(x), "the matrix"),
+        notations="\n".join(_notation(part) for part in notations(x, hand_eye.covariance)),
+        ros=escape(ros),
+        copy_ros=_copy_button(ros, "the ROS 2 command"),
+        urdf=escape(urdf),
+        copy_urdf=_copy_button(urdf, "the URDF origin"),
+        parent=PARENT,
+        child=CHILD,
+        doubt="" if hand_eye.converged else '<p class="why">Not to be trusted: see above.</p>',
+    )
+
+
+def _notation(part: Notation) -> str:
+    unit = {"": "", "deg": "°"}.get(part.unit, f" {part.unit}")
+    decimals = 4 if part.unit == "deg" else 6
+    rows = []
+    for name, value, std in zip(part.components, part.value, part.std, strict=True):
+        spread = f"{significant(1e3 * std)} mm" if part.unit == "m" else f"{significant(std)}{unit}"
+        rows.append(
+            f'<tr><td>{name}</td><td class="value">{value:.{decimals}f}{unit}</td>'
+            f'<td class="soft">±{spread}</td></tr>'
+        )
+    title = part.name + (f" ({part.unit})" if part.unit else "")
+    note = f'<p class="note">{escape(part.note)}</p>' if part.note else ""
+    button = _copy_button(json.dumps(part.value.round(9).tolist()), title)
+    return (
+        f'<div class="notation"><header><h3>{title}</h3>{button}</header>'
+        f"<table>{''.join(rows)}</table>{note}</div>"
+    )
+
+
+def _copy_button(text: str, what: str) -> str:
+    return f'<button data-copy="{escape(text)}" aria-label="copy {escape(what)}">copy</button>'
