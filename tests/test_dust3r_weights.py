@@ -5,13 +5,18 @@ import json
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
 
+from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.reconstruct.dust3r.pairs import read_pairs
 from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
 
 CONFIG = {
@@ -200,3 +205,58 @@ def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
     loaded = load_weights(hub_id)
     assert "CC BY-NC-SA 4.0" in loaded.licence
     assert_same_output(network, loaded.network)
+
+
+def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    frames = []
+    for k in range(3):
+        Image.fromarray(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)).save(tmp_path / f"{k}.png")
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec([0.3 * k, 0.2, 0.1 * k * k]).as_matrix()
+        pose[0, 3] = 0.1 * k
+        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
+    lens = {"fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "distortion": [0, 0, 0, 0, 0]}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    linear = Dust3r(**{**CONFIG, "head_type": "linear", "dec_depth": 2})
+    model = MODEL.replace("'dpt'", "'linear'").replace("dec_depth=10", "dec_depth=2")
+    weights = write_pth(tmp_path / "weights.pth", linear, model)
+    out = tmp_path / "pairs.npz"
+    command = [
+        "predict",
+        str(tmp_path),
+        str(out),
+        "--weights",
+        str(weights),
+        "--cache",
+        str(tmp_path / "cache"),
+    ]
+    command += ["--image-size", "224", "--device", "cpu", "--quiet", "--json"]
+    assert dispatch(command) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["pairs"] == 6 and (said["width"], said["height"]) == (224, 224)
+    pairs = read_pairs(out)
+    assert pairs.images == ("0.png", "1.png", "2.png")
+    assert pairs.intrinsics is not None
+    # 80x60 is enlarged so that 60 becomes 224, then the middle 224 columns are kept.
+    assert pairs.intrinsics.fy == pytest.approx(70 * 224 / 60)
+    assert pairs.intrinsics.cx == pytest.approx(39.5 * 224 / 60 + (224 / 60 - 1) / 2 - 37, abs=0.6)
+    assert len(list((tmp_path / "cache").iterdir())) == 6
+
+    assert dispatch([*command, "--memory-gb", "0"]) == 2
+    assert "must be positive" in capsys.readouterr().err
+    weights.write_bytes(b"no weights")
+    assert dispatch(command) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and str(weights) in error and error.count("\n") == 1
+
+
+def test_jcr_models_lists_licences_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:
+    assert dispatch(["models", "--json"]) == 0
+    rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)}
+    assert rows["colmap", ""]["present"] == "yes"
+    mast3r = rows["mast3r", CHECKPOINTS["mast3r"].hub_id]
+    assert mast3r["scale"] == "metres" and "non-commercial" in mast3r["licence"]
+    assert rows["mapanything", CHECKPOINTS["mapanything"].hub_id]["licence"] == "Apache-2.0"

@@ -19,12 +19,14 @@ COMMANDS = {
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
     "check": "reads and judges a capture before any heavy work",
+    "predict": "pairwise pointmaps of a network, as a file",
     "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
     "compare": "difference of two calibrations in mm and degrees",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README",
+    "models": "back ends, weights present or not, licences",
 }
 
 _OVERVIEW = """\

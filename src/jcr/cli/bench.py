@@ -17,6 +17,7 @@ from jcr.errors import InputError
 BENCHES = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
+    "pairs": "predicting pairs with every image encoded once, or with every pair",
     "run": "the whole job on the bundled capture: time and memory of each stage",
 }
 
@@ -31,7 +32,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """calibrate or run."""
+    """align, calibrate, pairs or run."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder."""
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.progress import Progress
+from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import Capture, Reconstruction
 
-BackendName = Literal["auto", "colmap"]
+BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "predictions"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,12 @@ class ReconstructOptions:
     """Where networks and dense matching run."""
     seed: int = 0
     """Same seed, same result on the same machine."""
+    weights: str | None = None
+    """Path or hub id of a network's weights, unset: the published ones; for predictions the npz file."""
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    memory_gb: float = 8.0
+    """Memory that dust3r and mast3r may take."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,8 @@ class Backend:
     """Whether its scale is metres already."""
     door: str
     """module:function of (capture, ReconstructOptions, progress)."""
+    keeps_order: bool = False
+    """Whether its input counts images in the capture's own order."""
 
     def reconstruct(
         self, capture: Capture, options: ReconstructOptions, progress: Progress | None
@@ -49,7 +59,16 @@ class Backend:
 
 
 BACKENDS = {
-    row.name: row for row in (Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),)
+    row.name: row
+    for row in (
+        Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),
+        Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
+        Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
+        Backend(
+            "mapanything", CHECKPOINTS["mapanything"].licence, True, "jcr.reconstruct.backends:_mapanything"
+        ),
+        Backend("predictions", "your network's", False, "jcr.reconstruct.backends:_predictions", True),
+    )
 }
 
 
@@ -66,6 +85,8 @@ def reconstruct(
         raise InputError(f"--backend {name}: no such back end; there are {', '.join(BACKENDS)}")
     # By name, so that the order of the frames changes nothing.
     order = np.argsort(np.array(capture.images), kind="stable")
+    if BACKENDS[name].keeps_order:
+        order = np.arange(len(capture))
     by_name = replace(
         capture,
         images=tuple(capture.images[k] for k in order),
@@ -93,7 +114,11 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
 
 def chosen(options: ReconstructOptions) -> str:
     """The name of the back end that `auto` stands for here, or the one that was asked for."""
-    return "colmap" if options.backend == "auto" else options.backend
+    if options.backend != "auto":
+        return options.backend
+    if options.weights is None:
+        return "colmap"
+    return "predictions" if options.weights.endswith(".npz") else "dust3r"
 
 
 def device_of(options: ReconstructOptions) -> str:
@@ -111,3 +136,27 @@ def _colmap(capture: Capture, options: ReconstructOptions, progress: Progress | 
     from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
     return reconstruct(capture, ColmapOptions(seed=options.seed, device=device_of(options)), progress)
+
+
+def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.dust3r.backend import Dust3rOptions, reconstruct
+    from jcr.reconstruct.dust3r.pairs import PairOptions
+
+    pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
+    model = "mast3r" if options.backend == "mast3r" else "dust3r"
+    return reconstruct(capture, Dust3rOptions(model, options.weights, device_of(options), pairs), progress)
+
+
+def _mapanything(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
+
+    weights = options.weights or CHECKPOINTS["mapanything"].hub_id
+    return reconstruct(capture, MapAnythingOptions(weights, device_of(options)), progress)
+
+
+def _predictions(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.predictions import PredictionsOptions, reconstruct
+
+    if options.weights is None:
+        raise InputError("--backend predictions: name the npz file with --weights FILE (docs/predictions.md)")
+    return reconstruct(capture, PredictionsOptions(Path(options.weights)), progress)

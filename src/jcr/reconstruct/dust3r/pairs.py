@@ -49,13 +49,6 @@ class PairOptions:
     cache_gb: float = 4.0
     """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
 
-    def __post_init__(self) -> None:
-        for name, value, least in (("window", self.window, 1), ("memory-gb", self.memory_gb, 1e-9)):
-            if value < least:
-                raise InputError(f"--{name} {value}: must be positive")
-        if self.cache_gb < 0:
-            raise InputError(f"--cache-gb {self.cache_gb}: give a size, or 0 for no cache")
-
 
 @dataclass(frozen=True)
 class PairPredictions:

@@ -87,9 +87,14 @@ def predict_pairs(
     """Pointmaps of the pairs of a capture's images, and notes on what was left out.
 
     Pairs found in the cache are not computed again. On CUDA that runs out of memory the batch is halved, then
-    the CPU takes over. Raises InputError when one pair does not fit the memory budget.
+    the CPU takes over. Raises InputError for options out of range, and when one pair does not fit the budget.
     """
     options = options or PairOptions()
+    for name, value in (("window", options.window), ("memory-gb", options.memory_gb)):
+        if value <= 0:
+            raise InputError(f"--{name} {value}: must be positive")
+    if options.cache_gb < 0:
+        raise InputError(f"--cache-gb {options.cache_gb}: give a size, or 0 for no cache")
     count = len(images.colors)
     predictor = _Predictor(loaded, images, names, options, progress or (lambda stage, fraction: None))
     graph = options.pair_graph

@@ -76,18 +76,26 @@ def fingerprint(network: Dust3r) -> str:
 
 
 def _download(hub_id: str) -> Path:
-    """The cached or fetched model.safetensors of a hub id."""
+    """The model.safetensors of a hub id beside its config.json, from the cache where both are there."""
     import httpx
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import hf_hub_download, try_to_load_from_cache
+    from huggingface_hub.utils import logging as hub_logging
 
+    cached = [try_to_load_from_cache(hub_id, name) for name in HUB_FILES]
+    if all(isinstance(path, str) for path in cached):
+        return Path(str(cached[1]))
+    sys.stderr.write(f"fetching {hub_id} from the hub\n")
+    verbosity = hub_logging.get_verbosity()
+    hub_logging.set_verbosity_error()  # its retries, five of them, are no news to the user
     try:
-        config, weights = (hf_hub_download(hub_id, name) for name in HUB_FILES)
+        return Path([hf_hub_download(hub_id, name) for name in HUB_FILES][1])
     except (OSError, ValueError, httpx.HTTPError) as error:
         raise InputError(
             f"{hub_id}: not in the cache and not to be had from the hub ({_line(error)}); "
             "connect, or pass the weights as a file"
         ) from None
-    return Path(config).parent / Path(weights).name
+    finally:
+        hub_logging.set_verbosity(verbosity)
 
 
 def _file_in(folder: Path) -> Path:
@@ -215,4 +223,4 @@ def _announce(source: str, licence: str) -> None:
 
 def _line(error: BaseException) -> str:
     """The first sentence of a message, on one line."""
-    return " ".join(str(error).split())[:160] or type(error).__name__
+    return " ".join(str(error).split()).split(". ")[0][:160] or type(error).__name__
