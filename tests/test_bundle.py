@@ -7,7 +7,7 @@ from scipy.stats import chi2
 import jcr
 from jcr.calibrate.bundle import adjust, median_reprojection
 from jcr.calibrate.pose_fit import widening
-from jcr.calibrate.projection import parameters, project
+from jcr.calibrate.projection import parameters, project, project_derivatives
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
@@ -29,14 +29,14 @@ def test_projection_derivatives_match_finite_differences():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(30, 3)) * [0.2, 0.2, 0.1] + [0, 0, 0.6]
     camera = parameters(LENS)
-    _, by_point, by_camera = project(x, camera)
+    by_point, by_camera = project_derivatives(x, camera)
     for k in range(3):
         step = 1e-6 * np.eye(3)[k]
-        numeric = (project(x + step, camera)[0] - project(x - step, camera)[0]) / 2e-6
+        numeric = (project(x + step, camera) - project(x - step, camera)) / 2e-6
         assert np.allclose(by_point[:, :, k], numeric, rtol=1e-6, atol=1e-4)
     for k in range(9):
         step = 1e-6 * np.eye(9)[k]
-        numeric = (project(x, camera + step)[0] - project(x, camera - step)[0]) / 2e-6
+        numeric = (project(x, camera + step) - project(x, camera - step)) / 2e-6
         assert np.allclose(by_camera[:, :, k], numeric, rtol=1e-6, atol=1e-4)
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibrate.pose_fit import robot_noise
-from jcr.calibrate.projection import parameters, project
-from jcr.geometry import apply, fit_similarity, inverse, rotation_exp, rotation_log, skew, transform
+from jcr.calibrate.projection import parameters, project, project_derivatives
+from jcr.geometry import apply, fit_similarity, inverse, rotation_exp, rotation_log, transform
 from jcr.records import Intrinsics, Tracks
 
 POINTS_AT_ONCE = 4096
@@ -71,6 +71,17 @@ class _Problem:
     """Free lens parameters: camera = start + lens · c."""
     lens_start: Float[ndarray, "9"]
     lens_std: Float[ndarray, " c"]
+    rows_of_image: list[Int[ndarray, " r"]]
+
+
+@dataclass(frozen=True)
+class _View:
+    """Every observation's point as one bundle has it."""
+
+    in_gripper: Float[ndarray, "k 3"]
+    in_camera: Float[ndarray, "k 3"]
+    residual: Float[ndarray, "k 2"]
+    """Projected minus observed, px."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +121,7 @@ def adjust(
         lens,
         parameters(intrinsics),
         lens_std,
+        [np.flatnonzero(tracks.image[order] == i) for i in range(len(base_from_gripper))],
     )
     recon_scaled = recon_from_camera.copy()
     recon_scaled[:, :3, 3] *= scale
@@ -121,16 +133,19 @@ def adjust(
     )
     robot = noise or (1e-3, np.radians(0.2))
     dof = (np.inf, np.inf)
-    sigma_px = _sigma_px(_reprojection(bundle, problem))
+    view = _view(bundle, problem)
+    sigma_px = _sigma_px(view)
     damping, total = 1e-4, 0
     for _ in range(12):
-        weights = _weights(bundle, problem, sigma_px)
         before = (*robot, sigma_px)
-        bundle, damping, used = _minimise(bundle, problem, weights, robot, damping, max_iterations)
+        weights = _weights(view, sigma_px)
+        bundle, view, damping, used = _minimise(
+            bundle, view, problem, weights, robot, damping, max_iterations
+        )
         total += used
-        sigma_px = _sigma_px(_reprojection(bundle, problem))
+        sigma_px = _sigma_px(view)
         if noise is None:
-            normal = _normal_equations(bundle, problem, _weights(bundle, problem, sigma_px), robot, 0.0)
+            normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
             robot, dof = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot)
         change = np.abs(np.log(np.array([*robot, sigma_px]) / before)).max()
         if change < 0.01:
@@ -158,41 +173,41 @@ def _free_lens(intrinsics: Intrinsics, refine: bool) -> tuple[Float[ndarray, "9 
 
 def _minimise(
     bundle: Bundle,
+    view: _View,
     problem: _Problem,
     weights: Float[ndarray, " k"],
     robot: tuple[float, float],
     damping: float,
     max_iterations: int,
-) -> tuple[Bundle, float, int]:
+) -> tuple[Bundle, _View, float, int]:
     """Levenberg-Marquardt with the weights held."""
-    cost = _cost(bundle, problem, weights, robot)
+    cost = _cost(bundle, view, problem, weights, robot)
     for iteration in range(1, max_iterations + 1):
-        normal = _normal_equations(bundle, problem, weights, robot, damping)
+        normal = _normal_equations(bundle, view, problem, weights, robot, damping)
         moved = _moved(bundle, problem, normal)
-        new_cost = _cost(moved, problem, weights, robot)
+        moved_view = _view(moved, problem)
+        new_cost = _cost(moved, moved_view, problem, weights, robot)
         if new_cost <= cost:
             gained = cost - new_cost
-            bundle, cost, damping = moved, new_cost, max(damping / 10, 1e-10)
-            if gained < 1e-7 * cost + 1e-9:
-                return bundle, damping, iteration
+            bundle, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
+            if gained < 1e-6 * cost + 1e-9:
+                return bundle, view, damping, iteration
         else:
             damping *= 10
             if damping > 1e8:
-                return bundle, 1e-4, iteration
-    return bundle, damping, max_iterations
+                return bundle, view, 1e-4, iteration
+    return bundle, view, damping, max_iterations
 
 
-def _seen_from(bundle: Bundle, problem: _Problem) -> tuple[ndarray, ndarray, ndarray]:
-    """Each point seen: in the gripper, from the camera's centre in gripper axes, and in the camera."""
-    gripper = bundle.base_from_gripper[problem.image]
-    from_gripper = bundle.points_in_base[problem.point] - gripper[:, :3, 3]
-    in_gripper = np.einsum("kji,kj->ki", gripper[:, :3, :3], from_gripper)
-    from_camera = in_gripper - bundle.gripper_from_camera[:3, 3]
-    return in_gripper, from_camera, from_camera @ bundle.gripper_from_camera[:3, :3]
-
-
-def _reprojection(bundle: Bundle, problem: _Problem) -> Float[ndarray, "k 2"]:
-    return project(_seen_from(bundle, problem)[2], bundle.camera)[0] - problem.x_px
+def _view(bundle: Bundle, problem: _Problem) -> _View:
+    gripper = bundle.base_from_gripper
+    x_rotation, x_offset = bundle.gripper_from_camera[:3, :3], bundle.gripper_from_camera[:3, 3]
+    in_gripper = np.empty((len(problem.image), 3))
+    for i, rows in enumerate(problem.rows_of_image):
+        points = bundle.points_in_base[problem.point[rows]]
+        in_gripper[rows] = (points - gripper[i, :3, 3]) @ gripper[i, :3, :3]
+    in_camera = (in_gripper - x_offset) @ x_rotation
+    return _View(in_gripper, in_camera, project(in_camera, bundle.camera) - problem.x_px)
 
 
 def _robot_residual(bundle: Bundle, reported: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 6"]:
@@ -201,22 +216,25 @@ def _robot_residual(bundle: Bundle, reported: Float[ndarray, "m 4 4"]) -> Float[
     return np.concatenate([adjusted[:, :3, 3] - reported[:, :3, 3], turned], axis=1)
 
 
-def _sigma_px(residual: Float[ndarray, "k 2"]) -> float:
+def _sigma_px(view: _View) -> float:
     """Noise of an image coordinate from the median length of the residuals, Rayleigh-distributed."""
-    return max(float(np.median(np.linalg.norm(residual, axis=1))) / 1.1774, MIN_SIGMA_PX)
+    return max(float(np.median(np.linalg.norm(view.residual, axis=1))) / 1.1774, MIN_SIGMA_PX)
 
 
-def _weights(bundle: Bundle, problem: _Problem, sigma_px: float) -> Float[ndarray, " k"]:
+def _weights(view: _View, sigma_px: float) -> Float[ndarray, " k"]:
     """Inverse variances under a Cauchy loss; points behind the camera count nothing."""
-    squared = (_reprojection(bundle, problem) ** 2).sum(1) / sigma_px**2
-    ahead = _seen_from(bundle, problem)[2][:, 2] > 1e-6
-    return ahead / (sigma_px**2 * (1 + squared / LOSS_SCALE**2))
+    squared = (view.residual**2).sum(1) / sigma_px**2
+    return (view.in_camera[:, 2] > 1e-6) / (sigma_px**2 * (1 + squared / LOSS_SCALE**2))
 
 
 def _cost(
-    bundle: Bundle, problem: _Problem, weights: Float[ndarray, " k"], robot: tuple[float, float]
+    bundle: Bundle,
+    view: _View,
+    problem: _Problem,
+    weights: Float[ndarray, " k"],
+    robot: tuple[float, float],
 ) -> float:
-    seen = float(weights @ (_reprojection(bundle, problem) ** 2).sum(1))
+    seen = float(weights @ (view.residual**2).sum(1))
     told = float(((_robot_residual(bundle, problem.reported) / np.repeat(robot, 3)) ** 2).sum())
     return seen + told + float(((_lens_step(bundle, problem) / problem.lens_std) ** 2).sum())
 
@@ -228,6 +246,7 @@ def _lens_step(bundle: Bundle, problem: _Problem) -> Float[ndarray, " c"]:
 
 def _normal_equations(
     bundle: Bundle,
+    view: _View,
     problem: _Problem,
     weights: Float[ndarray, " k"],
     robot: tuple[float, float],
@@ -235,26 +254,25 @@ def _normal_equations(
 ) -> _Normal:
     m, c = len(bundle.base_from_gripper), problem.lens.shape[1]
     shared, size = 6 + c, 6 + c + 6 * m
-    in_gripper, from_camera, in_camera = _seen_from(bundle, problem)
-    pixels, by_point, by_lens = project(in_camera, bundle.camera)
+    by_point, by_lens = project_derivatives(view.in_camera, bundle.camera)
     root = np.sqrt(weights)
-    residual = (pixels - problem.x_px) * root[:, None]
+    residual = view.residual * root[:, None]
     by_gripper_axes = (by_point * root[:, None, None]) @ bundle.gripper_from_camera[:3, :3].T
-    by_base_axes = by_gripper_axes @ np.swapaxes(bundle.base_from_gripper[problem.image, :3, :3], 1, 2)
+    by_base_axes = np.empty_like(by_gripper_axes)
     # X moves by (dt, ω), R_X ← exp(ω) R_X; a gripper by (dn in base axes, ρ), R_G ← R_G exp(ρ).
-    own = np.concatenate([-by_base_axes, by_gripper_axes @ skew(in_gripper)], axis=2)
-    common = np.concatenate(
-        [
-            -by_gripper_axes,
-            by_gripper_axes @ skew(from_camera),
-            (by_lens @ problem.lens) * root[:, None, None],
-        ],
-        axis=2,
+    common = np.empty((len(root), 2, shared))
+    common[:, :, 0:3] = -by_gripper_axes
+    common[:, :, 3:6] = np.cross(
+        by_gripper_axes, (view.in_gripper - bundle.gripper_from_camera[:3, 3])[:, None]
     )
+    common[:, :, 6:] = (by_lens @ problem.lens) * root[:, None, None]
+    own = np.empty((len(root), 2, 6))
+    own[:, :, 3:] = np.cross(by_gripper_axes, view.in_gripper[:, None])
 
     hessian, right = np.zeros((size, size)), np.zeros(size)
-    for i in range(m):
-        rows = problem.image == i
+    for i, rows in enumerate(problem.rows_of_image):
+        by_base_axes[rows] = by_gripper_axes[rows] @ bundle.base_from_gripper[i, :3, :3].T
+        own[rows, :, :3] = -by_base_axes[rows]
         block = np.concatenate([common[rows], own[rows]], axis=2).reshape(-1, shared + 6)
         columns = np.r_[0:shared, shared + 6 * i : shared + 6 * i + 6]
         hessian[np.ix_(columns, columns)] += block.T @ block
@@ -339,8 +357,8 @@ def _summary(
     points_in_recon: Float[ndarray, "p 3"],
     iterations: int,
 ) -> Adjusted:
-    weights = _weights(bundle, problem, sigma_px)
-    normal = _normal_equations(bundle, problem, weights, robot, 0.0)
+    view = _view(bundle, problem)
+    normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
     camera_covariance = np.linalg.inv(normal.schur)
     m = len(problem.reported)
 
@@ -392,13 +410,9 @@ def median_reprojection(
     bundle = adjusted.bundle
     if base_from_gripper is not None:
         bundle = replace(bundle, base_from_gripper=base_from_gripper)
-    length = np.linalg.norm(_reprojection(bundle, adjusted.problem), axis=1)
-    image = adjusted.problem.image
+    length = np.linalg.norm(_view(bundle, adjusted.problem).residual, axis=1)
     return np.array(
-        [
-            np.median(length[image == i]) if (image == i).any() else np.nan
-            for i in range(len(bundle.base_from_gripper))
-        ]
+        [np.median(length[rows]) if len(rows) else np.nan for rows in adjusted.problem.rows_of_image]
     )
 
 
