@@ -50,7 +50,7 @@ class ColmapOptions:
 
     working_size_px: int = 1600
     """Images whose long side is larger are reduced to this before features are extracted."""
-    pointmap_size_px: int = 320
+    pointmap_size_px: int = 400
     """Long side of the dense pointmaps."""
     neighbours: int = 5
     """Other images that each is compared with for its pointmap."""
