@@ -58,18 +58,6 @@ class PairTruth:
     """Pairs made wrong on purpose."""
 
 
-def complete_edges(images: int) -> Int[ndarray, "e 2"]:
-    """All ordered pairs of different images."""
-    first, second = np.nonzero(~np.eye(images, dtype=bool))
-    return np.stack([first, second], axis=1)
-
-
-def window_edges(images: int, reach: int) -> Int[ndarray, "e 2"]:
-    """Ordered pairs, both ways, of images at most `reach` apart in the sequence."""
-    edges = complete_edges(images)
-    return edges[np.abs(edges[:, 0] - edges[:, 1]) <= reach]
-
-
 def synthetic_pairs(
     edges: Int[ndarray, "e 2"],
     size: tuple[int, int] = (128, 96),

@@ -14,8 +14,8 @@ from jcr.reconstruct.dust3r.alignment import AlignOptions
 class Arguments:
     """Align pairwise pointmaps into one reconstruction.
 
-    PAIRS.npz is what `jcr predict` writes: edges (E,2), pts3d and pts3d_in_other_view (E,H,W,3), conf and conf2
-    (E,H,W). RESULT.npz gets poses (N,4,4), camera to recon; focals (N,); depth and confidence (N,H,W);
+    PAIRS.npz is what `jcr predict` writes: edges (E,2), pts3d and pts3d_in_other_view (E,H,W,3), conf and
+    conf2 (E,H,W). RESULT.npz gets poses (N,4,4), camera to recon; focals (N,); depth and confidence (N,H,W);
     principal_point (2,); pair_scale and pair_residual (E,).
 
     examples:

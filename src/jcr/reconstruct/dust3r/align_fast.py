@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,6 +37,7 @@ CONTRADICTION = 4.0
 """A pair whose residual is this many times the median one is named to the user."""
 
 
+@runtime_checkable
 class Cameras(Protocol):
     """What is free about the cameras: each way of tying them takes its own step."""
 

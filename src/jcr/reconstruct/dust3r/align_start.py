@@ -53,7 +53,7 @@ def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, 
         usable = (n[:, 2] > 1e-3) & (np.hypot(n[:, 0], n[:, 1]) > 1e-3) & (o.weight[o.second_count :] > 0)
         radius = np.broadcast_to(np.hypot(*o.pixel_offset), usable.shape)
         ratios.append((radius * n[:, 2])[usable] / np.hypot(n[:, 0], n[:, 1])[usable])
-    shared = np.median(np.concatenate(ratios))
+    shared = float(np.median(np.concatenate(ratios)))
     if pinhole.shared:
         return np.full(len(images), shared)
     return np.array([np.median(ratio) if ratio.size else shared for ratio in ratios])
@@ -68,7 +68,7 @@ def _depths(
     for o, f, out in zip(images, focal, depth, strict=True):
         first = slice(o.second_count, None)
         if len(o.pair) == o.second_count:
-            out[:] = _depth_by_resection(o, f)
+            out[:] = _depth_by_resection(o, float(f))
             continue
         forward = np.maximum(o.direction[first, 2], 1e-6).astype(np.float64)
         log_depth = o.log_range[first] + np.log(forward)

@@ -139,7 +139,7 @@ def align_kinematic(
         raise InputError(f"kinematic alignment needs 3 images or more, there are {count}; take more")
     problem = Problem(predictions, pinhole_of(predictions, options.align), weight_is_log(predictions))
     free = solve_free(problem, options.align)
-    start, scale = _hand_eye(base_from_gripper, free.state.recon_from_camera)
+    start, scale = hand_eye_from_motions(base_from_gripper, free.state.recon_from_camera)
     cameras = HandEyeCameras(
         base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
     )
@@ -159,7 +159,7 @@ def align_kinematic(
     )
 
 
-def _hand_eye(
+def hand_eye_from_motions(
     base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "4 4"], float]:
     """gripper_from_camera and scale from all motions: rotation after Park and Martin (1994), then one least
