@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ from jcr.simulate.render import render
 from jcr.simulate.scenes import RECIPES, make_scene, solid_labels
 from jcr.simulate.truth import read_truth, true_depth, true_labels, truth_points
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop"
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
 
 
@@ -36,7 +34,7 @@ def opengl():
 
 
 @pytest.fixture(scope="module")
-def tabletop(opengl, tmp_path_factory):
+def simulated(opengl, tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
 
 
@@ -175,19 +173,19 @@ def test_pictures_show_points_where_they_project():
 
 
 @pytest.mark.gl
-def test_capture_and_truth_agree(tabletop):
-    truth = read_truth(tabletop)
-    capture = json.loads((tabletop / "capture.json").read_text())
-    reference = json.loads((tabletop / "reference.json").read_text())
+def test_capture_and_truth_agree(simulated):
+    truth = read_truth(simulated)
+    capture = json.loads((simulated / "capture.json").read_text())
+    reference = json.loads((simulated / "reference.json").read_text())
     assert [frame["image"] for frame in capture["frames"]] == list(truth.images)
     reported = np.array([frame["base_from_gripper"] for frame in capture["frames"]])
     np.testing.assert_array_equal(reported, truth.base_from_gripper)
     np.testing.assert_array_equal(reference["gripper_from_camera"], truth.gripper_from_camera)
     np.testing.assert_allclose(reported @ truth.gripper_from_camera, truth.base_from_camera, atol=1e-15)
     for k, image in enumerate(truth.images):
-        assert cv2.imread(str(tabletop / image)).shape == (480, 640, 3)
+        assert cv2.imread(str(simulated / image)).shape == (480, 640, 3)
         assert true_depth(truth, k).shape == true_labels(truth, k).shape == (480, 640)
-    points, labels = truth_points(tabletop)
+    points, labels = truth_points(simulated)
     # Every object is seen up to its top: none rises above its height, none sinks into the table.
     for thing in truth.objects:
         height = points[labels == thing.label][:, 2] - truth.table_height
@@ -198,43 +196,43 @@ def test_capture_and_truth_agree(tabletop):
 
 
 @pytest.mark.gl
-def test_the_bundled_example_is_what_its_command_makes(tabletop):
+def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
     for name in ("capture.json", "reference.json", "truth/scene.json"):
-        bundled, made = (json.loads((folder / name).read_text()) for folder in (EXAMPLE, tabletop))
+        bundled, made = (json.loads((folder / name).read_text()) for folder in (tabletop, simulated))
         if name == "capture.json":
             assert bundled["source"]["options"].pop("truth") == "scene"
             made["source"]["options"].pop("truth")
         assert bundled == made
-    for image in read_truth(EXAMPLE).images:
-        bundled, made = (cv2.imread(str(folder / image)).astype(int) for folder in (EXAMPLE, tabletop))
+    for image in read_truth(tabletop).images:
+        bundled, made = (cv2.imread(str(folder / image)).astype(int) for folder in (tabletop, simulated))
         # Another OpenGL may round and filter a little differently.
         assert np.abs(bundled - made).mean() < 2
 
 
 @pytest.mark.gl
-def test_same_seed_same_bytes_and_fewer_images_are_the_first_ones(tabletop, tmp_path):
+def test_same_seed_same_bytes_and_fewer_images_are_the_first_ones(simulated, tmp_path):
     fewer = simulate(tmp_path / "fewer", SimulateOptions(seed=1, images=4))
     files = [path.relative_to(fewer) for path in fewer.rglob("*.*g")]
     assert len(files) == 3 * 4
     for name in files:
-        assert (fewer / name).read_bytes() == (tabletop / name).read_bytes(), name
+        assert (fewer / name).read_bytes() == (simulated / name).read_bytes(), name
     frames, first = (
-        json.loads((folder / "capture.json").read_text())["frames"] for folder in (tabletop, fewer)
+        json.loads((folder / "capture.json").read_text())["frames"] for folder in (simulated, fewer)
     )
     assert frames[:4] == first
     assert make_scene("tabletop", 2).true_objects[0].height != read_truth(fewer).objects[0].height
 
 
 @pytest.mark.gl
-def test_robot_noise_is_in_the_report_and_not_in_the_pictures(tabletop, tmp_path):
+def test_robot_noise_is_in_the_report_and_not_in_the_pictures(simulated, tmp_path):
     options = SimulateOptions(
         seed=1, images=2, robot_noise=(2.0, 0.5), unknown_intrinsics=True, truth="scene"
     )
     noisy = simulate(tmp_path / "noisy", options)
     truth, capture = read_truth(noisy), json.loads((noisy / "capture.json").read_text())
     for image in truth.images:
-        assert (noisy / image).read_bytes() == (tabletop / image).read_bytes()
-    np.testing.assert_array_equal(truth.base_from_gripper, read_truth(tabletop).base_from_gripper[:2])
+        assert (noisy / image).read_bytes() == (simulated / image).read_bytes()
+    np.testing.assert_array_equal(truth.base_from_gripper, read_truth(simulated).base_from_gripper[:2])
     assert capture["intrinsics"] is None
     reported = np.array([frame["base_from_gripper"] for frame in capture["frames"]])
     assert (np.abs(reported[:, :3, 3] - truth.base_from_gripper[:, :3, 3]).max(1) > 1e-4).all()
@@ -252,10 +250,10 @@ def test_robot_noise_has_the_sigma_asked_for_in_every_axis():
 
 
 @pytest.mark.gl
-def test_texture_is_what_features_hold_to(tabletop, tmp_path):
+def test_texture_is_what_features_hold_to(simulated, tmp_path):
     right = {}
     plain = simulate(tmp_path / "plain", SimulateOptions(images=2, texture=False, seed=1))
-    for folder in (tabletop, plain):
+    for folder in (simulated, plain):
         truth = read_truth(folder)
         first, second = (cv2.imread(str(folder / image), cv2.IMREAD_GRAYSCALE) for image in truth.images[:2])
         sift = cv2.SIFT.create()
@@ -275,7 +273,7 @@ def test_texture_is_what_features_hold_to(tabletop, tmp_path):
         in_second = apply(second_from_first, true_depth(truth, 0)[row, column][:, None] * rays)
         projected = in_second[:, :2] / in_second[:, 2:] * camera.fx + [camera.cx, camera.cy]
         right[folder] = int((np.linalg.norm(projected - y, axis=1) < 2).sum())
-    assert right[tabletop] > 100
+    assert right[simulated] > 100
     assert right[plain] < 10
 
 
