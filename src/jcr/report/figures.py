@@ -15,7 +15,7 @@ from jcr.geometry import apply
 from jcr.records import Intrinsics
 from jcr.report.samples import Slice
 
-WIDTH, HEIGHT = 440, 330
+WIDTH, HEIGHT = 440.0, 330.0
 """Of the panels; small enough that their text is still read when a phone shrinks them."""
 OBLIQUE, ABOVE = (-50.0, 28.0), (-90.0, 90.0)
 """Azimuth of the eye about the base's z axis and its elevation in degrees; the second has x to the right."""
@@ -50,7 +50,7 @@ def camera_figure(
     def place(x_in_base: Float[ndarray, "k 3"]) -> Float[ndarray, "k 2"]:
         return (x_in_base @ to_view.T - middle) * [zoom, -zoom] + [WIDTH / 2, HEIGHT / 2 + 6]
 
-    parts = [_text(12, 20, title, "title")]
+    parts = [_text(12.0, 20.0, title, "title")]
     origin, *tips = place(axes)
     for name, tip in zip("xyz", tips, strict=True):
         if np.linalg.norm(tip - origin) > 6:
@@ -69,15 +69,15 @@ def camera_figure(
     for x, y in place(grippers):
         parts.append(f'<path class="cross" d="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"/>')
     length = _round_length(0.3 * WIDTH / zoom)
-    parts.append(_line([(12, HEIGHT - 14), (12 + length * zoom, HEIGHT - 14)], "scale"))
-    parts.append(_text(12, HEIGHT - 20, f"{length:g} m", "small"))
+    parts.append(_line([(12.0, HEIGHT - 14), (12.0 + length * zoom, HEIGHT - 14)], "scale"))
+    parts.append(_text(12.0, HEIGHT - 20, f"{length:g} m", "small"))
     return _svg(parts, title)
 
 
 def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> str:
     """A slice of the map with axes in metres; `marked` is where the other slice cuts, on the second axis."""
     low, high = cut.extent
-    left, top, right, bottom = 46, 48, 12, 40
+    left, top, right, bottom = 46.0, 48.0, 12.0, 40.0
     zoom = min((WIDTH - left - right) / (high[0] - low[0]), 1.3 * HEIGHT / (high[1] - low[1]))
     width, height = zoom * (high - low)
     occupancy = np.zeros((*cut.occupancy.shape, 4), np.uint8)
@@ -88,7 +88,7 @@ def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> str:
     fill = f'{box} preserveAspectRatio="none"'
     name = f"unknown-{'xyz'[cut.axes[0]]}{'xyz'[cut.axes[1]]}"
     parts = [
-        _text(12, 20, title, "title"),
+        _text(12.0, 20.0, title, "title"),
         f'<mask id="{name}"><image {fill} href="{picture_url(unknown[::-1], "PNG")}"/></mask>',
         f'<rect {box} fill="url(#unknown)" mask="url(#{name})"/>',
         f'<image {fill} href="{picture_url(occupancy[::-1], "PNG")}"/>',
@@ -190,7 +190,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _svg(parts: Sequence[str], label: str, height: float = HEIGHT) -> str:
     return (
-        f'<svg class="figure" viewBox="0 0 {WIDTH} {height:.0f}" role="img" aria-label="{escape(label)}">'
+        f'<svg class="figure" viewBox="0 0 {WIDTH:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">'
         f"{''.join(parts)}</svg>"
     )
 
