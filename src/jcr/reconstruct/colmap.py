@@ -271,14 +271,14 @@ def _pointmaps(
     options: ColmapOptions,
     report: Progress,
 ) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
-    from jcr.reconstruct.planesweep import PlaneSweepOptions, choose_neighbours, depth_ranges, plane_sweep
+    from jcr.reconstruct.planesweep import PlaneSweepOptions, choose_neighbours, plane_sweep, sweep_planes
 
     depth, confidence = plane_sweep(
         colors,
         recon_from_camera,
         pinhole,
         choose_neighbours(tracks, recon_from_camera, options.neighbours),
-        depth_ranges(tracks, recon_from_camera),
+        sweep_planes(tracks, recon_from_camera),
         PlaneSweepOptions(device=options.device),
         lambda fraction: report("dense depth", fraction),
     )

@@ -1,9 +1,9 @@
 """Dense depth of posed images: plane sweep with normalised cross-correlation, smoothed, then cross-checked.
 
-Coarse to fine. At half the resolution every pixel tries planes evenly spaced in inverse depth (Collins, "A
-space-sweep approach to true multi-image matching", CVPR 1996) and semi-global matching picks a smooth surface
-(Hirschmüller, PAMI 2008, four paths). At full resolution the hypotheses are that surface moved towards and
-away from the camera, so that the correlation window follows slopes, which planes do not. Window pixels count
+Coarse to fine. At half the resolution every pixel tries a family of planes (Collins, "A space-sweep approach
+to true multi-image matching", CVPR 1996) and semi-global matching picks a smooth surface (Hirschmüller, PAMI
+2008, four paths). At full resolution the hypotheses are that surface moved towards and away from the camera,
+so that the correlation window follows slopes, which planes do not. Window pixels count
 by likeness to the central colour, as in COLMAP (Schönberger et al., ECCV 2016, eq. 6): with a plain box,
 twice as many confident points were off by more than 2 %, all around the objects' outlines.
 """
@@ -18,7 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional as F
 
-from jcr.geometry import inverse
+from jcr.geometry import apply, inverse
 from jcr.reconstruct.lens import rays, resized
 from jcr.records import Intrinsics, Tracks
 
@@ -33,16 +33,12 @@ _REFINEMENT = ((3, 0.5), (3, 0.15))
 _AGREEMENT = (0.01, 0.005, 0.003)
 """Per round: largest relative difference of two depths of one point that are averaged. On simulated views the
 three rounds bring the median error from 0.14 % to 0.05 % and the share beyond 2 % from 1.5 % to 0.8 %."""
-_BEYOND = 0.1
-"""Share by which refinement may leave the range of depths."""
 
 
 @dataclass(frozen=True)
 class PlaneSweepOptions:
     """How depth is searched and when it is believed."""
 
-    planes: int = 64
-    """Planes of the coarse sweep, evenly spaced in inverse depth."""
     best: int = 2
     """Neighbours whose correlations count at a pixel; the worse ones are taken to be occluded."""
     color_sigma: float = 0.1
@@ -56,14 +52,14 @@ def plane_sweep(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
     neighbours: Sequence[Int[ndarray, " _"]],
-    depth_range: Float[ndarray, "m 2"],
+    planes: Float[ndarray, "m d 3"],
     options: PlaneSweepOptions | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w"]]:
     """Depth (z, in recon units) and confidence of every pixel of undistorted images.
 
-    Row i is compared with rows `neighbours[i]` between its nearest and farthest depth `depth_range[i]`.
-    Confidence is the correlation (0 to 1) times the number of neighbours that confirm the depth, and 0 where
+    Row i is compared with rows `neighbours[i]` along `planes[i]`, evenly spaced as `sweep_planes` makes them.
+    Confidence is the correlation (0 to 1) times the number of neighbours that agree on the depth, and 0 where
     fewer than two do (one, where there are only two neighbours or one).
     """
     options = options or PlaneSweepOptions()
@@ -73,36 +69,33 @@ def plane_sweep(
     color = torch.from_numpy(images.astype(np.float32) / 255).to(device).movedim(-1, 1)
     coarse_pinhole = resized(pinhole, pinhole.width // 2, pinhole.height // 2)
     coarse_color = F.interpolate(color, (coarse_pinhole.height, coarse_pinhole.width), mode="area")
-    near, far = torch.from_numpy(1 / depth_range).float().to(device).T
-    step = (near - far) / (options.planes - 1)
-    planes = far[:, None] + step[:, None] * torch.arange(options.planes, device=device)
+    sweep = torch.from_numpy(planes).float().to(device)
+    step = sweep[:, 1, 2] - sweep[:, 0, 2]
     motions = [
         torch.from_numpy(inverse(recon_from_camera[others]) @ recon_from_camera[i]).float().to(device)
         for i, others in enumerate(neighbours)
     ]
 
-    cost = torch.empty((m, coarse_pinhole.height, coarse_pinhole.width, options.planes), device=device)
+    cost = torch.empty((m, coarse_pinhole.height, coarse_pinhole.width, planes.shape[1]), device=device)
     for i in range(m):
         correlation = _Correlation(coarse_color, i, neighbours[i], motions[i], coarse_pinhole, options)
-        fronto_parallel = planes[i, :, None, None].expand(-1, *cost.shape[1:3])
-        cost[i] = 1 - correlation(fronto_parallel).movedim(0, -1)
+        cost[i] = 1 - correlation(_on_planes(sweep[i], coarse_pinhole)).movedim(0, -1)
         report(0.45 * (i + 1) / m)
     _add_semi_global_paths(cost, coarse_color.mean(1))
-    plane, _ = _peak(-cost.movedim(-1, 1), dim=1)
-    inverse_depth = far[:, None, None] + step[:, None, None] * plane
+    index, _ = _peak(-cost.movedim(-1, 1), dim=1)
     del cost
     report(0.6)
 
-    inverse_depth = F.interpolate(inverse_depth[:, None], (pinhole.height, pinhole.width))[:, 0]
+    index = F.interpolate(index[:, None], (pinhole.height, pinhole.width))[:, 0]
+    inverse_depth = _on_planes(sweep[:, 0], pinhole) + step[:, None, None] * index
     score = torch.empty_like(inverse_depth)
     for i in range(m):
         correlation = _Correlation(color, i, neighbours[i], motions[i], pinhole, options)
         for reach, spacing in _REFINEMENT:
             offsets = spacing * step[i] * torch.arange(-reach, reach + 1, device=device)
             hypotheses = _median(inverse_depth[i]) + offsets[:, None, None]
-            hypotheses = hypotheses.clamp(far[i] * (1 - _BEYOND), near[i] * (1 + _BEYOND))
             at, score[i] = _peak(correlation(hypotheses), dim=0)
-            inverse_depth[i] = hypotheses[0] + at * spacing * step[i]
+            inverse_depth[i] = (hypotheses[0] + at * spacing * step[i]).clamp(min=step[i])
         report(0.6 + 0.4 * (i + 1) / m)
     count = torch.zeros_like(score)
     for tolerance in _AGREEMENT:
@@ -137,16 +130,34 @@ def choose_neighbours(
     return chosen
 
 
-def depth_ranges(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2"]:
-    """Nearest and farthest depth of the points each image observes: percentiles, with slack in 1/depth."""
-    ranges = np.empty((len(recon_from_camera), 2))
+def sweep_planes(
+    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int = 48
+) -> Float[ndarray, "m d 3"]:
+    """For each image `count` planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
+
+    All have the slope of the plane that the image's points lie on best, mostly the table (least absolute
+    deviations of inverse depth); their offsets, evenly spaced, span the points' percentiles and some slack.
+    With fronto-parallel planes 6 % fewer pixels got a depth, and its median error was 1.6 times as large.
+    """
+    planes = np.empty((len(recon_from_camera), count, 3))
     for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
-        x_in_recon = tracks.points_in_recon[tracks.point[tracks.image == i]]
-        depth = x_in_recon @ camera_from_recon[2, :3] + camera_from_recon[2, 3]
-        far, near = np.percentile(1 / depth[depth > 0], [1, 99])
-        slack = 0.15 * (near - far) + 0.02 * near
-        ranges[i] = 1 / (near + slack), 1 / max(far - slack, 0.5 * far)
-    return ranges
+        x = apply(camera_from_recon, tracks.points_in_recon[tracks.point[tracks.image == i]])
+        ray, inverse_depth = x / x[:, 2:], 1 / x[:, 2]
+        slope, residual = np.zeros(3), inverse_depth
+        for _ in range(20):
+            weight = 1 / np.sqrt(np.maximum(np.abs(residual), 1e-3 * np.median(inverse_depth)))
+            slope = np.linalg.lstsq(ray * weight[:, None], inverse_depth * weight, rcond=None)[0]
+            residual = inverse_depth - ray @ slope
+        low, high = np.percentile(residual, [1, 99])
+        slack = 0.15 * (high - low) + 0.02 * np.median(inverse_depth)
+        planes[i] = slope
+        planes[i, :, 2] += np.linspace(low - slack, high + slack, count)
+    return planes
+
+
+def _on_planes(planes: Float[Tensor, "d 3"], pinhole: Intrinsics) -> Float[Tensor, "d h w"]:
+    """Inverse depth of every pixel on every plane."""
+    return torch.einsum("di,hwi->dhw", planes, torch.from_numpy(rays(pinhole)).to(planes))
 
 
 class _Correlation:
