@@ -12,8 +12,9 @@ from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
 from jcr.reconstruct.dust3r.align import align
-from jcr.reconstruct.dust3r.align_equations import Layout, State
+from jcr.reconstruct.dust3r.align_equations import Layout
 from jcr.reconstruct.dust3r.align_fast import FreeCameras, Problem, gauss_newton, moved
+from jcr.reconstruct.dust3r.align_residuals import State
 from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, pinhole_of
 from jcr.reconstruct.dust3r.pairs import complete_pairs, window_pairs, write_pairs
 from jcr.records import Intrinsics
@@ -46,7 +47,7 @@ def test_exact_predictions_give_the_exact_scene(focal):
     np.testing.assert_allclose(result.depth * unit[0], truth.depth, rtol=1e-4)
     assert np.prod(result.pair_scale) == pytest.approx(1, rel=1e-6)
     np.testing.assert_array_equal(result.recon_from_camera[0], np.eye(4))
-    assert result.pair_residual.max() < 1e-4
+    assert result.pair_residual.max() < 2e-4
     assert result.notes == ()
 
 
@@ -93,11 +94,11 @@ def test_one_step_from_near_the_truth_is_almost_all_the_way():
         recon_from_camera=moved(truth.base_from_camera, nudge),
         log_focal=np.full(4, np.log(truth.intrinsics.fx) + 2e-3),
         log_pair_scale=log_unit + scale_nudge - scale_nudge.mean(),
+        pair_error=np.zeros((12, 6)),
         log_depth=np.log(depth) + 2e-3 * rng.normal(size=depth.shape),
     )
-    one_step = gauss_newton(
-        images, start, Layout(4, 12, 1), FreeCameras(start.recon_from_camera), np.inf
-    ).state
+    cameras = FreeCameras(start.recon_from_camera)
+    one_step = gauss_newton(images, start, Layout(4, 12, 1), cameras, np.full(6, 1e-5), np.inf).state
     for name, exact in (
         ("recon_from_camera", truth.base_from_camera),
         ("log_focal", np.log(truth.intrinsics.fx)),

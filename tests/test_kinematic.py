@@ -1,4 +1,4 @@
-"""Kinematic alignment: the true hand-eye transform and scale, better than after free alignment, honest spread."""
+"""Kinematic alignment: the true hand-eye transform and scale, gain over free alignment, honest spread."""
 
 from dataclasses import dataclass
 
@@ -63,15 +63,16 @@ def hand_eye_error(truth: Truth, found: KinematicAlignment) -> np.ndarray:
 def test_exact_input_gives_the_hand_eye_transform_metres_and_the_base_frame():
     truth = robot(3, 0, PairErrors(pixel=0.0, warp=0.0, outliers=0.0))
     found = align_kinematic(truth.predictions, truth.base_from_gripper, KinematicOptions(0.0, 0.0))
-    assert np.abs(hand_eye_error(truth, found)).max() < 1e-5
-    np.testing.assert_allclose(found.alignment.recon_from_camera, truth.base_from_camera, atol=1e-5)
+    # Three views of 48x36 float32 points.
+    assert np.abs(hand_eye_error(truth, found)).max() < 1e-4
+    np.testing.assert_allclose(found.alignment.recon_from_camera, truth.base_from_camera, atol=1e-4)
     np.testing.assert_allclose(found.alignment.depth, truth.depth, rtol=1e-4)
     np.testing.assert_array_equal(found.base_from_gripper, truth.base_from_gripper)
 
 
 def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
     free, kinematic = [], []
-    for seed in range(5):
+    for seed in range(8):
         truth = robot(4, seed)
         alignment = align(truth.predictions, FEW_PIXELS)
         guess, scale = hand_eye_from_motions(truth.base_from_gripper, alignment.recon_from_camera)
@@ -83,8 +84,13 @@ def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
         )
         error = hand_eye_error(truth, found)
         kinematic.append([np.linalg.norm(error[:3]), abs(error[6])])
-    assert (np.median(kinematic, axis=0) < 0.8 * np.median(free, axis=0)).all()
-    assert np.median(kinematic, axis=0)[0] < 2e-3
+    (free_translation, free_scale), (translation, scale) = (
+        np.median(free, axis=0),
+        np.median(kinematic, axis=0),
+    )
+    assert translation < 0.7 * free_translation
+    assert scale < free_scale
+    assert translation < 2e-3
 
 
 def test_covariance_covers_the_error():

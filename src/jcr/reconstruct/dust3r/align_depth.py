@@ -4,8 +4,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.reconstruct.dust3r.align_equations import Noise, State, agreement, depth_equations, residuals
+from jcr.reconstruct.dust3r.align_equations import depth_equations
 from jcr.reconstruct.dust3r.align_observations import ImageObservations
+from jcr.reconstruct.dust3r.align_residuals import Noise, State, agreement, residuals
 
 DEPTH_ITERATIONS = 2
 """The median it starts from is within a percent or two of the answer."""

@@ -1,149 +1,19 @@
-"""Normal equations of pairwise pointmaps against cameras, focal lengths, depths and pair scales.
-
-A predicted point errs differently *across* its line of sight (where in the observer's picture it appears) and
-*along* it (how far it is): networks know directions several times better than distances, and their errors in
-distance are smooth, so that a thousand pixels do not average them out. Each residual is therefore split,
-
-    across = n − (n·x̂) x̂        along = log|x| − log|q| − log σ_e
-
-(x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction, both
-turned into the recon axes), and the two parts are weighted by variances measured on the residuals themselves:
-per pointmap by their median, and per kind of view by how far neighbouring residuals go together. Pairs that
-contradict the others get large variances and so lose their say.
+"""Gauss-Newton equations of pairwise pointmaps, reduced to cameras, focal lengths and pair scales.
 
 Depths are eliminated pixel by pixel (Schur complement; Triggs et al., "Bundle adjustment: a modern
-synthesis", 2000, section 6), which leaves a system of the size of the cameras and pairs.
+synthesis", 2000, section 6). So are the rigid errors of the pairs' second views: they stand for the pair
+poses P_e of eq. 1, free there, here tied to the cameras by a spread that is measured (see `align_fast`).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.geometry import skew
-from jcr.reconstruct.dust3r.align_observations import CELL_SIDE, ImageObservations
-
-ROBUST_WIDTH = 3.0
-"""Standard deviations at which a residual's weight has fallen to a quarter (Geman-McClure)."""
-
-LEAST_NOISE = np.float32(1e-5)
-"""Spread below which float32 pointmaps say nothing."""
-
-
-@dataclass(frozen=True)
-class State:
-    """All that alignment estimates."""
-
-    recon_from_camera: Float[ndarray, "n 4 4"]
-    log_focal: Float[ndarray, " n"]
-    log_pair_scale: Float[ndarray, " e"]
-    log_depth: Float[ndarray, "n m"]
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Spread of the residuals of some pointmaps, `across` (rad per axis) and `along` (relative) the sight."""
-
-    across: Float[ndarray, "*k"]
-    along: Float[ndarray, "*k"]
-    across_inflation: Float[ndarray, "*k"]
-    """Factor by which neighbouring residuals going together widen the variance of their mean, at least 1."""
-    along_inflation: Float[ndarray, "*k"]
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """The two parts of the residuals of one image's pointmaps, and the geometry they hang on (recon axes)."""
-
-    depth_arm: Float[ndarray, "3 m"]
-    """From the image's camera centre to the modelled points."""
-    focal_arm: Float[ndarray, "3 m"]
-    """Change of the modelled points per change of log focal: toward the optical axis at constant depth."""
-    x_in_recon: Float[ndarray, "3 m"]
-    toward: Float[ndarray, "k 3 m"]
-    """Unit vectors from the observer to the modelled points, x̂."""
-    distance: Float[ndarray, "k m"]
-    across: Float[ndarray, "k 3 m"]
-    across_squared: Float[ndarray, "k m"]
-    """Squared chord between the directions: grows up to a half turn, as |across| does not."""
-    along: Float[ndarray, "k m"]
-
-
-def residuals(observations: ImageObservations, state: State, log_depth: Float[ndarray, " m"]) -> Residuals:
-    """Model one image's points at `log_depth` and compare them with every pointmap that shows them."""
-    o, k = observations, observations.image
-    rotation, center = state.recon_from_camera[:, :3, :3], state.recon_from_camera[:, :3, 3]
-    ray = np.ones((3, o.pixel_offset.shape[1]), np.float32)
-    ray[:2] = o.pixel_offset * np.float32(np.exp(-state.log_focal[k]))
-    depth = np.exp(log_depth).astype(np.float32)
-    depth_arm = rotation[k].astype(np.float32) @ (ray * depth)
-    focal_arm = rotation[k, :, 2:].astype(np.float32) * depth - depth_arm
-    sight = depth_arm + (center[k] - center[o.observer]).astype(np.float32)[:, :, None]
-    distance = np.sqrt(np.einsum("kcm,kcm->km", sight, sight))
-    toward = sight / distance[:, None]
-    seen = rotation[o.observer].astype(np.float32) @ o.direction
-    cosine = np.einsum("kcm,kcm->km", seen, toward)
-    across = seen - cosine[:, None] * toward
-    across_squared = np.einsum("kcm,kcm->km", across, across) + (1.0 - cosine) ** 2
-    along = np.log(distance) - o.log_range - state.log_pair_scale[o.pair].astype(np.float32)[:, None]
-    x_in_recon = depth_arm + center[k].astype(np.float32)[:, None]
-    return Residuals(depth_arm, focal_arm, x_in_recon, toward, distance, across, across_squared, along)
-
-
-def measure_noise(observations: ImageObservations, r: Residuals) -> Noise:
-    """Spread per pointmap: medians over those of unit normals, and how far cells agree."""
-    across = np.maximum(np.sqrt(np.median(r.across_squared, axis=1) / 1.386), LEAST_NOISE)
-    along = np.maximum(1.4826 * np.median(np.abs(r.along), axis=1), LEAST_NOISE)
-    weight = observations.weight * agreement(r, Noise(across, along, across, along))
-    across_inflation = _inflation(observations, weight, r.across)
-    return Noise(across, along, across_inflation, _inflation(observations, weight, r.along[:, None]))
-
-
-def _inflation(
-    o: ImageObservations, weight: Float[ndarray, "k m"], parts: Float[ndarray, "k c m"]
-) -> Float[ndarray, " k"]:
-    """Variance of residuals' cell means over what independent residuals would have (the design effect)."""
-    total = np.maximum(weight.sum(axis=1), 1e-12)
-    cell_total = weight @ o.cell
-    weighted = weight[:, None] * parts
-    variance = np.einsum("kcm,kcm->k", weighted, parts) / total
-    means = (weighted @ o.cell) / np.maximum(cell_total, 1e-12)[:, None]
-    variance_of_means = np.einsum("kcg,kcg,kg->k", means, means, cell_total) / total
-    per_cell = weight.shape[1] / CELL_SIDE**2
-    return np.maximum(1.0, per_cell * variance_of_means / np.maximum(variance, 1e-30))
-
-
-def agreement(r: Residuals, noise: Noise) -> Float[ndarray, "k m"]:
-    """Geman-McClure weights of the residuals, in (0, 1]."""
-    u = r.across_squared / noise.across[:, None] ** 2 + r.along**2 / noise.along[:, None] ** 2
-    return (1.0 + u * np.float32(ROBUST_WIDTH**-2)) ** -2
-
-
-def pooled_noise(images: list[ImageObservations], r: list[Residuals]) -> list[Noise]:
-    """Noise of every pointmap: spreads of its own, but no less than a third of the median of its kind of view
-    (a pair must not win all say by a lucky fit); inflations of its kind."""
-    own = [measure_noise(o, ri) for o, ri in zip(images, r, strict=True)]
-    second = np.concatenate([o.second for o in images])
-    parts = [np.concatenate([getattr(n, f.name) for n in own]) for f in fields(Noise)]
-    kinds = np.array(
-        [
-            [np.median(p[second == kind]) if (second == kind).any() else 1.0 for p in parts]
-            for kind in (False, True)
-        ]
-    )
-    out = []
-    for o, n in zip(images, own, strict=True):
-        across, along, across_inflation, along_inflation = kinds[o.second.astype(int)].T.astype(np.float32)
-        out.append(
-            Noise(
-                np.maximum(n.across, across / 3),
-                np.maximum(n.along, along / 3),
-                across_inflation,
-                along_inflation,
-            )
-        )
-    return out
+from jcr.reconstruct.dust3r.align_observations import ImageObservations
+from jcr.reconstruct.dust3r.align_residuals import Noise, Residuals, agreement
 
 
 @dataclass(frozen=True)
@@ -205,11 +75,63 @@ class ImageEquations:
         """Change of log depth once the local unknowns have moved."""
         return -(self.depth_gradient + local_step.astype(np.float32) @ self.coupling) / self.depth_hessian
 
-    def reduced(self) -> tuple[Float[ndarray, "c c"], Float[ndarray, " c"]]:
-        """Hessian and gradient with the depths eliminated."""
+    def reduced(self, ties: "PairTies") -> "ReducedEquations":
+        """Eliminate the depths, and then the errors of the pairs under their ties."""
         scaled = self.coupling / self.depth_hessian
         hessian = self.hessian - (scaled @ self.coupling.T).astype(np.float64)
-        return hessian, self.gradient - (scaled @ self.depth_gradient).astype(np.float64)
+        gradient = self.gradient - (scaled @ self.depth_gradient).astype(np.float64)
+        count = 6 * len(ties.error)
+        twists = np.arange(count).reshape(-1, 6)
+        tied = hessian[:count, :count].copy()
+        tied[twists[:, :, None], twists[:, None, :]] += ties.information
+        covariance = np.linalg.inv(tied)
+        gain = covariance @ hessian[:count]
+        offset = covariance @ (gradient[:count] - ties.pull.ravel())
+        own_covariance = covariance[twists[:, :, None], twists[:, None, :]]
+        return ReducedEquations(
+            hessian=hessian - hessian[:, :count] @ gain,
+            gradient=gradient - hessian[:, :count] @ offset,
+            gain=gain,
+            offset=offset,
+            error_variance=np.einsum("kij,kjl,kil->ki", ties.axes, own_covariance, ties.axes),
+        )
+
+
+@dataclass(frozen=True)
+class PairTies:
+    """What holds the errors of an image's second views near zero."""
+
+    axes: Float[ndarray, "n 6 6"]
+    """Adjoint of the observers: twists in recon axes to twists in theirs."""
+    error: Float[ndarray, "n 6"]
+    """Present value, in the observers' axes."""
+    spread: Float[ndarray, "6"]
+
+    @property
+    def information(self) -> Float[ndarray, "n 6 6"]:
+        """Of the errors' changes, recon axes."""
+        return self.axes.transpose(0, 2, 1) @ (self.axes / self.spread[:, None] ** 2)
+
+    @property
+    def pull(self) -> Float[ndarray, "n 6"]:
+        """Gradient at the present value, recon axes."""
+        return np.einsum("kji,kj->ki", self.axes, self.error / self.spread**2)
+
+
+@dataclass(frozen=True)
+class ReducedEquations:
+    """Equations of one image's local unknowns, without its depths and the errors of its pairs."""
+
+    hessian: Float[ndarray, "c c"]
+    gradient: Float[ndarray, " c"]
+    gain: Float[ndarray, "t c"]
+    offset: Float[ndarray, " t"]
+    error_variance: Float[ndarray, "n 6"]
+    """Of the pairs' errors where the cameras are given, in the observers' axes."""
+
+    def pair_step(self, local_step: Float[ndarray, " c"]) -> Float[ndarray, "n 6"]:
+        """Change of the pairs' errors (recon axes) once the local unknowns have moved."""
+        return (self.gain @ local_step + self.offset).reshape(-1, 6)
 
 
 def image_equations(observations: ImageObservations, r: Residuals, noise: Noise) -> ImageEquations:
@@ -308,3 +230,12 @@ def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[
 
 def _dot(a: Float[ndarray, "k 3 m"], v: Float[ndarray, "3 m"]) -> Float[ndarray, "k m"]:
     return np.einsum("kcm,cm->km", a, v)
+
+
+def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
+    """Matrices that take twists (v, ω) in b axes to a axes."""
+    out = np.zeros((len(a_from_b), 6, 6))
+    rotation = a_from_b[:, :3, :3]
+    out[:, :3, :3] = out[:, 3:, 3:] = rotation
+    out[:, :3, 3:] = skew(a_from_b[:, :3, 3]) @ rotation
+    return out

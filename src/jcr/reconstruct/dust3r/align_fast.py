@@ -1,4 +1,11 @@
-"""Global alignment by Gauss-Newton on a few thousand pixels per image, the depths eliminated."""
+"""Global alignment by Gauss-Newton on a few thousand pixels per image, the depths eliminated.
+
+It minimises what eq. 1 of the paper does, with three changes. Residuals are weighted by what they prove to
+be worth (`align_residuals`). The first view of a pair stands in its camera's own frame, as it was predicted,
+so that its rays give the focal length. And a pair's pose P_e, free in eq. 1, is its first camera's but for an
+error whose spread is measured over all pairs: where the network places second views well, pairs tie cameras
+firmly.
+"""
 
 import time
 from dataclasses import dataclass, replace
@@ -9,18 +16,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
 
-from jcr.geometry import rotation_exp, transform
+from jcr.geometry import inverse, rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.align_depth import fused_depth
-from jcr.reconstruct.dust3r.align_equations import (
-    Layout,
-    Noise,
-    State,
-    image_equations,
-    pooled_noise,
-    residuals,
-)
+from jcr.reconstruct.dust3r.align_equations import Layout, PairTies, adjoint, image_equations
 from jcr.reconstruct.dust3r.align_observations import ImageObservations, choose_pixels, observe, weight_is_log
+from jcr.reconstruct.dust3r.align_residuals import Noise, State, measure_noise, residuals
 from jcr.reconstruct.dust3r.align_start import initial_state
 from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.reconstruct.dust3r.pairs import PairPredictions
@@ -31,6 +32,11 @@ COARSE_TOLERANCE = 1e-3
 FINE_TOLERANCE = 1e-4
 """Of the last step (rad, or relative): a tenth of what the noise of predictions leaves."""
 ITERATIONS = 30
+START_SPREAD = 0.01
+"""Of the pairs' errors, relative to the depth and in radians, until it is measured."""
+LEAST_SPREAD = 1e-5
+NORMAL_SQUARE_MEDIAN = 0.455
+"""Median of the square of a unit normal."""
 DEPTH_CHUNK = 4096
 """Pixels at a time, so that the arrays of a chunk stay in the cache."""
 CONTRADICTION = 4.0
@@ -113,8 +119,8 @@ class Solution:
     images: list[ImageObservations]
     noise: list[Noise]
     """Per image, of its pointmaps."""
-    hessian: Float[ndarray, "p p"]
-    """Of the reduced system in the last iteration: the information the pointmaps hold."""
+    pair_spread: Float[ndarray, "6"]
+    """One sigma per axis of the pairs' errors: translation, rotation."""
 
 
 def align_fast(
@@ -132,18 +138,26 @@ def solve_free(problem: Problem, options: AlignOptions) -> Solution:
     images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
     state = initial_state(images, problem.predictions.edges, problem.pinhole)
     cameras = FreeCameras(state.recon_from_camera)
-    coarse = gauss_newton(images, state, problem.layout, cameras, COARSE_TOLERANCE)
+    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(state.log_depth)), 1.0], 3)
+    coarse = gauss_newton(images, state, problem.layout, cameras, pair_spread, COARSE_TOLERANCE)
     images = problem.observe_all(options.pixels)
     depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
     state = replace(coarse.state, log_depth=np.log(np.stack(depth)))
-    return gauss_newton(images, state, problem.layout, cameras, FINE_TOLERANCE)
+    return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
 
 
 def gauss_newton(
-    images: list[ImageObservations], state: State, layout: Layout, cameras: Cameras, tolerance: float
+    images: list[ImageObservations],
+    state: State,
+    layout: Layout,
+    cameras: Cameras,
+    pair_spread: Float[ndarray, "6"],
+    tolerance: float,
 ) -> Solution:
-    """Iterate until no unknown moves by more than `tolerance` (rad, or relative); weights are measured anew
-    on the residuals of each iteration."""
+    """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
+
+    The weights, and the spread of the pairs' errors, are measured anew in each iteration.
+    """
     selections = [_selection(o, layout) for o in images]
     focals = [layout.focal(k) for k in range(layout.images)]
     iteration = 0
@@ -151,25 +165,56 @@ def gauss_newton(
         misfit = [
             residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
         ]
-        noise = pooled_noise(images, misfit)
+        noise = measure_noise(images, misfit)
         equations = [image_equations(*each) for each in zip(images, misfit, noise, strict=True)]
+        observer_axes = adjoint(inverse(state.recon_from_camera))
+        ties = [
+            PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
+            for o in images
+        ]
+        reduced = [own.reduced(tie) for own, tie in zip(equations, ties, strict=True)]
+
         hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-        for selection, own in zip(selections, equations, strict=True):
-            own_hessian, own_gradient = own.reduced()
-            hessian += selection.T @ (selection.T @ own_hessian).T
-            gradient += selection.T @ own_gradient
+        for selection, own in zip(selections, reduced, strict=True):
+            hessian += selection.T @ (selection.T @ own.hessian).T
+            gradient += selection.T @ own.gradient
         step = cameras.step(layout, hessian, gradient)
-        depth_step = [own.depth_step(s @ step) for s, own in zip(selections, equations, strict=True)]
+
+        log_depth, pair_error = np.empty_like(state.log_depth), np.zeros_like(state.pair_error)
+        variance = np.zeros_like(state.pair_error)
+        for k, o in enumerate(images):
+            local_step = selections[k] @ step
+            pair_step = reduced[k].pair_step(local_step)
+            # An error of a pair moves its view as a step of its observer does.
+            local_step[: pair_step.size] -= pair_step.ravel()
+            # A far step of a pixel without parallax must not take it behind or beyond the scene.
+            log_depth[k] = state.log_depth[k] + np.clip(equations[k].depth_step(local_step), -0.5, 0.5)
+            pair_error[o.second_pairs] = ties[k].error + np.einsum("kij,kj->ki", ties[k].axes, pair_step)
+            variance[o.second_pairs] = reduced[k].error_variance
+        pair_spread = _spread(pair_error, variance, pair_spread)
         state = State(
             recon_from_camera=cameras.recon_from_camera,
             log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
             log_pair_scale=state.log_pair_scale + step[layout.scales],
-            # A far step of a pixel without parallax must not take it behind or beyond the scene.
-            log_depth=state.log_depth + np.clip(np.stack(depth_step), -0.5, 0.5),
+            pair_error=pair_error,
+            log_depth=log_depth,
         )
         iteration += 1
         if np.abs(step).max() < tolerance or iteration == ITERATIONS:
-            return Solution(state, images, noise, hessian)
+            return Solution(state, images, noise, pair_spread)
+
+
+def _spread(
+    error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
+) -> Float[ndarray, "6"]:
+    """Spread of the pairs' translations and rotations, from the errors found under the spread `before`.
+
+    The evidence fixed point σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30),
+    with medians in place of the sums: pairs that are altogether wrong do not count.
+    """
+    determined = 1.0 - np.median((variance / before**2).reshape(-1, 2, 3), axis=(0, 2))
+    squared = np.median((error**2).reshape(-1, 2, 3), axis=(0, 2)) / NORMAL_SQUARE_MEDIAN
+    return np.repeat(np.maximum(np.sqrt(squared / np.maximum(determined, 0.01)), LEAST_SPREAD), 3)
 
 
 def dense_alignment(

@@ -41,6 +41,16 @@ class ImageObservations:
         """Number of second views, which come first."""
         return int(self.second.sum())
 
+    @property
+    def second_pairs(self) -> Int[ndarray, " n"]:
+        """Pairs of the second views."""
+        return self.pair[self.second]
+
+    @property
+    def observers(self) -> Int[ndarray, " n"]:
+        """Observers of the second views."""
+        return self.observer[self.second]
+
 
 def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " m"]]:
     """Flat indices per image: the most confident pixel (over all pairs) in each of about `count` equal cells.
@@ -82,7 +92,7 @@ def observe(
     log_weight: bool,
 ) -> ImageObservations:
     """Gather the pointmaps of all pairs at `pixels` (flat indices) of one image."""
-    count, height, width = predictions.conf.shape
+    height, width = predictions.conf.shape[1:]
     as_second = np.flatnonzero(predictions.edges[:, 1] == image)
     as_first = np.flatnonzero(predictions.edges[:, 0] == image)
     sources: Sequence[tuple[ndarray, ndarray, ndarray]] = (

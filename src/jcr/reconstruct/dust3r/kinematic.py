@@ -15,7 +15,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import inverse, nearest_rotation, rotation_log, skew, transform
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.align_equations import Layout
+from jcr.reconstruct.dust3r.align_equations import Layout, adjoint
 from jcr.reconstruct.dust3r.align_fast import (
     FINE_TOLERANCE,
     Problem,
@@ -73,7 +73,7 @@ class HandEyeCameras:
         spread = np.repeat([options.robot_translation, options.robot_rotation], 3)
         self.held = spread == 0
         self.information = np.where(self.held, 0.0, 1.0 / np.where(self.held, 1.0, spread) ** 2)
-        self.covariance = np.zeros((0, 0))
+        self.normal = np.zeros((0, 0))
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
@@ -90,21 +90,20 @@ class HandEyeCameras:
         """
         images = layout.images
         rest = layout.size - 6 * images
-        adjoint = _adjoint(self.base_from_gripper)
+        to_base = adjoint(self.base_from_gripper)
         jacobian = np.zeros((layout.size, 6 + layout.size))
         for k in range(images):
             rows = slice(6 * k, 6 * k + 6)
-            jacobian[rows, :6] = adjoint[k]
-            jacobian[rows, 6 + 6 * k : 12 + 6 * k] = adjoint[k]
+            jacobian[rows, :6] = to_base[k]
+            jacobian[rows, 6 + 6 * k : 12 + 6 * k] = to_base[k]
         jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
         prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
         free = np.concatenate([np.ones(6, bool), np.tile(~self.held, images), np.ones(rest, bool)])
         pull = np.concatenate([np.zeros(6), (self.information * self._deviation()).ravel(), np.zeros(rest)])
 
-        normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
+        self.normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
         full = np.zeros(6 + layout.size)
-        full[free] = -np.linalg.solve(normal, (jacobian.T @ gradient + pull)[free])
-        self.covariance = np.linalg.inv(normal)
+        full[free] = -np.linalg.solve(self.normal, (jacobian.T @ gradient + pull)[free])
         self.gripper_from_camera = moved(self.gripper_from_camera[None], full[None, :6])[0]
         correction = moved(np.tile(np.eye(4), (images, 1, 1)), full[6 : 6 + 6 * images].reshape(-1, 6))
         self.base_from_gripper = self.base_from_gripper @ correction
@@ -143,13 +142,16 @@ def align_kinematic(
     cameras = HandEyeCameras(
         base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
     )
+    to_metres = np.repeat([scale, 1.0], 3)
     state = replace(
         free.state,
         recon_from_camera=cameras.recon_from_camera,
         log_depth=free.state.log_depth + np.log(scale),
         log_pair_scale=free.state.log_pair_scale + np.log(scale),
+        pair_error=free.state.pair_error * to_metres,
     )
-    solution = gauss_newton(free.images, state, problem.layout, cameras, FINE_TOLERANCE)
+    spread = free.pair_spread * to_metres
+    solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
     return KinematicAlignment(
         gripper_from_camera=cameras.gripper_from_camera,
         scale=float(np.exp(solution.state.log_pair_scale.mean())),
@@ -180,17 +182,8 @@ def hand_eye_from_motions(
 
 def _hand_eye_covariance(cameras: HandEyeCameras, pairs: int) -> Float[ndarray, "7 7"]:
     """From the twist of gripper_from_camera and the log pair scales to the order of COVARIANCE_ORDER."""
-    functional = np.zeros((7, len(cameras.covariance)))
+    functional = np.zeros((7, len(cameras.normal)))
     functional[:6, :6] = np.eye(6)
     functional[:3, 3:6] = -skew(cameras.gripper_from_camera[:3, 3])
     functional[6, -pairs:] = 1.0 / pairs
-    return functional @ cameras.covariance @ functional.T
-
-
-def _adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
-    """Matrices that take twists (v, ω) in b axes to a axes."""
-    out = np.zeros((len(a_from_b), 6, 6))
-    rotation = a_from_b[:, :3, :3]
-    out[:, :3, :3] = out[:, 3:, 3:] = rotation
-    out[:, :3, 3:] = skew(a_from_b[:, :3, 3]) @ rotation
-    return out
+    return functional @ np.linalg.solve(cameras.normal, functional.T)
