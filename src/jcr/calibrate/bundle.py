@@ -71,7 +71,7 @@ class _Problem:
     """Free lens parameters: camera = start + lens · c."""
     lens_start: Float[ndarray, "9"]
     lens_std: Float[ndarray, " c"]
-    rows_of_image: list[Int[ndarray, " r"]]
+    rows_of_image: list[Int[ndarray, "..."]]
 
 
 @dataclass(frozen=True)
