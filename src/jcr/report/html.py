@@ -71,18 +71,14 @@ def _verdict(calibration: CalibrationFile) -> str:
     if held_out is not None:
         miss = f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
     if not calibration.converged:
-        kind, reason = "bad", calibration.warnings[0] if calibration.warnings else "no reason was recorded"
+        reason = calibration.warnings[0] if calibration.warnings else "no reason was recorded"
         headline = f"<b>Do not trust this calibration:</b> {escape(reason)}."
     elif miss:
-        kind = "good"
         headline = f"<b>Trusted:</b> images left out of the calibration are predicted to {miss} on average."
     else:
-        kind = "good"
         headline = "<b>Trusted</b> by its own account: nothing speaks against it, nor could a held-out image."
     if held_out is None:
         believe = "There were too few images to leave one out and see how well the others predict it."
-        if uncertainty is not None:
-            believe += f" By its own account the offset is known {escape(uncertainty.worst)} (one σ)."
     elif not calibration.observability.observable:
         # An error along a direction that no motion shows changes no prediction.
         believe = f"Its held-out error of {miss} is no comfort: what no motion shows, no image can miss."
@@ -91,6 +87,9 @@ def _verdict(calibration: CalibrationFile) -> str:
             f"Held-out error, the number to believe: {miss} ({escape(held_out.how)}). The residuals of a fit "
             "shrink with few images even where it is wrong."
         )
+    if uncertainty is not None:
+        believe += f" Least certain is the offset {escape(uncertainty.worst)} (one σ)."
+    kind = "good" if calibration.converged else "bad"
     return f'<section class="verdict {kind}"><h2>{headline}</h2><p>{believe}</p></section>'
 
 
@@ -151,8 +150,8 @@ def _uncertainty(calibration: CalibrationFile) -> str:
         turn = _spreads("turn about", uncertainty.rotation_std_deg, "°")
         says += [
             f'<div class="columns">{offset}{turn}</div>',
-            '<p class="soft">One standard deviation, axes of the gripper frame. Least certain is the offset '
-            f"{escape(uncertainty.worst)}; scale ±{significant(uncertainty.scale_std_percent)} %.</p>",
+            '<p class="soft">One standard deviation, axes of the gripper frame; scale '
+            f"±{significant(uncertainty.scale_std_percent)}\u00a0%.</p>",
         ]
     return f'<section id="uncertainty"><h2>What the images can tell</h2>{"".join(says)}</section>'
 

@@ -70,7 +70,8 @@ def sample_surface(scene: SceneMap, count: int, seed: int = 0) -> SurfacePoints:
     x = x[solid]
     # One a third of a cell: how thick the solid side is known to be must not decide how dense it looks.
     third = np.floor((x - low) / (pitch / 3)).astype(np.int64)
-    _, one = np.unique(np.ravel_multi_index(third.T, [3 * side for side in shape]), return_index=True)
+    thirds = np.ravel_multi_index(tuple(third.T), [3 * side for side in shape], mode="clip")
+    _, one = np.unique(thirds, return_index=True)
     x = x[rng.permutation(one)[:count]]
     answer = scene.query(x)
     color = (255 * answer.color + 0.5).clip(0, 255).astype(np.uint8)
@@ -79,7 +80,7 @@ def sample_surface(scene: SceneMap, count: int, seed: int = 0) -> SurfacePoints:
 
 def slices(scene: SceneMap, surface: SurfacePoints) -> tuple[Slice, Slice]:
     """A horizontal slice just above the support surface, and a vertical one through what stands on it."""
-    x = surface.points_in_base
+    x = surface.points_in_base if len(surface.points_in_base) else scene.box.mean(0, keepdims=True)
     height = _fullest(x[:, 2], LAYER) + CLEARANCE
     standing = x[x[:, 2] > height]
     across = _fullest((standing if len(standing) else x)[:, 1], 0.02)

@@ -154,9 +154,11 @@
   }
 
   function drawGrid(view, colors) {
-    const step = 0.1;
+    const size = Math.max(...[0, 1].map((k) => scene.box[1][k] - scene.box[0][k]));
+    let step = 0.1;
+    while (size > 60 * step) step *= 10;
     const [low, high] = scene.box.map((corner, end) =>
-      corner.map((x) => step * (end ? Math.ceil(Math.max(x, 0.1) / step) : Math.floor(Math.min(x, -0.1) / step))));
+      corner.map((x) => step * (end ? Math.ceil(Math.max(x, step) / step) : Math.floor(Math.min(x, -step) / step))));
     for (let x = low[0]; x <= high[0] + 1e-6; x += step) line(view, [[x, low[1], 0], [x, high[1], 0]], colors.faint, 0.5);
     for (let y = low[1]; y <= high[1] + 1e-6; y += step) line(view, [[low[0], y, 0], [high[0], y, 0]], colors.faint, 0.5);
     triad(view, [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], 0.1, 3);
@@ -314,6 +316,12 @@
   for (const end of ["pointerup", "pointercancel"]) {
     canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
   }
+  canvas.addEventListener("pointerleave", (event) => {
+    if (event.pointerType !== "mouse") return;
+    picked = -1;
+    tooltip.hidden = true;
+    redraw();
+  });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   // The page scrolls over the view until the reader has clicked into it.
   canvas.addEventListener("wheel", (event) => {
