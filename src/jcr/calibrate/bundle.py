@@ -366,10 +366,12 @@ def _summary(
     # outward direction: d log λ = Σ a·dp, with points weighed down where the two disagree.
     points = bundle.points_in_base
     weight = np.ones(len(points))
+    recon = points_in_recon.astype(np.float64)
+    base_from_recon, scale = fit_similarity(points, recon, weight)
     for _ in range(5):
-        base_from_recon, scale = fit_similarity(points, points_in_recon.astype(np.float64), weight)
-        gap = np.linalg.norm(apply(base_from_recon, scale * points_in_recon) - points, axis=1)
+        gap = np.linalg.norm(apply(base_from_recon, scale * recon) - points, axis=1)
         weight = 1 / (1 + (gap / max(float(np.median(gap)), 1e-9)) ** 2)
+        base_from_recon, scale = fit_similarity(points, recon, weight)
     outward = points - np.average(points, axis=0, weights=weight)
     outward *= (weight / (weight @ (outward**2).sum(1)))[:, None]
     variance, coupling = 0.0, np.zeros(len(camera_covariance))

@@ -262,6 +262,7 @@ def _rotation_from_positions(
     camera, center = recon_from_camera[:, :3, :3], recon_from_camera[:, :3, 3]
     base_from_recon, scale = fit_similarity(position, center)
     rotation, offset, w = base_from_recon[:3, :3], base_from_recon[:3, 3], np.zeros(3)
+    miss = np.full_like(position, np.inf)
     for _ in range(30):
         arm = (scale * center - camera @ w) @ rotation.T
         miss = position - arm - offset

@@ -251,5 +251,4 @@ def read_calibration(path: Path) -> CalibrationFile:
 def _lens(intrinsics: Intrinsics | None) -> Lens | None:
     if intrinsics is None:
         return None
-    fields = vars(intrinsics) | {"distortion": list(intrinsics.distortion)}
-    return Lens(**fields)
+    return Lens.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion)})

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibrate.pose_fit import PRIOR_STD, Poses, pose_information
-from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
+from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 
 CANDIDATES = 600
 UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
@@ -118,6 +118,7 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
 
 def _described(pose: Float[ndarray, "4 4"], std: Float[ndarray, "7"], existing: Poses) -> NextPose:
     motion = inverse(existing) @ pose
-    moved, turned = np.linalg.norm(motion[:, :3, 3], axis=1), rotation_angle(motion[:, :3, :3])
+    moved = np.linalg.norm(motion[:, :3, 3], axis=1)
+    turned = np.linalg.norm(rotation_log(motion[:, :3, :3]), axis=1)
     like = int((moved + 0.3 * turned).argmin())
     return NextPose(pose, std, like, float(moved[like]), float(turned[like]))

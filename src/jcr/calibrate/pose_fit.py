@@ -111,7 +111,7 @@ def fit_poses(
     x, scale, z = start
     cues = cues or Cues()
     sigma_t, sigma_r = noise or (5e-4, np.radians(0.1))
-    dof = (np.inf, np.inf)
+    dof, hessian = (np.inf, np.inf), np.eye(13)
     for _ in range(iterations):
         r_t, r_r, j_t, j_r = _residuals(x, scale, z, base_from_gripper, recon_from_camera)
         h_t = np.einsum("n,nij,nik->jk", weights, j_t, j_t)

@@ -23,8 +23,9 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
             with Image.open(path) as opened:
                 _refuse_size(path, opened.size)
                 # Phones write MPO: a JPEG with previews behind it, whose first picture is the photograph.
-                if opened.format != "MPO" and getattr(opened, "n_frames", 1) > 1:
-                    raise InputError(f"{path}: holds {opened.n_frames} pictures; save one as PNG or JPEG")
+                pictures = getattr(opened, "n_frames", 1)
+                if opened.format != "MPO" and pictures > 1:
+                    raise InputError(f"{path}: holds {pictures} pictures; save one as PNG or JPEG")
                 opened.load()
                 upright = ImageOps.exif_transpose(opened)
                 if upright.mode.startswith("I"):  # 16-bit grey, which convert() would clip at 255

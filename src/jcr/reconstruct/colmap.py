@@ -29,6 +29,8 @@ class ColmapOptions:
     """Images whose long side is larger are reduced to this before features are extracted."""
     pointmap_size_px: int = 400
     """Long side of the dense pointmaps."""
+    dense: bool = True
+    """Off: cameras and tracks alone, with pointmaps of no confidence."""
     neighbours: int = 5
     """Other images that each is compared with for its pointmap."""
     seed: int = 0
@@ -65,7 +67,12 @@ def reconstruct(
         notes.append(f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}")
     pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
     colors = np.stack([undistort_image(images[row], sparse.lens, pinhole) for row in sparse.rows])
-    points, confidence = _pointmaps(colors, sparse.recon_from_camera, pinhole, sparse.tracks, options, report)
+    if options.dense:
+        points, confidence = _pointmaps(
+            colors, sparse.recon_from_camera, pinhole, sparse.tracks, options, report
+        )
+    else:
+        points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
     return Reconstruction(
         image_index=sparse.rows,
         recon_from_camera=sparse.recon_from_camera,

@@ -4,6 +4,7 @@ import json
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,5 +75,6 @@ def read_reconstruction(path: Path) -> Reconstruction:
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
-def _intrinsics(fields: dict) -> Intrinsics:
-    return Intrinsics(**(fields | {"distortion": tuple(fields["distortion"])}))
+def _intrinsics(fields: dict[str, Any]) -> Intrinsics:
+    numbers: dict[str, Any] = fields | {"distortion": tuple(fields["distortion"])}
+    return Intrinsics(**numbers)
