@@ -128,5 +128,7 @@ def undistort_image(
     factor = max(1, round(lens.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
     u, v = np.moveaxis(distort(lens, rays(fine)[..., :2]).astype(np.float32), -1, 0)
-    resampled = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cv2.resize(resampled, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+    # In whole grey levels, averages of two by two would all be rounded up from a half.
+    resampled = cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    small = cv2.resize(resampled, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+    return np.rint(small).astype(np.uint8)

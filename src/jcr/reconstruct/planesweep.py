@@ -26,6 +26,8 @@ _WINDOW_REACH, _WINDOW_STRIDE = 2, 2
 """The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""
 _NOISE = 1.0 / 255
 """Standard deviation of pixel noise: where the texture is no stronger, the correlation fades to 0."""
+_LEAST_CORRELATION = 0.3
+"""Where even the best neighbours correlate less, what smoothness put there is no estimate."""
 _SMALL_STEP_PENALTY, _JUMP_PENALTY, _EDGE = 0.15, 1.2, 10.0 / 255
 """Of semi-global matching, in units of correlation; a jump is cheaper across a change of grey by `_EDGE`."""
 _REFINEMENT = ((3, 0.5), (3, 0.15))
@@ -59,8 +61,8 @@ def plane_sweep(
     """Depth (z, in recon units) and confidence of every pixel of undistorted images.
 
     Row i is compared with rows `neighbours[i]` along `planes[i]`, evenly spaced as `sweep_planes` makes them.
-    Confidence is the correlation (0 to 1) times the number of neighbours that agree on the depth, and 0 where
-    fewer than two do (one, where there are only two neighbours or one).
+    Confidence is the correlation (0 to 1) times the number of neighbours that agree on the depth; 0 without
+    texture, and where fewer than two neighbours agree (one, if there are no more than two).
     """
     options = options or PlaneSweepOptions()
     report = progress or (lambda fraction: None)
@@ -104,7 +106,8 @@ def plane_sweep(
         ]
         inverse_depth, count = (torch.stack(maps) for maps in zip(*agreed, strict=True))
     needed = torch.tensor([1 if len(others) < 3 else 2 for others in neighbours], device=device)
-    confidence = score.clamp(0, 1) * count * (count >= needed[:, None, None])
+    believed = (count >= needed[:, None, None]) & (score >= _LEAST_CORRELATION)
+    confidence = torch.where(believed, score.clamp(max=1) * count, 0.0)
     return (1 / inverse_depth).double().cpu().numpy(), confidence.double().cpu().numpy()
 
 

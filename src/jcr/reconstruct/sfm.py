@@ -54,9 +54,9 @@ def structure_from_motion(
 ) -> SparseModel:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
-    A `known` lens is the only one of `lenses`, does not fold over, and is held; else they are tried in turn as
-    starting points for a focal length and two radial coefficients. Raises NotTrustedError when fewer than
-    three images register.
+    A `known` lens is the only one of `lenses`, does not fold over, and is held; unknown ones are starting
+    points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
+    than three images register.
     """
     with _log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
