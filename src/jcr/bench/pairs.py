@@ -14,7 +14,7 @@ from jcr.reconstruct.dust3r.predict import GB, estimate_memory, predict_pairs
 from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid
 from jcr.reconstruct.dust3r.weights import LoadedNetwork
 
-IMAGES, HEIGHT, WIDTH = 10, 96, 128
+IMAGES, HEIGHT, WIDTH = 10, 64, 96
 VIT_LARGE = {
     "enc_embed_dim": 1024,
     "enc_depth": 24,
