@@ -52,7 +52,7 @@ def main(arguments: Arguments) -> int:
     red, green, blue = np.nan_to_num(sample.color * 255).round().astype(np.uint8).T
     columns = (*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T)
     columns = (*columns, red, green, blue, sample.label)
-    rows = np.rec.fromarrays(columns, names=_COLUMNS)
+    rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
     if arguments.json:
         answers = {name: _finite(rows[name]) for name in _COLUMNS.split(",")} | {
             "label_names": list(scene.label_names)

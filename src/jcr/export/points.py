@@ -36,7 +36,7 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
         *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
         f"element vertex {len(vertices)}",
-        *(f"property {_PLY_TYPES[kind[1:]]} {name}" for name, kind in _VERTEX.descr),
+        *(f"property {_PLY_TYPES[_VERTEX[name].str[1:]]} {name}" for name in _VERTEX.names or ()),
         "end_header\n",
     ]
     write_bytes(path, "\n".join(header).encode() + vertices.tobytes())

@@ -57,7 +57,7 @@ def hand_eye_problem(
 def disturbed(
     a_from_b: Float[ndarray, "n 4 4"], noise: tuple[float, float], rng: np.random.Generator
 ) -> Float[ndarray, "n 4 4"]:
-    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), rotation in b's (rad)."""
+    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), turn in b's (rad)."""
     rotation = a_from_b[:, :3, :3] @ rotation_exp(noise[1] * rng.normal(size=(len(a_from_b), 3)))
     return transform(rotation, a_from_b[:, :3, 3] + noise[0] * rng.normal(size=(len(a_from_b), 3)))
 
