@@ -80,7 +80,7 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
     for seed in range(runs):
         rng = np.random.default_rng([4, seed])
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
-        adjusted = solved(problem, observed(problem, rng, 120, 0.3))
+        adjusted = solved(problem, observed(problem, rng, 80, 0.3))
         missed = error(problem, adjusted.bundle.gripper_from_camera, adjusted.scale)
         covariance = adjusted.covariance * widening(adjusted.degrees_of_freedom)
         inside += missed @ np.linalg.solve(covariance, missed) < chi2.ppf(0.95, 7)

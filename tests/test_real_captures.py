@@ -1,0 +1,37 @@
+"""Real captures with a reference that someone else measured; skipped where they are not at hand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.calibrate.calibrate import calibrate
+from jcr.geometry import rotation_between_deg
+from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "max_mm", "max_deg"),
+    [("franka_tabletop", 3.0, 0.4), ("franka_wood_table", 4.0, 0.5), ("doosan_bench", 5.0, 0.7)],
+)
+def test_within_reach_of_the_marker_reference(real_captures: Path, name: str, max_mm: float, max_deg: float):
+    capture = jcr.read_capture(real_captures / name)
+    found = reconstruct(capture, ColmapOptions(dense=False))
+    solved = calibrate(capture, found)
+    reference = np.array(
+        json.loads((real_captures / name / "reference.json").read_text())["gripper_from_camera"]
+    )
+    assert solved.converged
+    assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
+    assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
+    assert solved.held_out is not None and solved.held_out.translation_mm < 6.0
+    assert any("folds over" in note for note in found.notes) == (name == "doosan_bench")
+
+
+def test_a_plain_background_is_not_trusted(real_captures: Path):
+    capture = jcr.read_capture(real_captures / "franka_plain_background")
+    with pytest.raises(jcr.NotTrustedError, match="0 of 8 images"):
+        reconstruct(capture, ColmapOptions(dense=False))
