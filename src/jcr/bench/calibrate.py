@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
 from jcr.bench.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
@@ -107,7 +108,10 @@ def _accuracy() -> list[str]:
 
 
 def _missed(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[float, float, float]:
-    x, scale = solver(problem, seed)
+    try:
+        x, scale = solver(problem, seed)
+    except cv2.error:  # with wrong poses among them some of OpenCV's methods give up
+        return np.inf, np.inf, np.inf
     off = error(problem, x, abs(scale))
     return (
         1e3 * float(np.linalg.norm(off[:3])),
