@@ -7,7 +7,9 @@ error whose spread is measured over all pairs: where the network places second v
 firmly.
 """
 
+import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -225,12 +227,19 @@ def dense_alignment(
     count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
     depth = np.empty((count, height * width), np.float32)
     confidence = np.empty_like(depth)
-    for k, noise in enumerate(solution.noise):
+
+    def settle(k: int) -> None:
         for start in range(0, height * width, DEPTH_CHUNK):
             chunk = slice(start, start + DEPTH_CHUNK)
-            depth[k, chunk], confidence[k, chunk] = fused_depth(problem.observe(k, chunk), state, noise)
-        if progress is not None:
-            progress("align pairs", (k + 1) / count)
+            depth[k, chunk], confidence[k, chunk] = fused_depth(
+                problem.observe(k, chunk), state, solution.noise[k]
+            )
+
+    # numpy lets go of the interpreter during its loops, so threads share the cores.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done, _ in enumerate(pool.map(settle, range(count)), start=1):
+            if progress is not None:
+                progress("align pairs", done / count)
     focal = np.exp(state.log_focal)
     residual, notes = _pair_residuals(predictions, solution)
     return Alignment(

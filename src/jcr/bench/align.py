@@ -1,0 +1,232 @@
+"""`jcr bench align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.bench.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
+from jcr.calibrate.hand_eye import solve_hand_eye
+from jcr.geometry import (
+    apply_similarity,
+    fit_similarity,
+    inverse,
+    rotation_between_deg,
+    rotation_exp,
+    transform,
+)
+from jcr.reconstruct.dust3r.align import AlignOptions, align
+from jcr.reconstruct.dust3r.kinematic import KinematicOptions, align_kinematic
+from jcr.reconstruct.dust3r.pairs import PairPredictions, complete_pairs, write_pairs
+
+SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
+SEEDS = 5
+HAND_EYE_SEEDS = 10
+FEW_STEPS = 3
+"""Of adam at the large size, whose 300 take a quarter of an hour."""
+ERRORS = {
+    "white 0.3 %, smooth distance 1 %, 2 % outliers (below: these and)": PairErrors(),
+    "pairs turned by 1° per axis": PairErrors(pair_turn_deg=1.0),
+    "smooth direction 0.6°": PairErrors(bend=0.01),
+    "20 % outliers": PairErrors(outliers=0.2),
+    "10 % of the pairs wrong": PairErrors(wrong_pairs=6),
+}
+CHILD = """
+import sys
+from jcr.cli import dispatch
+status = dispatch(sys.argv[1:])
+sys.stderr.write(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")))
+sys.exit(status)
+"""
+"""The command in a process of its own, which says its peak memory (ru_maxrss counts the parent's, too)."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean errors of the cameras after the best similarity, and the time of the alignment."""
+
+    mm: float
+    deg: float
+    seconds: float
+
+
+def run() -> str:
+    """Markdown tables: time and memory, accuracy over images, kinds of error, hand-eye from few images."""
+    return "\n\n".join([_cost(), _images(), _kinds(), _hand_eye()]) + "\n"
+
+
+def camera_errors(
+    base_from_camera: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
+) -> tuple[float, float]:
+    """Mean distance (mm) and angle (deg) of the cameras from the truth, after the best similarity."""
+    base_from_recon, scale = fit_similarity(base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3])
+    centers = apply_similarity(base_from_recon, scale, recon_from_camera[:, :3, 3])
+    turn = rotation_between_deg(
+        base_from_recon[:3, :3] @ recon_from_camera[:, :3, :3], base_from_camera[:, :3, :3]
+    )
+    return 1e3 * float(np.linalg.norm(centers - base_from_camera[:, :3, 3], axis=1).mean()), float(
+        turn.mean()
+    )
+
+
+def _cost() -> str:
+    rows = [
+        "| input | method | alignment | whole command | peak memory beside the input | error |",
+        "|---|---|---|---|---|---|",
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        predictions, truth = synthetic_pairs(complete_pairs(10), MIDDLE)
+        pairs = Path(folder) / "pairs.npz"
+        write_pairs(pairs, predictions)
+        fast, row = _command(pairs, "fast", 300, predictions, truth)
+        rows.append(f"| {_size(MIDDLE)}, 10 images | fast {row}")
+        adam, row = _command(pairs, "adam", 300, predictions, truth)
+        rows.append(f"| {_size(MIDDLE)}, 10 images | adam, 300 steps {row}")
+        predictions, truth = synthetic_pairs(complete_pairs(10), LARGE)
+        write_pairs(pairs, predictions)
+        large, row = _command(pairs, "fast", 300, predictions, truth)
+        rows.append(f"| {_size(LARGE)}, 10 images | fast {row}")
+        begin, _ = _command(pairs, "adam", 0, predictions, truth)
+        few, row = _command(pairs, "adam", FEW_STEPS, predictions, truth)
+        rows.append(f"| {_size(LARGE)}, 10 images | adam, {FEW_STEPS} steps {row}")
+    full = begin + (few - begin) * 300 / FEW_STEPS
+    rows.append(
+        f"\nadam takes {adam / fast:.0f} times as long as fast at {_size(MIDDLE)}, and at {_size(LARGE)} "
+        f"{full / large:.0f} times ({full:.0f} s, 300 steps extrapolated from {FEW_STEPS})."
+    )
+    return "\n".join(rows)
+
+
+def _command(
+    pairs: Path, method: str, steps: int, predictions: PairPredictions, truth: PairTruth
+) -> tuple[float, str]:
+    """Seconds of the alignment, and the rest of a table row, of `jcr align` in a process of its own."""
+    result = pairs.with_name("aligned.npz")
+    arguments = [
+        "align",
+        str(pairs),
+        str(result),
+        "--method",
+        method,
+        "--steps",
+        str(steps),
+        "--quiet",
+        "--json",
+    ]
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, *arguments], capture_output=True, text=True, check=True
+    )
+    whole = time.perf_counter() - begin
+    seconds = json.loads(done.stdout)["seconds"]
+    peak_gb = int(done.stderr.split("VmHWM:")[1].split()[0]) * 1024 / 1e9
+    shown = (predictions.pts3d, predictions.conf, predictions.pts3d_in_other_view, predictions.conf2)
+    input_gb = sum(array.nbytes for array in shown) / 1e9
+    with np.load(result) as file:
+        mm, deg = camera_errors(truth.base_from_camera, file["poses"])
+    row = f"| {seconds:.2f} s | {whole:.1f} s | {peak_gb - input_gb:.2f} GB | {mm:.2f} mm, {deg:.3f}° |"
+    return seconds, row
+
+
+def _score(predictions: PairPredictions, truth: PairTruth, method: str) -> Score:
+    options = AlignOptions(method="adam" if method == "adam" else "fast")
+    found = align(predictions, options)
+    return Score(*camera_errors(truth.base_from_camera, found.recon_from_camera), found.seconds)
+
+
+def _mean_row(name: str, scores: dict[str, list[Score]]) -> str:
+    cells = []
+    for method in ("fast", "adam"):
+        mm = [score.mm for score in scores[method]]
+        deg = [score.deg for score in scores[method]]
+        seconds = np.mean([score.seconds for score in scores[method]])
+        cells.append(
+            f"{np.mean(mm):.2f} mm ({max(mm):.2f}), {np.mean(deg):.3f}° ({max(deg):.3f}), {seconds:.2f} s"
+        )
+    return f"| {name} | {cells[0]} | {cells[1]} |"
+
+
+def _images() -> str:
+    rows = [
+        f"Mean over seeds 0 to {SEEDS - 1} (worst in brackets), {_size(SMALL)}:\n",
+        "| images | fast | adam |",
+        "|---|---|---|",
+    ]
+    for images in (6, 10, 15):
+        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
+        for seed in range(SEEDS):
+            predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
+            for method, list_of in scores.items():
+                list_of.append(_score(predictions, truth, method))
+        rows.append(_mean_row(str(images), scores))
+    return "\n".join(rows)
+
+
+def _kinds() -> str:
+    rows = [
+        f"Mean over seeds 0 to 2 (worst in brackets), 8 images, {_size(SMALL)}:\n",
+        "| errors of the predictions | fast | adam |",
+        "|---|---|---|",
+    ]
+    for name, errors in ERRORS.items():
+        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
+        for seed in range(3):
+            predictions, truth = synthetic_pairs(complete_pairs(8), SMALL, errors, seed)
+            for method, list_of in scores.items():
+                list_of.append(_score(predictions, truth, method))
+        rows.append(_mean_row(name, scores))
+    return "\n".join(rows)
+
+
+def _hand_eye() -> str:
+    rows = [
+        f"gripper_from_camera and metric scale, median error over {HAND_EYE_SEEDS} seeds, {_size(SMALL)}:\n",
+        "| robot noise | images | free alignment, then hand-eye | kinematic alignment |",
+        "|---|---|---|---|",
+    ]
+    for noise in ((0.0, 0.0), (5e-4, float(np.radians(0.1)))):
+        for images in (3, 4, 5, 6, 8, 10, 15):
+            trials = np.array([_hand_eye_trial(images, seed, noise) for seed in range(HAND_EYE_SEEDS)])
+            free, kinematic = (
+                f"{mm:.2f} mm, {deg:.3f}°, {percent:.3f} %" for mm, deg, percent in np.median(trials, axis=0)
+            )
+            label = f"{1e3 * noise[0]:g} mm, {np.degrees(noise[1]):g}°"
+            rows.append(f"| {label} | {images} | {free} | {kinematic} |")
+    return "\n".join(rows)
+
+
+def _hand_eye_trial(images: int, seed: int, noise: tuple[float, float]) -> Float[ndarray, "2 3"]:
+    """Errors (mm, deg, % of scale) of free alignment with hand-eye after it, and of kinematic alignment."""
+    predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
+    rng = np.random.default_rng(1000 + seed)
+    gripper_from_camera = transform(rotation_exp(rng.normal(0, 0.8, 3)), rng.uniform(-0.08, 0.08, 3))
+    jitter = transform(
+        rotation_exp(noise[1] * rng.normal(size=(images, 3))), noise[0] * rng.normal(size=(images, 3))
+    )
+    base_from_gripper = truth.base_from_camera @ inverse(gripper_from_camera) @ jitter
+    scale = np.exp(-np.log(truth.pair_unit).mean())
+    free = align(predictions)
+    held = (max(noise[0], 1e-5), max(noise[1], 1e-5))
+    after = solve_hand_eye(base_from_gripper, free.recon_from_camera, robot_noise=held)
+    kinematic = align_kinematic(predictions, base_from_gripper, KinematicOptions(*noise))
+    return np.array(
+        [
+            [
+                1e3 * np.linalg.norm(found.gripper_from_camera[:3, 3] - gripper_from_camera[:3, 3]),
+                rotation_between_deg(found.gripper_from_camera[:3, :3], gripper_from_camera[:3, :3]),
+                100 * abs(found.scale / scale - 1),
+            ]
+            for found in (after, kinematic)
+        ]
+    )
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
