@@ -8,6 +8,7 @@ import numpy as np
 
 from jcr.bench.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
 from jcr.calibrate.bundle import adjust
+from jcr.calibrate.calibrate import of_images
 from jcr.calibrate.hand_eye import solve_hand_eye
 from jcr.geometry import scale_translation
 from jcr.records import HandEye
@@ -41,13 +42,11 @@ def _solvers() -> dict[str, Solver]:
     def bundle(problem: HandEyeProblem, seed: int) -> tuple[np.ndarray, float]:
         start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         used = start.inliers
-        tracks = observed(problem, np.random.default_rng(seed), 300, 0.3)
-        if not used.all():
-            return start.gripper_from_camera, start.scale
+        tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
         adjusted = adjust(
-            problem.base_from_gripper,
+            problem.base_from_gripper[used],
             (start.gripper_from_camera, start.scale, start.base_from_recon),
-            problem.recon_from_camera,
+            problem.recon_from_camera[used],
             LENS,
             tracks,
         )

@@ -55,7 +55,7 @@ def calibrate(
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     used = hand_eye.inliers
-    tracks = _of_images(reconstruction.tracks, used)
+    tracks = of_images(reconstruction.tracks, used)
     if (
         not options.bundle_adjustment
         or cues is not None  # bundle adjustment knows the robot's scale and height alone
@@ -98,7 +98,7 @@ def _investigated(
     return replace(hand_eye, warnings=(explained(found), *hand_eye.warnings))
 
 
-def _of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
+def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     """The observations of the used images, whose rows are counted anew."""
     kept = used[tracks.image]
     row = np.cumsum(used) - 1
