@@ -212,6 +212,9 @@ def _fingerprint(capture: Capture, options: dict[str, Any]) -> str:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
     digest.update(capture.base_from_gripper.tobytes())
     lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
+    weights = Path(options["weights"] or "")
+    if weights.is_file():  # gigabytes at times: size and date tell one file of that name from another
+        options = options | {"weights": [str(weights), weights.stat().st_size, weights.stat().st_mtime_ns]}
     digest.update(json.dumps([lens, options, __version__], sort_keys=True).encode())
     return digest.hexdigest()
 

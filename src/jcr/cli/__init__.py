@@ -7,6 +7,7 @@ status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug.
 
 import contextlib
 import io
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -71,6 +72,10 @@ def dispatch(arguments: Sequence[str]) -> int:
         return _fail(2, str(error))
     except NotTrustedError as error:
         return _fail(3, str(error))
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; nothing more must be written, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
 
