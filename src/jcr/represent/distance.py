@@ -23,26 +23,25 @@ class DistanceGrid:
 
     lower: Float[Tensor, "3"]
     cell: float
-    table: Float[Tensor, "4 nz ny nx"]
-    """Distance, then its derivatives along x, y and z."""
+    nodes: Float[Tensor, "nz ny nx"]
+    """The distance."""
+    gradients: Float[Tensor, "4 nz ny nx"]
+    """The distance again, then its derivatives along x, y and z; in memory node after node, as queries read it."""
 
     def at(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
         """Distance and gradient, interpolated trilinearly at points (n,3) of the box."""
-        return self._interpolate(self.table, x_in_base)
+        return self._interpolate(self.gradients, x_in_base).T
 
     def distance(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """The distance alone, at points (n,3) of the box."""
-        return self._interpolate(self.table[:1], x_in_base)[:, 0]
+        return self._interpolate(self.nodes[None], x_in_base)[0]
 
     def _interpolate(
-        self, table: Float[Tensor, "k nz ny nx"], x: Float[Tensor, "n 3"]
-    ) -> Float[Tensor, "n k"]:
-        cells = torch.tensor(table.shape[:0:-1], device=x.device) - 1
-        at = (x - self.lower) * (2.0 / self.cell / cells) - 1.0
-        at = at.view(1, 1, 1, -1, 3)
-        return (
-            F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1).T
-        )
+        self, table: Float[Tensor, "k nz ny nx"], x_in_base: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "k n"]:
+        cells = torch.tensor(table.shape[:0:-1], device=x_in_base.device) - 1
+        at = ((x_in_base - self.lower) * (2.0 / (self.cell * cells)) - 1.0).view(1, 1, 1, -1, 3)
+        return F.grid_sample(table[None], at, padding_mode="border", align_corners=True).view(len(table), -1)
 
 
 def distance_grid(
@@ -74,7 +73,9 @@ def distance_grid(
             wall = cell * np.minimum(np.arange(n), np.arange(n)[::-1]).astype(np.float32)
             distance = np.minimum(distance, wall.reshape([-1 if a == axis else 1 for a in range(3)]))
     dz, dy, dx = np.gradient(distance, cell)
-    return DistanceGrid(lower, cell, torch.as_tensor(np.stack([distance, dx, dy, dz]), device=lower.device))
+    nodes = torch.as_tensor(distance, device=lower.device)
+    gradients = torch.as_tensor(np.stack([distance, dx, dy, dz], -1), device=lower.device)
+    return DistanceGrid(lower, cell, nodes, gradients.permute(3, 0, 1, 2))
 
 
 def _boundary(

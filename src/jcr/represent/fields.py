@@ -78,9 +78,9 @@ class Interpolate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-        """(n, features) from a table (k, features), rows (n,8) and weights (n,8)."""
+        """(features, n) from a table (k, features), rows (n,8) and weights (n,8)."""
         ctx.save_for_backward(table, rows, weight)
-        return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum")
+        return F.embedding_bag(rows, table, per_sample_weights=weight, mode="sum").T
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, None, Tensor | None]:
@@ -91,11 +91,11 @@ class Interpolate(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_table = torch.zeros(table.shape[::-1], device=table.device)
             flat = rows.view(-1).long()
-            for column, out in zip(gradient.unbind(1), of_table, strict=True):
+            for column, out in zip(gradient, of_table, strict=True):
                 out.scatter_add_(0, flat, (column[:, None] * weight).view(-1))
             of_table = of_table.T.contiguous()
         if ctx.needs_input_grad[2]:
-            of_weight = (table[rows.long()] * gradient[:, None]).sum(-1)
+            of_weight = (table[rows.long()] * gradient.T[:, None]).sum(-1)
         return of_table, None, of_weight
 
 
@@ -114,10 +114,10 @@ class SinusoidalEncoding(nn.Module):
         self.register_buffer("center", box.mean(0), persistent=False)
         self.features = 6 * frequencies
 
-    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n f"]:
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Features of points (n,3)."""
-        angle = ((x_in_base - self.center)[:, :, None] * self.frequency).flatten(1)
-        return torch.cat([angle.sin(), angle.cos()], 1)
+        angle = (self.frequency[:, None, None] * (x_in_base - self.center).T).flatten(0, 1)
+        return torch.cat([angle.sin(), angle.cos()])
 
 
 class GridEncoding(nn.Module):
@@ -132,10 +132,34 @@ class GridEncoding(nn.Module):
         )
         self.features = sum(features)
 
-    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "n f"]:
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
         """Features of points (n,3)."""
         parts = zip(self.tables, self.lattices, strict=True)
-        return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts], 1)
+        return torch.cat([Interpolate.apply(t, *lattice.corners(x_in_base)) for t, lattice in parts])
+
+
+class SpreadEncoding:
+    """A trained `GridEncoding` with features at every node: more memory, and answers three times as fast."""
+
+    def __init__(self, encoding: GridEncoding) -> None:
+        self.tables = [
+            table.detach()[lattice.row.long()].T.reshape(1, -1, *lattice.shape)
+            for table, lattice in zip(encoding.tables, encoding.lattices, strict=True)
+        ]
+        self.lower = [lattice.lower for lattice in encoding.lattices]
+        self.scale = [
+            2.0 / (lattice.cell * (torch.tensor(lattice.shape[::-1], device=lattice.lower.device) - 1))
+            for lattice in encoding.lattices
+        ]
+
+    def __call__(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "f n"]:
+        """Features of points (n,3)."""
+        parts = []
+        for table, lower, scale in zip(self.tables, self.lower, self.scale, strict=True):
+            at = ((x_in_base - lower) * scale - 1.0).view(1, 1, 1, -1, 3)
+            sampled = F.grid_sample(table, at, padding_mode="border", align_corners=True)
+            parts.append(sampled.view(table.shape[1], -1))
+        return torch.cat(parts)
 
 
 class Field(nn.Module):
@@ -148,13 +172,18 @@ class Field(nn.Module):
             if shape.frequencies
             else GridEncoding([lattices[k] for k, _ in shape.grids], [n for _, n in shape.grids])
         )
+        self.spread: SpreadEncoding | None = None
         self.hidden = nn.Linear(self.encoding.features, shape.hidden)
         self.heads = nn.ModuleDict({name: nn.Linear(shape.hidden, n) for name, n in shape.heads.items()})
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Outputs (n, outputs) of every head at points (n,3)."""
-        hidden = F.relu(self.hidden(self.encoding(x_in_base)))
-        return {name: head(hidden) for name, head in self.heads.items()}
+        # Features first: with so few of them, this product and its gradients take half the time.
+        features = (self.spread or self.encoding)(x_in_base)
+        hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features))
+        return {
+            name: torch.addmm(head.bias[:, None], head.weight, hidden).T for name, head in self.heads.items()
+        }
 
 
 class Fields(nn.Module):
@@ -175,3 +204,9 @@ class Fields(nn.Module):
             if not shape.heads.keys().isdisjoint(names):
                 out |= field(x_in_base)
         return {name: out[name] for name in names}
+
+    def spread(self, name: str) -> None:
+        """Make the field of that head answer faster, at the cost of memory; for maps that are trained."""
+        for shape, field in zip(self.shapes, self.of, strict=True):
+            if name in shape.heads and isinstance(field.encoding, GridEncoding):
+                field.spread = SpreadEncoding(field.encoding)

@@ -17,6 +17,10 @@ CROSSED, HIT = 1, 2
 NEAR = 0.06
 """Metres before each point in which its own ray is followed; farther off, the camera's depth image is asked."""
 
+CROSSINGS = 4
+"""Samples of such rays, two to a cell's side, that make a cell crossed: one ray through a corner does not show that
+the cell is empty, and one ray that ends too deep is no reason to call the inside of an object free."""
+
 
 @dataclass(frozen=True)
 class SeenGrid:
@@ -78,12 +82,16 @@ def carve(
     reach = ray.norm(dim=1, keepdim=True)
     ray /= reach
     flat = seen.state.view(-1)
+    samples = torch.zeros(len(flat), dtype=torch.int16, device=flat.device)
     for step in torch.arange(cell / 2, NEAR, cell / 2).tolist():
         index, inside = seen.index(points_in_base + step * ray)
         index = index[inside & (reach[:, 0] > step)]
-        flat[index] = flat[index] | CROSSED
-    index, inside = seen.index(points_in_base)
-    flat[index[inside]] = flat[index[inside]] | HIT
+        samples.scatter_add_(0, index.long(), samples.new_ones(1).expand(len(index)))
+    flat[samples >= CROSSINGS] |= CROSSED
+    # Half a cell behind the point as well: a surface that lies just on a cell's far side has some thickness too.
+    for step in (0.0, -cell / 2):
+        index, inside = seen.index(points_in_base + step * ray)
+        flat[index[inside]] = flat[index[inside]] | HIT
     return seen
 
 

@@ -57,22 +57,27 @@ class Recipe:
     layer_rate: float
     grid_rate: float
     """Learning rates of Adam."""
-    batch: int = 8192
+    look: int
+    """Steps between looks at the held-out rays."""
 
 
 RECIPES = {
-    "default": Recipe(32, 0, ((0, 4), (1, 2)), ((1, 4), (2, 4)), rays=True, layer_rate=5e-3, grid_rate=5e-2),
-    "paper": Recipe(256, 10, (), (), rays=False, layer_rate=3e-3, grid_rate=0.0),
+    "default": Recipe(
+        32, 0, ((0, 4), (1, 2)), ((1, 4), (2, 4)), rays=True, layer_rate=3e-2, grid_rate=0.3, look=10
+    ),
+    "paper": Recipe(256, 10, (), (), rays=False, layer_rate=5e-3, grid_rate=0.0, look=100),
 }
-CHECK_EVERY = 10
-"""Steps between looks at the held-out rays."""
-PATIENCE = 3
-"""Looks without gain after which the learning rate falls; at the third fall the training ends."""
+BATCH = 8192
+"""Rays a step."""
+GAIN = 0.03
+"""Share by which the loss must fall from look to look, or the learning rate falls."""
+FALLS = 3
+"""Falls of the learning rate at which the training ends."""
 BEHIND = 2.0
 """Cells behind a surface that still count as occupied."""
-CLEARANCE = 0.2
+CLEARANCE = 0.1
 """Cells before a surface that no negative is drawn from, so that noise does not eat the surface."""
-NEAR = 3.0
+NEAR = 2.0
 """Cells before a surface from which half of the negatives along the rays are drawn."""
 
 
@@ -126,20 +131,22 @@ def build_scene(
     box = workspace_box(cloud, options.workspace)
     cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
     box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
-    inside, rays = workspace_rays(cloud, values or {}, box, cell, device)
-    image = torch.as_tensor(cloud.image[inside], device=device)
+    rays = workspace_rays(cloud, values or {}, box, cell, device)
 
     start = time.perf_counter()
     if progress:
         progress("what was seen", 0.0)
-    seen = carve(rays.x, image, tensor(cloud.camera_centers_in_base), tensor(box), cell / 2)
+    # Rays that end beyond the workspace cross it all the same.
+    image = torch.as_tensor(cloud.image, device=device)
+    centers = tensor(cloud.camera_centers_in_base)
+    seen = carve(tensor(cloud.points_in_base), image, centers, tensor(box), cell / 2)
     carved = time.perf_counter()
     lattices = feature_lattices(seen) if recipe.grids else []
     outputs = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
     heads = {"occupancy": 1} | outputs
     if "label" in rays.targets:
         heads["label"] = len(cloud.label_names)
-    groups = [heads] if options.joint else [{name: outputs} for name, outputs in heads.items()]
+    groups = [heads] if options.joint else [{"occupancy": heads.pop("occupancy")}, heads]
     shapes = [
         FieldShape(
             group,
@@ -157,7 +164,7 @@ def build_scene(
         "carving_s": f"{carved - start:.3f}",
         "training_s": f"{time.perf_counter() - carved:.3f}",
     }
-    return SceneMap(fields.eval(), seen, cloud.label_names, history)
+    return SceneMap(fields, seen, cloud.label_names, history)
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:
@@ -192,27 +199,26 @@ def train(
     order = torch.randperm(len(rays.x), generator=generator, device=rays.x.device)
     held_out, order = order[: len(order) // 50], order[len(order) // 50 :]
     test = draw_samples(rays[held_out], seen, recipe, generator)
-    best, stale, falls, step, start = float("inf"), 0, 0, 0, time.perf_counter()
-    while falls < 3 and time.perf_counter() - start < max_seconds:
-        first = step * recipe.batch % max(len(order) - recipe.batch, 1)
-        samples = draw_samples(rays[order[first : first + recipe.batch]], seen, recipe, generator)
+    best, falls, step, start = float("inf"), 0, 0, time.perf_counter()
+    while falls < FALLS and time.perf_counter() - start < max_seconds:
+        first = step * BATCH % max(len(order) - BATCH, 1)
+        samples = draw_samples(rays[order[first : first + BATCH]], seen, recipe, generator)
         with torch.autocast(rays.x.device.type, torch.bfloat16, enabled=half_precision):
             loss = total_loss(fields, samples)
         adam.zero_grad()
         loss.backward()
         adam.step()
         step += 1
-        if step % CHECK_EVERY == 0:
+        if step % recipe.look == 0:
             with torch.no_grad():
                 now = float(total_loss(fields, test))
-            stale = 0 if now < 0.99 * best else stale + 1
-            best = min(best, now)
-            if stale == PATIENCE:
-                stale, falls = 0, falls + 1
+            if now > (1 - GAIN) * best:
+                falls += 1
                 for group in adam.param_groups:
                     group["lr"] *= 0.3
+            best = min(best, now)
             if progress:
-                progress("map", (falls + stale / PATIENCE) / 3)
+                progress("map", falls / FALLS)
     return step
 
 
@@ -275,7 +281,10 @@ def draw_samples(rays: Rays, seen: SeenGrid, recipe: Recipe, generator: torch.Ge
 def workspace_box(
     cloud: PointCloud, workspace: tuple[float, float, float, float, float, float] | None
 ) -> Float[ndarray, "2 3"]:
-    """Lower and upper corner of the map: as asked, or what holds nearly all points and the cameras, and 5 cm more."""
+    """Lower and upper corner of the map: as asked, or around the scene and the cameras with 5 cm to spare.
+
+    The scene is what lies within one and a half times the median distance from the cameras.
+    """
     if workspace is not None:
         box = np.array(workspace, dtype=np.float64).reshape(2, 3)
         if not np.isfinite(box).all() or (box[0] >= box[1]).any():
@@ -287,8 +296,10 @@ def workspace_box(
         raise InputError("the cloud holds points that are not finite; remove them before the map is built")
     if len(cloud.points_in_base) == 0:
         raise InputError("the cloud holds no points; a map needs at least some hundreds")
-    # A few stray points far away must not stretch the workspace.
-    lower, upper = np.percentile(cloud.points_in_base, [0.5, 99.5], axis=0)
+    # The background behind the scene, and a few stray points, must not stretch the workspace.
+    distance = np.linalg.norm(cloud.points_in_base - cloud.camera_centers_in_base[cloud.image], axis=1)
+    near = cloud.points_in_base[distance < 1.5 * np.median(distance)]
+    lower, upper = np.percentile(near, [0.5, 99.5], axis=0)
     cameras = cloud.camera_centers_in_base[np.unique(cloud.image)]
     return np.stack([np.minimum(lower, cameras.min(0)) - 0.05, np.maximum(upper, cameras.max(0)) + 0.05])
 
@@ -299,8 +310,8 @@ def workspace_rays(
     box: Float[ndarray, "2 3"],
     cell: float,
     device: str,
-) -> tuple[ndarray, Rays]:
-    """Rows of the cloud that lie in the box, and their rays; reliable points weigh more.
+) -> Rays:
+    """The rays of the points that lie in the box; reliable points weigh more.
 
     A point counts by its confidence (relative to the median, within a factor of four) and by how small its
     `margin` is against a cell: there is no use in sharpness that the calibration does not have.
@@ -335,7 +346,7 @@ def workspace_rays(
     tensors = {name: tensor(target) for name, target in targets.items()}
     if len(cloud.label_names) > 1:
         tensors["label"] = torch.as_tensor(cloud.label[inside], dtype=torch.int64, device=device)
-    return inside, Rays(
+    return Rays(
         tensor(x), tensor(toward / distance), tensor(reach[:, None]), tensor(weight / weight.mean()), tensors
     )
 

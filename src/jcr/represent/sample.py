@@ -1,0 +1,104 @@
+"""Answers of a map at points."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from jcr.represent.chunks import in_chunks
+from jcr.represent.seen import CROSSED, HIT
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
+
+
+class Sample:
+    """Answers at n points, each worked out when first asked for; arrays or tensors, as the points were."""
+
+    def __init__(
+        self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], unknown: str, tensors: bool
+    ) -> None:
+        self._scene, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
+
+    @property
+    def occupancy(self) -> Any:
+        """Probability (n,) that the place is solid; one half where nobody has looked, unless told otherwise."""
+        return self._occupancy_unknown[0]
+
+    @property
+    def unknown(self) -> Any:
+        """Whether (n,) nobody has looked there: no ray passed, no surface was seen; so all beyond the workspace."""
+        return self._occupancy_unknown[1]
+
+    @property
+    def distance(self) -> Any:
+        """Metres (n,) to the nearest surface, negative inside; NaN outside of the workspace."""
+        return self._distance_gradient[0]
+
+    @property
+    def gradient(self) -> Any:
+        """Gradient (n,3) of the distance: points away from the nearest surface; NaN outside of the workspace."""
+        return self._distance_gradient[1]
+
+    @cached_property
+    def color(self) -> Any:
+        """RGB (n,3) in [0, 1] of surfaces, and nearby as the field goes on; NaN outside of the workspace."""
+        return self._continuous("color", 0.0, 1.0)
+
+    @cached_property
+    def label(self) -> Any:
+        """Segment (n,) of surfaces, named by the map's `label_names`; 0 = none, and where nobody has looked."""
+        scene = self._scene
+
+        def label(x: Tensor) -> tuple[Tensor]:
+            if "label" not in scene.properties:
+                return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
+            return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
+
+        return self._given(in_chunks(label, self._x))[0]
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """Further continuous properties (n,d) that the map was trained with; NaN outside of the workspace."""
+        further = [name for name in self._scene.properties if name not in ("occupancy", "color", "label")]
+        return {name: self._continuous(name, -np.inf, np.inf) for name in further}
+
+    @cached_property
+    def _occupancy_unknown(self) -> tuple[Any, ...]:
+        unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
+        scene = self._scene
+
+        def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
+            state = scene.seen.at(x)
+            occupancy = scene.fields(x, ("occupancy",))["occupancy"][:, 0].sigmoid()
+            # A cell that was hit but not crossed lies behind the surface: it can be solid, never free.
+            known = ((state & CROSSED) != 0) | (((state & HIT) != 0) & (occupancy >= 0.5))
+            return torch.where(known, occupancy, unseen), ~known
+
+        return self._given(in_chunks(occupancy_unknown, self._x))
+
+    @cached_property
+    def _distance_gradient(self) -> tuple[Any, ...]:
+        grid = self._scene.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
+
+        def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
+            answer = torch.where(self._scene.seen.index(x)[1][:, None], grid.at(x), torch.nan)
+            return answer[:, 0], answer[:, 1:]
+
+        return self._given(in_chunks(distance_gradient, self._x))
+
+    def _continuous(self, name: str, low: float, high: float) -> Any:
+        scene = self._scene
+
+        def continuous(x: Tensor) -> tuple[Tensor]:
+            value = scene.fields(x, (name,))[name].clamp(low, high)
+            return (torch.where(scene.seen.index(x)[1][:, None], value, torch.nan),)
+
+        return self._given(in_chunks(continuous, self._x))[0]
+
+    def _given(self, answers: tuple[Tensor, ...]) -> tuple[Any, ...]:
+        """The answers in the kind of array that the points came in."""
+        return answers if self._tensors else tuple(answer.cpu().numpy() for answer in answers)
