@@ -182,7 +182,8 @@ class Field(nn.Module):
         features = (self.spread or self.encoding)(x_in_base)
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features))
         return {
-            name: torch.addmm(head.bias[:, None], head.weight, hidden).T for name, head in self.heads.items()
+            name: torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
+            for name, head in self.heads.items()
         }
 
 
@@ -209,4 +210,4 @@ class Fields(nn.Module):
         """Make the field of that head answer faster, at the cost of memory; for maps that are trained."""
         for shape, field in zip(self.shapes, self.of, strict=True):
             if name in shape.heads and isinstance(field.encoding, GridEncoding):
-                field.spread = SpreadEncoding(field.encoding)
+                field.spread = SpreadEncoding(field.encoding)  # pyright: ignore[reportArgumentType]

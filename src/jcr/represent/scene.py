@@ -138,7 +138,7 @@ class SceneMap:
         if unknown == "report":
             surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
             return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
-        return states.any(-1)
+        return np.asarray(states.any(-1))
 
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
