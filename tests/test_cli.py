@@ -53,6 +53,8 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert content["converged"] is True
     assert np.shape(content["uncertainty"]["covariance"]) == (7, 7)
     assert len(content["images"]) == 12
+    std_mm = content["uncertainty"]["translation_std_mm"]
+    assert 1e3 * max(content["next_poses"][-1]["expected_std"][:3]) < max(std_mm)
 
 
 def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabletop: Path):

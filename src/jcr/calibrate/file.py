@@ -7,12 +7,15 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jcr.calibrate.next_poses import NextPose, next_poses
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
 from jcr.records import COVARIANCE_ORDER, Capture, HandEye, ImageVerdict, Intrinsics, Reconstruction
 
 FORMAT = "jcr.calibration/1"
+PROPOSED = 2
+"""Gripper poses proposed after a calibration."""
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
 
@@ -77,6 +80,15 @@ class Lens(_Part):
     height: int
 
 
+class Proposal(_Part):
+    """A gripper pose worth adding, and what would then be known."""
+
+    base_from_gripper: Matrix
+    like: str
+    expected_std: list[float]
+    """In the order of `uncertainty`."""
+
+
 class CalibrationFile(_Part):
     """The content of calibration.json; everything found is null where nothing was."""
 
@@ -96,6 +108,7 @@ class CalibrationFile(_Part):
     warnings: list[str]
     timings_s: dict[str, float]
     version: str
+    next_poses: list[Proposal] = []
 
 
 def calibration_file(
@@ -108,6 +121,7 @@ def calibration_file(
     """The file of a calibration of `capture`."""
     std = np.sqrt(np.diag(hand_eye.covariance))
     held_out = hand_eye.held_out
+    names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     return CalibrationFile(
         gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
         scale=hand_eye.scale,
@@ -142,7 +156,24 @@ def calibration_file(
         warnings=[*hand_eye.warnings, *reconstruction.notes],
         timings_s=timings_s,
         version=version,
+        next_poses=[
+            Proposal(
+                base_from_gripper=pose.base_from_gripper.tolist(),
+                like=names[pose.like],
+                expected_std=pose.expected_std.tolist(),
+            )
+            for pose in _proposals(capture, reconstruction, hand_eye)
+        ],
     )
+
+
+def _proposals(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> list[NextPose]:
+    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used."""
+    used = capture.base_from_gripper[reconstruction.image_index[hand_eye.inliers]]
+    noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
+    if not hand_eye.converged:
+        return next_poses(used, PROPOSED)[1]
+    return next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)[1]
 
 
 def failed_file(

@@ -45,4 +45,12 @@ def summary(result: RunResult) -> str:
         error = f"{held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°{pixels}"
         lines.append(f"held out: {error} ({held_out.how})")
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
+    if content.next_poses:
+        after = content.next_poses[-1].expected_std
+        offset = " ".join(f"{1e3 * value:.2g}" for value in after[:3])
+        near = ", ".join(f"{pose.like}" for pose in content.next_poses)
+        lines.append(
+            f"{len(content.next_poses)} more views, like {near} but turned (next_poses in calibration.json), "
+            f"would give ± {offset} mm"
+        )
     return "\n".join(lines) + "\n"
