@@ -119,6 +119,15 @@ def test_gripper_poses_move_only_within_the_robots_noise():
     )
 
 
+def test_a_wrong_gripper_pose_is_named():
+    truth = robot(6, 1)
+    poses = truth.base_from_gripper.copy()
+    poses[2, :3, 3] += [0.02, 0.0, 0.0]
+    found = align_kinematic(truth.predictions, poses, KinematicOptions(0.0005, 0.0017, FEW_PIXELS))
+    assert len(found.alignment.notes) == 1
+    assert "#2" in found.alignment.notes[0]
+
+
 def test_motions_without_rotation_leave_the_translation_open_and_say_so():
     truth = robot(4, 0)
     rng = np.random.default_rng(0)

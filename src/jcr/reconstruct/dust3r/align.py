@@ -1,7 +1,7 @@
 """Global alignment: pairwise pointmaps of a set of images become one reconstruction."""
 
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, check_connected
+from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, check_connected, check_options
 from jcr.reconstruct.dust3r.pairs import PairPredictions
 
 __all__ = ["AlignOptions", "Alignment", "align"]
@@ -15,6 +15,7 @@ def align(
     Raises InputError for images that no chain of pairs joins, and for options the predictions cannot serve.
     """
     options = options or AlignOptions()
+    check_options(options)
     check_connected(predictions)
     if options.method == "adam":
         # torch takes seconds to import and the default does without.

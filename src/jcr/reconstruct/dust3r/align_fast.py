@@ -140,11 +140,11 @@ def solve_free(problem: Problem, options: AlignOptions) -> Solution:
     images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
     state = initial_state(images, problem.predictions.edges, problem.pinhole)
     cameras = FreeCameras(state.recon_from_camera)
-    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(state.log_depth)), 1.0], 3)
+    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
     coarse = gauss_newton(images, state, problem.layout, cameras, pair_spread, COARSE_TOLERANCE)
     images = problem.observe_all(options.pixels)
     depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
-    state = replace(coarse.state, log_depth=np.log(np.stack(depth)))
+    state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
     return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
 
 
@@ -180,9 +180,12 @@ def gauss_newton(
         for selection, own in zip(selections, reduced, strict=True):
             hessian += selection.T @ (selection.T @ own.hessian).T
             gradient += selection.T @ own.gradient
+        # A pair nobody believes keeps its scale.
+        scales = layout.scales
+        hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
         step = cameras.step(layout, hessian, gradient)
 
-        log_depth, pair_error = np.empty_like(state.log_depth), np.zeros_like(state.pair_error)
+        log_depth, pair_error = [], np.zeros_like(state.pair_error)
         variance = np.zeros_like(state.pair_error)
         for k, o in enumerate(images):
             local_step = selections[k] @ step
@@ -190,7 +193,8 @@ def gauss_newton(
             # An error of a pair moves its view as a step of its observer does.
             local_step[: pair_step.size] -= pair_step.ravel()
             # A far step of a pixel without parallax must not take it behind or beyond the scene.
-            log_depth[k] = state.log_depth[k] + np.clip(equations[k].depth_step(local_step), -0.5, 0.5)
+            depth_step = np.clip(equations[k].depth_step(local_step), -0.5, 0.5)
+            log_depth.append(state.log_depth[k] + depth_step)
             pair_error[o.second_pairs] = ties[k].error + np.einsum("kij,kj->ki", ties[k].axes, pair_step)
             variance[o.second_pairs] = reduced[k].error_variance
         pair_spread = _spread(pair_error, variance, pair_spread)

@@ -7,11 +7,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.errors import InputError
 from jcr.reconstruct.dust3r.alignment import Pinhole
 from jcr.reconstruct.dust3r.pairs import PairPredictions
 
 CELL_SIDE = 4
 """Residuals are correlated over an image; their cell means on a 4x4 grid tell by how much."""
+POOR = 0.2
+"""Share of a good pixel's weight under which a cell's best pixel is not worth having."""
 
 
 @dataclass(frozen=True)
@@ -52,31 +55,43 @@ class ImageObservations:
         return self.observer[self.second]
 
 
-def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " m"]]:
-    """Flat indices per image: the most confident pixel (over all pairs) in each of about `count` equal cells.
+def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray, " _"]]:
+    """Flat indices per image: the most confident pixel of each of about `count` equal cells.
 
-    Equal cells keep the whole field of view, which a plain ranking by confidence would give up.
+    Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
+    a pixel worth having (sky, say) are left out. Raises InputError for an image without any confidence.
     """
     height, width = predictions.conf.shape[1:]
     side = np.sqrt(max(1.0, height * width / count))
     rows, columns = max(1, round(height / side)), max(1, round(width / side))
-    cell = (np.arange(height)[:, None] * rows // height) * columns + np.arange(width) * columns // width
+    cell = (
+        (np.arange(height)[:, None] * rows // height) * columns + np.arange(width) * columns // width
+    ).ravel()
+    by_cell = np.argsort(cell, kind="stable")
+    starts = np.searchsorted(cell[by_cell], np.arange(rows * columns))
+
     total = np.zeros((predictions.image_count, height * width), np.float32)
     for (first, second), conf, conf2 in zip(
         predictions.edges, predictions.conf, predictions.conf2, strict=True
     ):
         total[first] += conf.ravel()
         total[second] += conf2.ravel()
-    by_cell = np.argsort(cell.ravel(), kind="stable")
-    starts = np.searchsorted(cell.ravel()[by_cell], np.arange(rows * columns))
+    shown = np.bincount(predictions.edges.ravel(), minlength=len(total)).astype(np.float32)
     chosen = []
-    for confidence in total:
-        sorted_confidence = confidence[by_cell]
-        best = np.maximum.reduceat(sorted_confidence, starts)
-        is_best = np.flatnonzero(sorted_confidence == best[cell.ravel()[by_cell]])
-        _, first_best = np.unique(cell.ravel()[by_cell[is_best]], return_index=True)
-        chosen.append(by_cell[is_best[first_best]])
+    for k, weight in enumerate(weigh(total / shown[:, None], weight_is_log(predictions))):
+        best = np.maximum.reduceat(weight[by_cell], starts)
+        if best.max() <= 0:
+            name = predictions.images[k] if predictions.images else f"#{k}"
+            raise InputError(f"no pixel of image {name} has any confidence; leave the image out")
+        winners = by_cell[weight[by_cell] == best[cell[by_cell]]]
+        winners = winners[np.unique(cell[winners], return_index=True)[1]]
+        chosen.append(winners[best > POOR * np.quantile(best, 0.9)])
     return chosen
+
+
+def weigh(confidence: Float[ndarray, "*k"], log_weight: bool) -> Float[ndarray, "*k"]:
+    """Weights of confidences, at least 0."""
+    return np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
 
 
 def weight_is_log(predictions: PairPredictions) -> bool:
@@ -104,7 +119,7 @@ def observe(
     distance = np.sqrt(np.einsum("kcm,kcm->km", points, points))
     usable = distance > 1e-12
     distance[~usable] = 1.0
-    weight = np.log(np.maximum(confidence, 1.0)) if log_weight else confidence
+    weight = weigh(confidence, log_weight)
     flat = np.arange(height * width)[pixels]
     y, x = np.divmod(flat, width)
     cx, cy = pinhole.principal_point_px

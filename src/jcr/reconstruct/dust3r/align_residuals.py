@@ -36,8 +36,8 @@ class State:
     log_pair_scale: Float[ndarray, " e"]
     pair_error: Float[ndarray, "e 6"]
     """Twist (v, ω), in the axes of a pair's first camera, by which the network misplaced its second view."""
-    log_depth: Float[ndarray, "n m"]
-    """Of the observed pixels."""
+    log_depth: list[Float[ndarray, " _"]]
+    """Of the observed pixels of each image."""
 
 
 @dataclass(frozen=True)

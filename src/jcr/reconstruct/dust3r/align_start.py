@@ -40,7 +40,7 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], p
         log_focal=np.log(focal),
         log_pair_scale=log_scale[edges[:, 0]] - unit,
         pair_error=np.zeros((len(edges), 6)),
-        log_depth=np.log(depth) + log_scale[:, None],
+        log_depth=[np.log(z) + scale for z, scale in zip(depth, log_scale, strict=True)],
     )
 
 
@@ -62,14 +62,14 @@ def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, 
 
 def _depths(
     images: list[ImageObservations], focal: Float[ndarray, " n"], pairs: int
-) -> tuple[Float[ndarray, "n m"], Float[ndarray, " e"]]:
+) -> tuple[list[Float[ndarray, " _"]], Float[ndarray, " e"]]:
     """Depth per image in a unit of its own, and the log of each pair's unit in that of its first image."""
-    depth = np.empty((len(images), images[0].pixel_offset.shape[1]))
+    depth = []
     unit = np.zeros(pairs)
-    for o, f, out in zip(images, focal, depth, strict=True):
+    for o, f in zip(images, focal, strict=True):
         first = slice(o.second_count, None)
         if len(o.pair) == o.second_count:
-            out[:] = _depth_by_resection(o, float(f))
+            depth.append(_depth_by_resection(o, float(f)))
             continue
         forward = np.maximum(o.direction[first, 2], 1e-6).astype(np.float64)
         log_depth = o.log_range[first] + np.log(forward)
@@ -79,7 +79,7 @@ def _depths(
             middle = np.median(log_depth - shift[:, None], axis=0)
         shift = np.median(log_depth - middle, axis=1)
         unit[o.pair[first]] = shift
-        out[:] = np.exp(middle)
+        depth.append(np.exp(middle))
     return depth, unit
 
 
@@ -105,7 +105,7 @@ def _similarities(
     images: list[ImageObservations],
     edges: Int[ndarray, "e 2"],
     focal: Float[ndarray, " n"],
-    depth: Float[ndarray, "n m"],
+    depth: list[Float[ndarray, " _"]],
     unit: Float[ndarray, " e"],
 ) -> PairSimilarities:
     """Register each image's own points to its second views (Umeyama 1991, weights by Geman-McClure)."""

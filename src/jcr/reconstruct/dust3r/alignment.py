@@ -10,6 +10,9 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.reconstruct.dust3r.pairs import PairPredictions
 
+LEAST_PIXELS = 50
+"""Several for each coarse cell that tells how far residuals go together."""
+
 
 @dataclass(frozen=True)
 class AlignOptions:
@@ -105,6 +108,16 @@ def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
         focal_px=given.fx if given and held else None,
         shared=options.focal != "own",
     )
+
+
+def check_options(options: AlignOptions) -> None:
+    """Raise InputError for numbers that no alignment can work with."""
+    if options.pixels < LEAST_PIXELS:
+        raise InputError(
+            f"{options.pixels} pixels per image are too few; --pixels needs {LEAST_PIXELS} or more"
+        )
+    if options.steps < 0 or options.learning_rate <= 0:
+        raise InputError("--steps must be 0 or more and --learning-rate more than 0")
 
 
 def check_connected(predictions: PairPredictions) -> None:

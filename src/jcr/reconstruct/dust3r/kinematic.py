@@ -25,11 +25,20 @@ from jcr.reconstruct.dust3r.align_fast import (
     solve_free,
 )
 from jcr.reconstruct.dust3r.align_observations import weight_is_log
-from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, check_connected, pinhole_of
+from jcr.reconstruct.dust3r.alignment import (
+    Alignment,
+    AlignOptions,
+    check_connected,
+    check_options,
+    pinhole_of,
+)
 from jcr.reconstruct.dust3r.pairs import PairPredictions
 
 VAGUE = 10.0
 """One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
+
+STRAIN = 4.0
+"""Standard deviations by which a gripper pose may move before the user is told."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +108,7 @@ class HandEyeCameras:
         jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
         prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
         free = np.concatenate([np.ones(6, bool), np.tile(~self.held, images), np.ones(rest, bool)])
-        pull = np.concatenate([np.zeros(6), (self.information * self._deviation()).ravel(), np.zeros(rest)])
+        pull = np.concatenate([np.zeros(6), (self.information * self.deviation()).ravel(), np.zeros(rest)])
 
         self.normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
         full = np.zeros(6 + layout.size)
@@ -109,7 +118,7 @@ class HandEyeCameras:
         self.base_from_gripper = self.base_from_gripper @ correction
         return jacobian @ full
 
-    def _deviation(self) -> Float[ndarray, "n 6"]:
+    def deviation(self) -> Float[ndarray, "n 6"]:
         """How far the gripper poses have moved from the measured ones, in gripper axes."""
         gap = inverse(self.measured) @ self.base_from_gripper
         return np.concatenate([gap[:, :3, 3], rotation_log(gap[:, :3, :3])], axis=1)
@@ -130,6 +139,7 @@ def align_kinematic(
     """
     options = options or KinematicOptions()
     begin = time.perf_counter()
+    check_options(options.align)
     check_connected(predictions)
     count = predictions.image_count
     if len(base_from_gripper) != count:
@@ -146,18 +156,33 @@ def align_kinematic(
     state = replace(
         free.state,
         recon_from_camera=cameras.recon_from_camera,
-        log_depth=free.state.log_depth + np.log(scale),
+        log_depth=[log_depth + np.log(scale) for log_depth in free.state.log_depth],
         log_pair_scale=free.state.log_pair_scale + np.log(scale),
         pair_error=free.state.pair_error * to_metres,
     )
     spread = free.pair_spread * to_metres
     solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
+    alignment = dense_alignment(problem, solution, begin, progress)
+    notes = (*alignment.notes, *_strained(cameras, predictions))
     return KinematicAlignment(
         gripper_from_camera=cameras.gripper_from_camera,
         scale=float(np.exp(solution.state.log_pair_scale.mean())),
         base_from_gripper=cameras.base_from_gripper,
         covariance=_hand_eye_covariance(cameras, len(predictions.edges)),
-        alignment=replace(dense_alignment(problem, solution, begin, progress), method="kinematic"),
+        alignment=replace(alignment, method="kinematic", notes=notes),
+    )
+
+
+def _strained(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
+    """A note that names the images whose gripper pose had to move further than the robot's noise explains."""
+    sigmas = np.abs(cameras.deviation()) * np.sqrt(cameras.information)
+    strained = np.flatnonzero(sigmas.max(axis=1) > STRAIN)
+    if not len(strained):
+        return ()
+    names = [predictions.images[k] if predictions.images else f"#{k}" for k in strained]
+    return (
+        f"the pictures contradict the gripper poses of {', '.join(names)} by up to {sigmas.max():.0f} times the "
+        "robot's noise; these poses are wrong, or --robot-noise is too small",
     )
 
 
