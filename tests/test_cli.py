@@ -142,7 +142,7 @@ def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: 
 
     shutil.copytree(tabletop, tmp_path / "plain")
     for k, file in enumerate(sorted((tmp_path / "plain" / "images").iterdir())):
-        Image.new("RGB", (640, 480), (120 + k, 120, 120)).save(file)
+        Image.new("RGB", (640, 480), (120 + k, 120, 120)).save(file, format="PNG")  # no two alike
     finished = run_jcr("run", tmp_path / "plain", tmp_path / "out", "--quiet")
     assert finished.returncode == 3
     assert finished.stderr.startswith("error: ") and finished.stderr.count("\n") == 1
