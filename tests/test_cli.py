@@ -67,17 +67,30 @@ def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabl
     assert after["scale"] == before["scale"]
 
 
+def result_points(done: Path) -> np.ndarray:
+    """A few hundred points of a run's cloud."""
+    from jcr.export.points import read_cloud
+
+    return read_cloud(done / "cloud.ply").points_in_base[::500]
+
+
 def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     truth = json.loads((tabletop / "truth" / "scene.json").read_text())
     table = truth["table_height"]
     capture = jcr.read_capture(tabletop)
     over = capture.base_from_gripper[:, :2, 3].mean(0)
     points = tmp_path / "points.csv"
-    points.write_text(f"x,y,z\n{over[0]},{over[1]},{table + 0.3}\n9,9,9\n")
+    surface = result_points(done)
+    rows = [[over[0], over[1], table + 0.3], [9.0, 9.0, 9.0], *surface]
+    points.write_text("x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in rows))
     answered = run_jcr("query", done, points, "--json")
     assert answered.returncode == 0, answered.stderr
     answers = json.loads(answered.stdout)
-    assert "occupancy" in json.dumps(answers)
+    # High over the table everyone looked and saw nothing; nine metres away nobody did; points lie on surfaces.
+    assert answers["occupancy"][0] < 0.5 and not answers["unknown"][0]
+    assert answers["unknown"][1]
+    assert np.mean(np.array(answers["occupancy"][2:]) > 0.5) > 0.5
+    assert np.median(np.abs(answers["distance"][2:])) < 0.01
 
 
 def test_scale_is_metric_to_half_a_percent(done: Path, tabletop: Path):
