@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.reconstruct.lens import rays
-from jcr.reconstruct.planesweep import choose_neighbours, plane_sweep, sweep_planes
+from jcr.reconstruct.planesweep import plane_sweep
+from jcr.reconstruct.views import choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Tracks
 
 PINHOLE = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)

@@ -117,7 +117,8 @@ def _pointmaps(
     options: ColmapOptions,
     report: Progress,
 ) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
-    from jcr.reconstruct.planesweep import PlaneSweepOptions, choose_neighbours, plane_sweep, sweep_planes
+    from jcr.reconstruct.planesweep import PlaneSweepOptions, plane_sweep
+    from jcr.reconstruct.views import choose_neighbours, sweep_planes
 
     depth, confidence = plane_sweep(
         colors,

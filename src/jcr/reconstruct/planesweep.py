@@ -8,8 +8,12 @@ by likeness to the central colour, as in COLMAP (Schönberger et al., ECCV 2016,
 twice as many confident points were off by more than 2 %, all around the objects' outlines.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import repeat
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,10 +22,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional as F
 
-from jcr.geometry import apply, inverse
+from jcr.geometry import inverse
 from jcr.reconstruct.lens import rays, resized
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Intrinsics
 
+_T = TypeVar("_T")
 _WINDOW_REACH, _WINDOW_STRIDE = 2, 2
 """The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""
 _NOISE = 1.0 / 255
@@ -60,7 +65,7 @@ def plane_sweep(
 ) -> tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w"]]:
     """Depth (z, in recon units) and confidence of every pixel of undistorted images.
 
-    Row i is compared with rows `neighbours[i]` along `planes[i]`, evenly spaced as `sweep_planes` makes them.
+    Row i is compared with rows `neighbours[i]` along `planes[i]`, evenly spaced as `views.sweep_planes` does.
     Confidence is the correlation (0 to 1) times the number of neighbours that agree on the depth; 0 without
     texture, and where fewer than two neighbours agree (one, if there are no more than two).
     """
@@ -78,84 +83,62 @@ def plane_sweep(
         for i, others in enumerate(neighbours)
     ]
 
-    cost = torch.empty((m, coarse_pinhole.height, coarse_pinhole.width, planes.shape[1]), device=device)
-    for i in range(m):
+    def coarse(i: int) -> Float[Tensor, "h w d"]:
         correlation = _Correlation(coarse_color, i, neighbours[i], motions[i], coarse_pinhole, options)
-        cost[i] = 1 - correlation(_on_planes(sweep[i], coarse_pinhole)).movedim(0, -1)
-        report(0.45 * (i + 1) / m)
-    _add_semi_global_paths(cost, coarse_color.mean(1))
-    index, _ = _peak(-cost.movedim(-1, 1), dim=1)
-    del cost
-    report(0.6)
+        return 1 - correlation(_on_planes(sweep[i], coarse_pinhole)).movedim(0, -1)
 
-    index = F.interpolate(index[:, None], (pinhole.height, pinhole.width))[:, 0]
-    inverse_depth = _on_planes(sweep[:, 0], pinhole) + step[:, None, None] * index
-    score = torch.empty_like(inverse_depth)
-    for i in range(m):
+    def fine(i: int) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         correlation = _Correlation(color, i, neighbours[i], motions[i], pinhole, options)
+        at_best, score = surface[i], surface[i]
         for reach, spacing in _REFINEMENT:
             offsets = spacing * step[i] * torch.arange(-reach, reach + 1, device=device)
-            hypotheses = _median(inverse_depth[i]) + offsets[:, None, None]
-            at, score[i] = _peak(correlation(hypotheses), dim=0)
-            inverse_depth[i] = (hypotheses[0] + at * spacing * step[i]).clamp(min=step[i])
-        report(0.6 + 0.4 * (i + 1) / m)
-    count = torch.zeros_like(score)
-    for tolerance in _AGREEMENT:
-        agreed = [
-            _agreement(inverse_depth, i, neighbours[i], motions[i], pinhole, tolerance) for i in range(m)
-        ]
-        inverse_depth, count = (torch.stack(maps) for maps in zip(*agreed, strict=True))
+            hypotheses = _median(at_best) + offsets[:, None, None]
+            index, score = _peak(correlation(hypotheses), dim=0)
+            at_best = (hypotheses[0] + index * spacing * step[i]).clamp(min=step[i])
+        return at_best, score
+
+    def agree(i: int, tolerance: float) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        return _agreement(inverse_depth, i, neighbours[i], motions[i], pinhole, tolerance)
+
+    with _threads_over_images(device) as pool:
+        cost = torch.stack(list(_told(pool.map(coarse, range(m)), report, 0.0, 0.45 / m)))
+        _add_semi_global_paths(cost, coarse_color.mean(1))
+        index, _ = _peak(-cost.movedim(-1, 1), dim=1)
+        del cost
+        index = F.interpolate(index[:, None], (pinhole.height, pinhole.width))[:, 0]
+        surface = _on_planes(sweep[:, 0], pinhole) + step[:, None, None] * index
+        refined = list(_told(pool.map(fine, range(m)), report, 0.5, 0.5 / m))
+        inverse_depth, score = (torch.stack(maps) for maps in zip(*refined, strict=True))
+        count = torch.zeros_like(score)
+        for tolerance in _AGREEMENT:
+            agreed = list(pool.map(agree, range(m), repeat(tolerance)))
+            inverse_depth, count = (torch.stack(maps) for maps in zip(*agreed, strict=True))
     needed = torch.tensor([1 if len(others) < 3 else 2 for others in neighbours], device=device)
     believed = (count >= needed[:, None, None]) & (score >= _LEAST_CORRELATION)
     confidence = torch.where(believed, score.clamp(max=1) * count, 0.0)
     return (1 / inverse_depth).double().cpu().numpy(), confidence.double().cpu().numpy()
 
 
-def choose_neighbours(
-    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int
-) -> list[Int[ndarray, " _"]]:
-    """For each image the rows of up to `count` others that share most points under a useful angle.
+@contextmanager
+def _threads_over_images(device: torch.device) -> Iterator[Executor]:
+    """As many threads as torch has, each to work on images of its own.
 
-    The angle's weight has the form of MVSNet's (Yao et al., ECCV 2018, section 4.1), its best at 15°.
+    Torch's own threads wait for each other after every one of thousands of short steps.
     """
-    m = len(recon_from_camera)
-    seen = np.zeros((m, len(tracks.points_in_recon)), dtype=bool)
-    seen[tracks.image, tracks.point] = True
-    towards = recon_from_camera[:, None, :3, 3] - tracks.points_in_recon
-    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-    chosen = []
-    for i in range(m):
-        angle_deg = np.degrees(np.arccos(np.clip((towards[i] * towards).sum(-1), -1, 1)))
-        weight = np.exp(-(((angle_deg - 15) / np.where(angle_deg < 15, 7, 15)) ** 2) / 2)
-        score = (weight * (seen & seen[i])).sum(1)
-        score[i] = -1.0
-        chosen.append(np.argsort(-score, kind="stable")[: min(count, m - 1)])
-    return chosen
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads if device.type == "cpu" else 1) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)
 
 
-def sweep_planes(
-    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int = 48
-) -> Float[ndarray, "m d 3"]:
-    """For each image `count` planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
-
-    All have the slope of the plane that the image's points lie on best, mostly the table (least absolute
-    deviations of inverse depth); their offsets, evenly spaced, span the points' percentiles and some slack.
-    With fronto-parallel planes 6 % fewer pixels got a depth, and its median error was 1.6 times as large.
-    """
-    planes = np.empty((len(recon_from_camera), count, 3))
-    for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
-        x = apply(camera_from_recon, tracks.points_in_recon[tracks.point[tracks.image == i]])
-        ray, inverse_depth = x / x[:, 2:], 1 / x[:, 2]
-        slope, residual = np.zeros(3), inverse_depth
-        for _ in range(20):
-            weight = 1 / np.sqrt(np.maximum(np.abs(residual), 1e-3 * np.median(inverse_depth)))
-            slope = np.linalg.lstsq(ray * weight[:, None], inverse_depth * weight, rcond=None)[0]
-            residual = inverse_depth - ray @ slope
-        low, high = np.percentile(residual, [1, 99])
-        slack = 0.15 * (high - low) + 0.02 * np.median(inverse_depth)
-        planes[i] = slope
-        planes[i, :, 2] += np.linspace(low - slack, high + slack, count)
-    return planes
+def _told(results: Iterable[_T], report: Callable[[float], None], start: float, share: float) -> Iterator[_T]:
+    """The results, of which each is reported as done."""
+    for k, result in enumerate(results):
+        report(start + share * (k + 1))
+        yield result
 
 
 def _on_planes(planes: Float[Tensor, "d 3"], pinhole: Intrinsics) -> Float[Tensor, "d h w"]:
