@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
 
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.progress import Progress
@@ -148,6 +149,9 @@ def solve_free(problem: Problem, options: AlignOptions) -> Solution:
     return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
 
 
+# The matrices are small. BLAS threads gain nothing on them, and on a busy machine wait for each other: with the
+# other core taken, 15 images took 3 to 6 times as long.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def gauss_newton(
     images: list[ImageObservations],
     state: State,
