@@ -9,7 +9,7 @@ import pytest
 
 from jcr.bench.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.cli import dispatch
-from jcr.errors import InputError
+from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
 from jcr.reconstruct.dust3r.align import align
 from jcr.reconstruct.dust3r.align_equations import Layout
@@ -218,6 +218,15 @@ def test_senseless_options_are_refused():
         align(predictions, AlignOptions(pixels=1))
     with pytest.raises(InputError, match="--steps"):
         align(predictions, AlignOptions(method="adam", steps=-1))
+
+
+def test_predictions_that_are_noise_are_called_useless():
+    predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
+    try:
+        notes = align(predictions).notes
+    except NotTrustedError as refusal:
+        notes = (str(refusal),)
+    assert any("nothing can be built on them" in note or "came to nothing" in note for note in notes)
 
 
 def test_same_input_same_output():

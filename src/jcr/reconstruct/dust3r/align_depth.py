@@ -30,7 +30,7 @@ def fused_depth(
     observations: ImageObservations, state: State, noise: Noise
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
     """Depth of the observed pixels by Gauss-Newton from `initial_depth`, and their weight averaged over the
-    pointmaps, each counting as far as it agrees."""
+    pointmaps, each counting as far as it agrees and as its noise allows."""
     log_depth = np.log(initial_depth(observations, state))
     weight = observations.weight
     for _ in range(DEPTH_ITERATIONS):

@@ -19,6 +19,7 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
+from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.align_depth import fused_depth
@@ -44,6 +45,8 @@ DEPTH_CHUNK = 4096
 """Pixels at a time, so that the arrays of a chunk stay in the cache."""
 CONTRADICTION = 4.0
 """A pair whose residual is this many times the median one is named to the user."""
+USELESS = 0.2
+"""Residual of the middle pair, relative to the distance, that no network worth its weights comes near."""
 
 
 @runtime_checkable
@@ -124,6 +127,8 @@ class Solution:
     """Per image, of its pointmaps."""
     pair_spread: Float[ndarray, "6"]
     """One sigma per axis of the pairs' errors: translation, rotation."""
+    settled: bool
+    """Whether the last step was small enough."""
 
 
 def align_fast(
@@ -162,7 +167,8 @@ def gauss_newton(
 ) -> Solution:
     """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
 
-    The weights, and the spread of the pairs' errors, are measured anew in each iteration.
+    The weights, and the spread of the pairs' errors, are measured anew in each iteration. Raises
+    NotTrustedError where the pointmaps do not determine the unknowns.
     """
     selections = [_selection(o, layout) for o in images]
     focals = [layout.focal(k) for k in range(layout.images)]
@@ -187,7 +193,14 @@ def gauss_newton(
         # A pair nobody believes keeps its scale.
         scales = layout.scales
         hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
-        step = cameras.step(layout, hessian, gradient)
+        try:
+            step = cameras.step(layout, hessian, gradient)
+        except np.linalg.LinAlgError:
+            step = np.full(layout.size, np.nan)
+        if not np.isfinite(step).all():
+            raise NotTrustedError(
+                "the alignment of the pairs came to nothing; their pointmaps have too little in common"
+            )
 
         log_depth, pair_error = [], np.zeros_like(state.pair_error)
         variance = np.zeros_like(state.pair_error)
@@ -210,8 +223,9 @@ def gauss_newton(
             log_depth=log_depth,
         )
         iteration += 1
-        if np.abs(step).max() < tolerance or iteration == ITERATIONS:
-            return Solution(state, images, noise, pair_spread)
+        settled = bool(np.abs(step).max() < tolerance)
+        if settled or iteration == ITERATIONS:
+            return Solution(state, images, noise, pair_spread, settled)
 
 
 def _spread(
@@ -249,7 +263,7 @@ def dense_alignment(
             if progress is not None:
                 progress("align pairs", done / count)
     focal = np.exp(state.log_focal)
-    residual, notes = _pair_residuals(predictions, solution)
+    residual = _pair_residuals(predictions, solution)
     return Alignment(
         recon_from_camera=state.recon_from_camera,
         focal_px=np.stack([focal, focal * problem.pinhole.aspect], axis=1),
@@ -260,26 +274,37 @@ def dense_alignment(
         pair_residual=residual,
         seconds=time.perf_counter() - begin,
         method="fast",
-        notes=notes,
+        notes=_notes(predictions, residual, solution.settled),
     )
 
 
-def _pair_residuals(
-    predictions: PairPredictions, solution: Solution
-) -> tuple[Float[ndarray, " e"], tuple[str, ...]]:
-    """Residual of each pair, the larger of its two views', and a note that names those that stand out."""
+def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[ndarray, " e"]:
+    """Residual of each pair, the larger of its two views'."""
     residual = np.zeros(len(predictions.edges))
     for o, noise in zip(solution.images, solution.noise, strict=True):
         np.maximum.at(residual, o.pair, np.sqrt(2 * noise.across**2 + noise.along**2))
-    bad = np.flatnonzero(residual > CONTRADICTION * np.median(residual))
-    if not len(bad):
-        return residual, ()
-    names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
-    pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
-    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-    return residual, (
-        f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",
-    )
+    return residual
+
+
+def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
+    """What the user should know of an alignment."""
+    notes = []
+    middle = float(np.median(residual))
+    if not settled:
+        notes.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
+    if middle > USELESS:
+        notes.append(
+            f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"
+        )
+    bad = np.flatnonzero(residual > CONTRADICTION * middle)
+    if len(bad):
+        names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
+        pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        notes.append(
+            f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}"
+        )
+    return tuple(notes)
 
 
 def _selection(o: ImageObservations, layout: Layout) -> csr_array:

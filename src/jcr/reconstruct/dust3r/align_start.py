@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.errors import InputError
 from jcr.geometry import inverse, nearest_rotation, transform
 from jcr.reconstruct.dust3r.align_observations import ImageObservations
 from jcr.reconstruct.dust3r.align_residuals import State
@@ -45,7 +46,10 @@ def initial_state(images: list[ImageObservations], edges: Int[ndarray, "e 2"], p
 
 
 def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, " n"]:
-    """fx per image: median over the first views of pixel radius over tangent of the angle off the axis."""
+    """fx per image: median over the first views of pixel radius over tangent of the angle off the axis.
+
+    Raises InputError where no first view shows it.
+    """
     if pinhole.focal_px is not None:
         return np.full(len(images), pinhole.focal_px)
     ratios = []
@@ -54,6 +58,8 @@ def _focal(images: list[ImageObservations], pinhole: Pinhole) -> Float[ndarray, 
         usable = (n[:, 2] > 1e-3) & (np.hypot(n[:, 0], n[:, 1]) > 1e-3) & (o.weight[o.second_count :] > 0)
         radius = np.broadcast_to(np.hypot(*o.pixel_offset), usable.shape)
         ratios.append((radius * n[:, 2])[usable] / np.hypot(n[:, 0], n[:, 1])[usable])
+    if not sum(ratio.size for ratio in ratios):
+        raise InputError("no first view of a pair has points in front of the camera; give the intrinsics")
     shared = float(np.median(np.concatenate(ratios)))
     if pinhole.shared:
         return np.full(len(images), shared)

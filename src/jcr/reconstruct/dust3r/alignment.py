@@ -52,7 +52,7 @@ class Alignment:
     """One reconstruction from pairwise pointmaps: a camera and a depth map per image, a scale per pair.
 
     The recon frame is the camera frame of image 0; its unit is the geometric mean of the pairs' own units, so
-    metric predictions give metres.
+    metric predictions give metres. (Kinematic alignment puts the base frame and metres in their place.)
     """
 
     recon_from_camera: Float[ndarray, "n 4 4"]
