@@ -1,18 +1,16 @@
 """The COLMAP back end: structure from motion, then dense pointmaps by plane sweep; no network, no weights."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from numpy import ndarray
 from PIL import ExifTags, Image
 
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.progress import Progress
-from jcr.reconstruct.lens import NO_DISTORTION, fold_distance_px, pinhole_inside, rays, undistort_image
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.reconstruct.lens import pinhole_inside, undistort_image, usable_lens
+from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
 """Of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
@@ -49,12 +47,14 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
+    from jcr.reconstruct.dense import dense_pointmaps
     from jcr.reconstruct.sfm import structure_from_motion
+    from jcr.reconstruct.views import choose_neighbours, sweep_planes
 
     options = options or ColmapOptions()
     report = progress or (lambda stage, fraction: None)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, notes = _usable_lens(capture.intrinsics)
+    given, notes = usable_lens(capture.intrinsics)
     lenses = [given] if given else _guessed_lenses(capture)
     try:
         sparse = structure_from_motion(
@@ -68,8 +68,14 @@ def reconstruct(
     pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
     colors = np.stack([undistort_image(images[row], sparse.lens, pinhole) for row in sparse.rows])
     if options.dense:
-        points, confidence = _pointmaps(
-            colors, sparse.recon_from_camera, pinhole, sparse.tracks, options, report
+        points, confidence = dense_pointmaps(
+            colors,
+            sparse.recon_from_camera,
+            pinhole,
+            choose_neighbours(sparse.tracks, sparse.recon_from_camera, options.neighbours),
+            sweep_planes(sparse.tracks, sparse.recon_from_camera),
+            options.device,
+            report,
         )
     else:
         points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
@@ -87,17 +93,6 @@ def reconstruct(
     )
 
 
-def _usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, list[str]]:
-    """The given intrinsics, without a distortion that has no inverse: with it, images do not register."""
-    if lens is None or (fold := fold_distance_px(lens)) is None:
-        return lens, []
-    note = (
-        f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
-        "calibrate the lens again with points out to the corners, or give zero distortion"
-    )
-    return replace(lens, distortion=NO_DISTORTION), [note]
-
-
 def _guessed_lenses(capture: Capture) -> list[Intrinsics]:
     """Starting points for unknown intrinsics: EXIF's 35 mm focal length if there is one, then a ladder."""
     width, height = capture.image_size
@@ -107,28 +102,3 @@ def _guessed_lenses(capture: Capture) -> list[Intrinsics]:
     focals = [focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)] if focal_35mm else []
     focals += [factor * max(width, height) for factor in _START_FOCALS]
     return [Intrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height) for f in focals]
-
-
-def _pointmaps(
-    colors: UInt8[ndarray, "m h w 3"],
-    recon_from_camera: Float[ndarray, "m 4 4"],
-    pinhole: Intrinsics,
-    tracks: Tracks,
-    options: ColmapOptions,
-    report: Progress,
-) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
-    from jcr.reconstruct.planesweep import PlaneSweepOptions, plane_sweep
-    from jcr.reconstruct.views import choose_neighbours, sweep_planes
-
-    depth, confidence = plane_sweep(
-        colors,
-        recon_from_camera,
-        pinhole,
-        choose_neighbours(tracks, recon_from_camera, options.neighbours),
-        sweep_planes(tracks, recon_from_camera),
-        PlaneSweepOptions(device=options.device),
-        lambda fraction: report("dense depth", fraction),
-    )
-    x_in_camera = depth[..., None] * rays(pinhole)
-    x_in_recon = np.einsum("mij,mhwj->mhwi", recon_from_camera[:, :3, :3], x_in_camera)
-    return x_in_recon + recon_from_camera[:, None, None, :3, 3], confidence

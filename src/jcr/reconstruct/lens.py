@@ -87,6 +87,20 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     return float(np.linalg.norm(at_fold - [lens.cx, lens.cy], axis=-1).min())
 
 
+def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, list[str]]:
+    """Given intrinsics, without a distortion that has no inverse, and a note that says so.
+
+    With such a distortion images do not register.
+    """
+    if lens is None or (fold := fold_distance_px(lens)) is None:
+        return lens, []
+    note = (
+        f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
+        "calibrate the lens again with points out to the corners, or give zero distortion"
+    )
+    return replace(lens, distortion=NO_DISTORTION), [note]
+
+
 def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:
     """The same camera with its image resized to `width` x `height` pixels."""
     sx, sy = width / lens.width, height / lens.height
