@@ -33,8 +33,9 @@ from jcr.report.html import report_html
 from jcr.report.markup import significant
 from jcr.report.notations import notations
 from jcr.report.samples import CLEARANCE, sample_surface, slices
+from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
-from jcr.represent.train import MapOptions, build_scene
+from jcr.represent.options import MapOptions
 from jcr.simulate.truth import Truth, read_truth
 
 EVIL = "<script>alert(1)</script>&\"'.jpg"

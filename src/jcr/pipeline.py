@@ -25,9 +25,10 @@ from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, chosen, reconstruct
 from jcr.reconstruct.file import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.represent.options import MapOptions
 from jcr.represent.scene import SceneMap
-from jcr.represent.train import MapOptions, build_scene
 
 STATE = "run.json"
 """In the run folder: the capture, and what each finished stage was made from."""

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from jcr.represent.cloud import CloudOptions
-from jcr.represent.train import MapOptions
+from jcr.represent.options import MapOptions
 
 
 @dataclass(frozen=True)

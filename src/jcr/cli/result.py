@@ -2,13 +2,15 @@
 
 import json
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.pipeline import RunResult
+if TYPE_CHECKING:
+    from jcr.pipeline import RunResult
 
 
-def show(result: RunResult, as_json: bool) -> int:
+def show(result: "RunResult", as_json: bool) -> int:
     """Print the calibration on stdout and its doubts on stderr; the exit status, 0 or 3."""
     content = result.calibration
     if as_json:
@@ -23,7 +25,7 @@ def show(result: RunResult, as_json: bool) -> int:
     return 0
 
 
-def summary(result: RunResult) -> str:
+def summary(result: "RunResult") -> str:
     """A few lines a person reads: the transform, how sure it is, what was left out."""
     hand_eye, content = result.hand_eye, result.calibration
     uncertainty = content.uncertainty

@@ -11,7 +11,7 @@ from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.cli.result import show
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.cloud import CloudOptions
-from jcr.represent.train import MapOptions
+from jcr.represent.options import MapOptions
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ are metres of the base frame; each encoding scales them by itself.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -175,16 +175,34 @@ class Field(nn.Module):
         self.spread: SpreadEncoding | None = None
         self.hidden = nn.Linear(self.encoding.features, shape.hidden)
         self.heads = nn.ModuleDict({name: nn.Linear(shape.hidden, n) for name, n in shape.heads.items()})
+        # Mean and deviation of plain values, whose unit is anyone's: the heads learn them standardised.
+        self.standard = nn.ParameterDict(
+            {
+                name: nn.Parameter(torch.tensor([[0.0], [1.0]]).repeat(1, n), requires_grad=False)
+                for name, n in shape.heads.items()
+                if name not in ("occupancy", "label")
+            }
+        )
+
+    @torch.no_grad()
+    def standardise(self, targets: Mapping[str, Tensor]) -> None:
+        """Take mean and deviation of the plain values from what is to be learnt, each (n, outputs)."""
+        for name, standard in self.standard.items():
+            target = targets[name]
+            standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
     def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
         """Outputs (n, outputs) of every head at points (n,3)."""
         # Features first: with so few of them, this product and its gradients take half the time.
         features = (self.spread or self.encoding)(x_in_base)
         hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features))
-        return {
-            name: torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
-            for name, head in self.heads.items()
-        }
+        outputs = {}
+        for name, head in self.heads.items():
+            outputs[name] = torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
+            if name in self.standard:
+                mean, std = self.standard[name]
+                outputs[name] = mean + std * outputs[name]
+        return outputs
 
 
 class Fields(nn.Module):

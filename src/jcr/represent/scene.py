@@ -242,7 +242,11 @@ def _from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap
         Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])
         for k, (cell, shape) in enumerate(about["lattices"])
     ]
-    fields = Fields([FieldShape(**shape) for shape in about["fields"]], seen.box, lattices)
+    shapes = [
+        FieldShape(**shape | {"grids": tuple((lattice, n) for lattice, n in shape["grids"])})
+        for shape in about["fields"]
+    ]
+    fields = Fields(shapes, seen.box, lattices)
     fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
     return SceneMap(fields, seen, tuple(about["label_names"]), about["history"])
 

@@ -1,0 +1,104 @@
+"""The stage: from a cloud to the map of it."""
+
+import math
+import time
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from jcr.errors import InputError
+from jcr.progress import Progress
+from jcr.records import PointCloud
+from jcr.represent.chunks import threads_of_one_core
+from jcr.represent.fields import Field, Fields, FieldShape, Lattice
+from jcr.represent.options import MapOptions
+from jcr.represent.rays import NEAR, workspace_box, workspace_rays
+from jcr.represent.scene import SceneMap
+from jcr.represent.seen import HIT, SeenGrid, carve, dilate, halve
+from jcr.represent.train import RECIPES, train
+
+
+def build_scene(
+    cloud: PointCloud,
+    options: MapOptions | None = None,
+    progress: Progress | None = None,
+    values: dict[str, Float[ndarray, "n d"]] | None = None,
+    device: str = "cpu",
+) -> SceneMap:
+    """The map of a cloud: what was seen, and fields of occupancy, colour, label and any further `values` (n,d).
+
+    Raises InputError when hardly any point lies in the workspace, or a number is not finite.
+    """
+    options = options or MapOptions()
+    recipe = RECIPES[options.preset]
+    torch.manual_seed(options.map_seed)
+
+    def tensor(array: ndarray) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+    for numbers in (cloud.points_in_base, cloud.camera_centers_in_base, cloud.confidence, cloud.margin):
+        if not np.isfinite(numbers).all():
+            raise InputError(
+                "the cloud holds numbers that are not finite; remove those points and map the rest"
+            )
+    box = workspace_box(cloud, options.workspace)
+    cell = max(options.cell, float(np.prod(box[1] - box[0]) / options.max_cells) ** (1 / 3))
+    box[1] = box[0] + np.ceil((box[1] - box[0]) / cell - 1e-6) * cell
+    rays = workspace_rays(cloud, values or {}, box, cell, device)
+
+    start = time.perf_counter()
+    if progress:
+        progress("what was seen", 0.0)
+    # Rays that end beyond the workspace cross it all the same.
+    image = torch.as_tensor(cloud.image, device=device)
+    centers = tensor(cloud.camera_centers_in_base)
+    seen = carve(tensor(cloud.points_in_base), image, centers, tensor(box), cell / 2)
+    carved = time.perf_counter()
+    lattices = feature_lattices(seen) if recipe.grids else []
+    outputs = {name: target.shape[-1] for name, target in rays.targets.items() if name != "label"}
+    heads = {"occupancy": 1} | outputs
+    if "label" in rays.targets:
+        heads["label"] = len(cloud.label_names)
+    groups = [heads] if options.joint else [{"occupancy": heads.pop("occupancy")}, heads]
+    shapes = [
+        FieldShape(
+            group,
+            recipe.hidden,
+            recipe.frequencies,
+            recipe.grids if "occupancy" in group else recipe.surface_grids,
+        )
+        for group in groups
+    ]
+    fields = Fields(shapes, seen.box, lattices).to(device)
+
+    def fit(field: Field) -> int:
+        stage = f"map: {', '.join(field.heads)}"
+        report = partial(progress or (lambda stage, fraction: None), stage)
+        return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, report)
+
+    with threads_of_one_core(torch.device(device)) as pool:
+        steps = list(pool.map(fit, fields.of))
+    history = {
+        "preset": options.preset,
+        "steps": " + ".join(map(str, steps)),
+        "carving_s": f"{carved - start:.3f}",
+        "training_s": f"{time.perf_counter() - carved:.3f}",
+    }
+    return SceneMap(fields, seen, cloud.label_names, history)
+
+
+def feature_lattices(seen: SeenGrid) -> list[Lattice]:
+    """Three lattices: four cells a step everywhere, one cell near surfaces, half a cell on them."""
+    hit = (seen.state & HIT) != 0
+    nz, ny, nx = ((n // 2 + 3) // 4 for n in hit.shape)
+    everywhere = torch.ones(nz, ny, nx, dtype=torch.bool, device=hit.device)
+    cell = 2 * seen.cell
+    return [
+        Lattice.around(everywhere, seen.lower, 4 * cell),
+        Lattice.around(dilate(halve(hit), math.ceil(NEAR)), seen.lower, cell),
+        Lattice.around(dilate(hit, 1), seen.lower, cell / 2),
+    ]

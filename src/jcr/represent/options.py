@@ -1,0 +1,26 @@
+"""How a map is built; apart from the training, so that the command line's help need not import torch."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How the map is trained."""
+
+    preset: Literal["default", "paper"] = "default"
+    """default: feature grids, free space learnt along the rays; paper: the paper's sinusoidal network with uniform
+    negatives, slower and coarser."""
+    joint: bool = False
+    """One network for all properties instead of one for each."""
+    workspace: tuple[float, float, float, float, float, float] | None = None
+    """Box of the map in the base frame (m): xmin ymin zmin xmax ymax zmax; by default it holds the points and the
+    cameras."""
+    cell: float = 0.01
+    """Side (m) of the finest feature cells; what was seen is kept at half of it."""
+    max_cells: int = 4_000_000
+    """Enlarge the cells until the workspace holds no more than so many."""
+    max_seconds: float = 60.0
+    """Stop the training after this time at the latest; it stops by itself on a plateau."""
+    map_seed: int = 0
+    """Seed of the samples and of the initial weights."""

@@ -1,0 +1,389 @@
+"""The map against a scene whose every distance is known: a table with a box and a ball."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import analytic_scene
+from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
+from jcr.errors import InputError
+from jcr.records import PointCloud
+from jcr.represent.build import build_scene
+from jcr.represent.options import MapOptions
+from jcr.represent.rays import workspace_rays
+from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap, load_map
+
+OPTIONS = MapOptions(workspace=WORKSPACE)
+INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
+UNDER_TABLE = np.array([0.0, 0.0, -0.08])
+FREE_SPOT = np.array([0.0, 0.2, 0.15])
+OUTSIDE = np.array([2.0, 0.0, 0.1])
+
+
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return analytic_scene.cloud()
+
+
+def warmth(cloud: PointCloud) -> np.ndarray:
+    """A property of two numbers, for the door that any continuous property takes."""
+    x = cloud.points_in_base
+    return np.stack([20 + 30 * x[:, 0], x[:, 2] > 0.02], -1)
+
+
+@pytest.fixture(scope="module")
+def scene(cloud: PointCloud) -> SceneMap:
+    return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
+
+
+def uniform(count: int, seed: int = 0) -> np.ndarray:
+    low, high = np.reshape(WORKSPACE, (2, 3))
+    return np.random.default_rng(seed).uniform(low + 0.001, high - 0.001, (count, 3))
+
+
+def near_surface(count: int) -> np.ndarray:
+    """Points within 6 cm of the true surface."""
+    x = uniform(20 * count)
+    return x[np.abs(signed_distance(x)) < 0.06][:count]
+
+
+# What nobody has seen
+
+
+def test_what_no_ray_crossed_is_claimed_by_nobody(scene: SceneMap):
+    hidden = np.stack([INSIDE_BOX, BALL_CENTER, UNDER_TABLE, [0.0, 0.0, -0.02], OUTSIDE])
+    sample = scene.query(hidden)
+    assert sample.unknown.all()
+    assert (sample.occupancy == 0.5).all()
+    assert (sample.label == 0).all()
+    assert (scene.query(hidden, unknown="occupied").occupancy == 1).all()
+    assert (scene.query(hidden, unknown="free").occupancy == 0).all()
+
+
+def test_no_place_that_no_camera_could_see_is_called_free(scene: SceneMap):
+    x = uniform(200_000)
+    deep = signed_distance(x) < -0.005
+    assert deep.sum() > 1000
+    sample = scene.query(x[deep])
+    claimed_free = ~sample.unknown & (sample.occupancy < 0.5)
+    assert claimed_free.mean() < 0.001
+
+
+def test_the_box_is_no_wall_and_nothing_is_clamped_into_it(scene: SceneMap):
+    just_out = np.array([[0.0, 0.0, 0.601], [0.0, 0.0, 5.0], [-0.451, 0, 0.3], [1e30, 0, 0], [0, -3e9, 0]])
+    sample = scene.query(just_out)
+    assert sample.unknown.all()
+    assert np.isnan(sample.distance).all()
+    assert np.isnan(sample.gradient).all()
+    assert np.isnan(sample.color).all()
+
+
+def test_the_planner_chooses_how_unknown_counts(scene: SceneMap):
+    centers = np.stack([FREE_SPOT, UNDER_TABLE, BOX_CENTER + [0, 0, BOX_HALF[2]], OUTSIDE])
+    radii = np.array([0.05, 0.01, 0.02, 0.05])
+    assert scene.check_spheres(centers, radii, unknown="report").tolist() == [
+        FREE,
+        UNKNOWN,
+        OCCUPIED,
+        UNKNOWN,
+    ]
+    assert scene.check_spheres(centers, radii).tolist() == [False, True, True, True]
+    assert scene.check_spheres(centers, radii, unknown="free").tolist() == [False, False, True, False]
+
+
+def test_free_space_that_was_seen_is_not_called_solid(scene: SceneMap):
+    x = uniform(200_000)
+    clear = signed_distance(x) > 0.005
+    sample = scene.query(x[clear])
+    assert (~sample.unknown).mean() > 0.3
+    assert ((sample.occupancy >= 0.5) & ~sample.unknown).mean() < 0.002
+
+
+# Distance
+
+
+def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: SceneMap):
+    x = uniform(200_000)
+    true = signed_distance(x)
+    beside = (true > 0.01) & (true < 0.15) & ~scene.query(x).unknown
+    x, true = x[beside], true[beside]
+    sample = scene.query(x)
+    assert np.percentile(np.abs(sample.distance - true), 95) < 0.003
+    step = 1e-4 * np.eye(3)
+    gradient = np.stack([(signed_distance(x + h) - signed_distance(x - h)) / 2e-4 for h in step], -1)
+    smooth = np.linalg.norm(gradient, axis=1) > 0.99
+    alike = (gradient * sample.gradient).sum(1)[smooth]
+    assert np.median(alike) > 0.99
+    assert np.percentile(np.linalg.norm(sample.gradient, axis=1), 90) < 1.1
+
+
+def test_distance_is_negative_inside_and_zero_on_the_surface(scene: SceneMap, cloud: PointCloud):
+    assert scene.query(INSIDE_BOX[None], unknown="occupied").distance[0] < -0.02
+    on_surface = scene.query(cloud.points_in_base[:5000]).distance
+    assert np.abs(np.median(on_surface)) < 0.001
+    assert np.percentile(np.abs(on_surface), 95) < 0.004
+
+
+def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: SceneMap):
+    x = uniform(50_000)
+    careful, bold = (scene.query(x, unknown=choice).distance for choice in ("occupied", "free"))
+    outside = bold > 0
+    assert (careful <= bold + scene.cell / 2)[outside].all()
+    assert (careful <= bold + 1e-6)[outside].mean() > 0.99
+    assert (careful[scene.query(x).unknown] < scene.cell).mean() > 0.99
+
+
+# Spheres and segments
+
+
+def test_spheres_touch_what_they_reach_and_nothing_else(scene: SceneMap):
+    centers = uniform(100_000)
+    radii = np.random.default_rng(1).uniform(0.005, 0.05, len(centers))
+    true = signed_distance(centers)
+    answer = scene.check_spheres(centers, radii, unknown="free")
+    seen = (true > 0) & ~scene.query(centers).unknown  # the table's lower side is known to nobody
+    assert answer[seen & (true < radii - 0.006)].mean() > 0.998
+    assert answer[seen & (true > radii + 0.006)].mean() < 0.001
+    # To be careful frees nothing, but for the half cell that two distance grids may differ by.
+    assert scene.check_spheres(centers, radii + scene.cell / 2)[answer].all()
+
+
+def test_spheres_come_in_any_batch(scene: SceneMap):
+    centers = uniform(24).reshape(2, 3, 4, 3)
+    flat = scene.check_spheres(centers.reshape(-1, 3), 0.03)
+    assert (scene.check_spheres(centers, 0.03) == flat.reshape(2, 3, 4)).all()
+    assert (scene.check_spheres(centers, np.full((3, 1), 0.03)) == flat.reshape(2, 3, 4)).all()
+    assert scene.check_spheres(centers[0, 0, 0], 0.03).shape == ()
+    assert scene.check_spheres(np.zeros((0, 3)), 0.03).shape == (0,)
+
+
+def test_a_segment_touches_where_its_middle_does(scene: SceneMap):
+    start, end = BALL_CENTER + [0, -0.12, 0.02], BALL_CENTER + [0, 0.12, 0.02]
+    above = np.array([0, 0, BALL_RADIUS + 0.05])
+    ends = [FREE, FREE]
+    assert scene.check_spheres(np.stack([start, end]), 0.01, "report").tolist() == ends
+    assert scene.check_segments(start, end, 0.01, "report") == OCCUPIED
+    assert scene.check_segments(start + above, end + above, 0.01, "report") == FREE
+    assert scene.check_segments(FREE_SPOT, OUTSIDE, 0.01, "report") == UNKNOWN
+    both = scene.check_segments(np.stack([start, start + above]), np.stack([end, end + above]), 0.01)
+    assert both.tolist() == [True, False]
+
+
+# What is there
+
+
+def test_colours_labels_and_further_values_are_learnt(scene: SceneMap, cloud: PointCloud):
+    x = cloud.points_in_base
+    sample = scene.query(x)
+    assert np.abs(sample.color - analytic_scene.true_color(x)).mean() < 0.03
+    assert (sample.label == cloud.label).mean() > 0.99
+    assert np.abs(sample.values["warmth"] - warmth(cloud)).mean() < 0.3
+    assert scene.label_names == analytic_scene.LABELS
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_the_papers_networks_learn_all_three(cloud: PointCloud, joint: bool):
+    scene = build_scene(cloud, replace(OPTIONS, preset="paper", joint=joint, max_seconds=3.0))
+    x = uniform(100_000)
+    surface, free = cloud.points_in_base[:20_000], x[signed_distance(x) > 0.03]
+    known = ~scene.query(free).unknown
+    assert (scene.query(surface).occupancy > 0.5).mean() > 0.9
+    assert (scene.query(free).occupancy[known] < 0.5).mean() > 0.95
+    color_error = np.abs(scene.query(surface).color - analytic_scene.true_color(surface)).mean()
+    assert color_error < 0.1  # the mean colour alone is off by 0.29
+    assert (scene.query(surface).label == cloud.label[:20_000]).mean() > 0.97
+
+
+def test_one_network_for_all_properties_answers_as_well(cloud: PointCloud):
+    scene = build_scene(cloud, replace(OPTIONS, joint=True))
+    assert len(scene.fields.of) == 1
+    x = cloud.points_in_base[:20_000]
+    assert (scene.query(x).label == cloud.label[:20_000]).mean() > 0.98
+    assert np.percentile(np.abs(scene.query(x).distance), 95) < 0.005
+
+
+def test_reliable_points_weigh_more(cloud: PointCloud):
+    n = len(cloud.points_in_base)
+    half = np.arange(n) < n // 2
+    box = np.reshape(WORKSPACE, (2, 3))
+    doubted = replace(cloud, confidence=np.where(half, 1.0, 0.5), margin=np.where(half, 0.0, 0.02))
+    weight = workspace_rays(doubted, {}, box, 0.01, "cpu").weight.numpy()
+    assert len(weight) == n
+    assert np.allclose(weight[half] / weight[~half], 2 * (1 + 2**2))
+    assert np.isclose(weight.mean(), 1, rtol=1e-4)
+
+
+def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCloud):
+    wrong = np.random.default_rng(0).random(len(cloud.color)) < 0.4
+    stained = replace(
+        cloud,
+        color=np.where(wrong[:, None], 255, cloud.color).astype(np.uint8),
+        margin=np.where(wrong, 0.05, 0.0),
+    )
+    trusting = replace(stained, margin=np.zeros(len(wrong)))
+    x = cloud.points_in_base[:10_000]
+
+    def error(cloud: PointCloud) -> float:
+        color = build_scene(cloud, OPTIONS).query(x).color
+        return float(np.abs(color - analytic_scene.true_color(x)).mean())
+
+    assert error(stained) < 0.3 * error(trusting)
+
+
+# Torch, threads, files
+
+
+def test_torch_differentiates_every_answer(scene: SceneMap):
+    def wanted(x: np.ndarray) -> torch.Tensor:
+        return torch.tensor(x, dtype=torch.float32, requires_grad=True)
+
+    near = near_surface(6000)
+    near = near[~scene.query(near).unknown]
+    beside, on = (np.abs(signed_distance(near)) > 0.02), np.abs(signed_distance(near)) < 0.004
+    x = wanted(near[beside])
+    sample = scene.query(x)
+    (by_torch,) = torch.autograd.grad(sample.distance.sum(), x)
+    # The one is of the trilinear interpolant, the other its smoothed gradient.
+    assert (by_torch - sample.gradient).norm(dim=1).median() < 0.2
+    assert (by_torch * sample.gradient).sum(1).median() > 0.97
+    x = wanted(near[on])
+    sample = scene.query(x)
+    (of_color,) = torch.autograd.grad(sample.color.sum(), x)
+    assert (of_color.norm(dim=1) > 1).float().mean() > 0.9
+    (of_occupancy,) = torch.autograd.grad(sample.occupancy.sum(), x)
+    step = 1e-4 * torch.nn.functional.normalize(of_occupancy, dim=1)
+    with torch.no_grad():
+        rise = scene.query(x + step).occupancy - sample.occupancy
+    steep = of_occupancy.norm(dim=1) > 10
+    assert steep.sum() > 50
+    assert (rise[steep] / 1e-4 / of_occupancy.norm(dim=1)[steep]).median() == pytest.approx(1, abs=0.1)
+
+
+def test_arrays_and_tensors_get_the_same_answers(scene: SceneMap):
+    x = uniform(1000)
+    array, tensor = scene.query(x), scene.query(torch.tensor(x, dtype=torch.float32))
+    assert isinstance(array.distance, np.ndarray)
+    assert np.array_equal(array.distance, tensor.distance.numpy(), equal_nan=True)
+    assert np.array_equal(array.occupancy, tensor.occupancy.numpy())
+
+
+def test_eight_threads_get_the_answers_of_one(cloud: PointCloud, scene: SceneMap, tmp_path: Path):
+    x = uniform(50_000)
+    alone = scene.query(x, unknown="occupied")
+    expected = alone.occupancy, alone.distance, alone.label, scene.check_spheres(x, 0.02)
+    scene.save(tmp_path / "map.safetensors")
+    fresh = load_map(tmp_path)  # nothing is cached yet, so that all threads ask for the distances at once
+
+    def ask(_: int) -> tuple[np.ndarray, ...]:
+        sample = fresh.query(x, unknown="occupied")
+        return sample.occupancy, sample.distance, sample.label, fresh.check_spheres(x, 0.02)
+
+    with ThreadPoolExecutor(8) as pool:
+        for answers in pool.map(ask, range(16)):
+            for answer, right in zip(answers, expected, strict=True):
+                assert np.array_equal(answer, right, equal_nan=True)
+
+
+def test_a_loaded_map_answers_as_the_saved_one(scene: SceneMap, tmp_path: Path):
+    scene.save(tmp_path / "map.safetensors")
+    again = load_map(tmp_path)
+    x = np.concatenate([uniform(20_000), OUTSIDE[None]])
+    a, b = scene.query(x), again.query(x)
+    for name in ("occupancy", "unknown", "distance", "gradient", "color", "label"):
+        assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True), name
+    assert np.array_equal(a.values["warmth"], b.values["warmth"], equal_nan=True)
+    assert again.label_names == scene.label_names
+    assert np.array_equal(again.box, scene.box)
+    assert again.history == scene.history
+
+
+def test_the_same_seed_gives_the_same_map(cloud: PointCloud, scene: SceneMap):
+    again = build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
+    x = uniform(20_000)
+    assert np.array_equal(scene.query(x).occupancy, again.query(x).occupancy)
+    assert np.array_equal(scene.query(x).color, again.query(x).color)
+    other = build_scene(cloud, replace(OPTIONS, map_seed=1))
+    assert not np.array_equal(scene.query(x).occupancy, other.query(x).occupancy)
+
+
+def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud):
+    shift = np.array([0.5, -0.25, 1.0])
+    moved = replace(
+        cloud,
+        points_in_base=cloud.points_in_base + shift,
+        camera_centers_in_base=cloud.camera_centers_in_base + shift,
+    )
+    there = replace(OPTIONS, workspace=tuple(np.add(WORKSPACE, np.tile(shift, 2)).tolist()))
+    x = near_surface(20_000)
+    here_at, there_at = build_scene(cloud, OPTIONS).query(x), build_scene(moved, there).query(x + shift)
+    assert (here_at.unknown == there_at.unknown).mean() > 0.995
+    assert np.median(np.abs(here_at.distance - there_at.distance)) < 0.0005
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (np.zeros(3), r"\(n, 3\)"),
+        (np.zeros((4, 2)), r"\(n, 3\)"),
+        (np.array([[0.0, 0, 0], [0, np.nan, 0]]), "row 1 is not finite"),
+        (np.array([[np.inf, 0, 0]]), "row 0 is not finite"),
+    ],
+)
+def test_points_that_are_none_are_refused(scene: SceneMap, points: np.ndarray, says: str):
+    # Past the shape checks of the test run, as a user's call comes.
+    with pytest.raises(InputError, match=says):
+        scene._points(points, "points")
+
+
+def test_questions_that_make_no_sense_are_refused(scene: SceneMap):
+    with pytest.raises(InputError, match="negative"):
+        scene.check_spheres(np.zeros((2, 3)), np.array([0.1, -0.1]))
+    with pytest.raises(InputError, match="does not fit"):
+        scene.check_spheres(np.zeros((2, 3)), np.zeros(3))
+    with pytest.raises(InputError, match="not finite"):
+        scene.check_spheres(np.full((2, 3), np.nan), 0.1)
+    with pytest.raises(InputError, match="not finite"):
+        scene.check_segments(np.zeros((1, 3)), np.full((1, 3), np.inf), 0.1)
+
+
+def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
+    broken = cloud.points_in_base.copy()
+    broken[7, 1] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        build_scene(replace(cloud, points_in_base=broken), OPTIONS)
+    with pytest.raises(InputError, match="not finite"):
+        build_scene(replace(cloud, points_in_base=broken))
+    with pytest.raises(InputError, match="points lie in the workspace"):
+        build_scene(cloud, replace(OPTIONS, workspace=(3.0, 3.0, 3.0, 4.0, 4.0, 4.0)))
+    with pytest.raises(InputError, match="minimum below"):
+        build_scene(cloud, replace(OPTIONS, workspace=(0.4, -0.4, 0.0, -0.4, 0.4, 0.6)))
+    with pytest.raises(InputError, match="one finite row per point"):
+        build_scene(cloud, OPTIONS, values={"warmth": np.full((len(broken), 1), np.nan)})
+
+
+def test_damaged_and_foreign_map_files_are_named(scene: SceneMap, tmp_path: Path):
+    path = tmp_path / "map.safetensors"
+    with pytest.raises(InputError, match="no map here"):
+        load_map(tmp_path)
+    scene.save(path)
+    whole = path.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"", b"\x00" * 100, whole[:2000]):
+        path.write_bytes(damage)
+        with pytest.raises(InputError, match="damaged"):
+            load_map(tmp_path)
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.zeros(2)}, path)
+    with pytest.raises(InputError, match="no map of jcr"):
+        load_map(tmp_path)
+    save_file({"a": torch.zeros(2)}, path, metadata={"format": "jcr.map/1", "about": json.dumps({})})
+    with pytest.raises(InputError, match="damaged"):
+        load_map(tmp_path)
