@@ -80,6 +80,8 @@ class Reconstruction:
     tracks: Tracks
     backend: str
     is_metric: bool = False
+    metric_std: float | None = None
+    """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
     notes: tuple[str, ...] = ()
     """What the user should know: images not registered, distortion dropped."""
 

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.calibrate.bundle import Adjusted, adjust, lens_of, median_reprojection
 from jcr.calibrate.conventions import better_reading, explained
-from jcr.calibrate.cues import height_cue, length_cue
+from jcr.calibrate.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibrate.hand_eye import judged, solve_hand_eye
 from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
 from jcr.calibrate.residuals import paper_residuals
@@ -50,8 +50,15 @@ def calibrate(
     if options.robot_noise is not None:
         noise = (options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1])))
     cues = _cues(capture, reconstruction, options)
+    contradiction = None
+    if cues is None and (metric_std := reconstruction.metric_std) is not None:
+        free = solve_hand_eye(gripper, camera, robot_noise=noise)
+        contradiction = scale_contradiction(free, metric_std)
+        cues = Cues(scale=(1.0, metric_std))
     hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues)
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
+    if contradiction is not None:
+        return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     used = hand_eye.inliers

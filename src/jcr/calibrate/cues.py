@@ -8,12 +8,14 @@ from numpy import ndarray
 from jcr.calibrate.pose_fit import Poses
 from jcr.errors import InputError
 from jcr.geometry import rotation_angle
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, HandEye, Reconstruction
 
 LENGTH_STD = 0.01
 """Relative: a pixel's breadth at either end of a length of a hundred pixels."""
 HEIGHT_STD = 1e-3
 """m, of a ruler held to a lens."""
+CONTRADICTED = (4.0, 0.02)
+"""Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
 ONE_AXIS = np.radians(6)
 """Planar motion keeps its axis within this, on average."""
 
@@ -62,3 +64,22 @@ def length_cue(
         )
     first, second = reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
     return length / float(np.linalg.norm(second - first)), LENGTH_STD
+
+
+def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
+    """What to tell the user where the robot's motion excludes that the reconstruction is in metres.
+
+    `free` is a calibration that was not told so; `metric_std` is how well the metre is known (relative one
+    sigma).
+    """
+    if not free.converged:
+        return None
+    off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
+    sigmas, share = CONTRADICTED
+    if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
+        return None
+    return (
+        f"by the robot's motion the board is {100 * abs(np.expm1(off)):.1f} ± {100 * std:.1f} % "
+        f"{'larger' if off > 0 else 'smaller'} than told; measure its squares, and check that the gripper poses "
+        "are in metres"
+    )

@@ -15,7 +15,7 @@ from jcr.progress import Progress
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import Capture, Reconstruction
 
-BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "predictions"]
+BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "marker", "predictions"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,9 @@ class ReconstructOptions:
     """Path or hub id of a network's weights, unset: the published ones; for predictions the npz file."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
     """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    board: str | None = None
+    """The board or tags that marker looks for, lengths in metres: charuco:7x5:0.030:0.022:DICT_4X4_50,
+    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     memory_gb: float = 8.0
     """Memory that dust3r and mast3r may take."""
 
@@ -67,6 +70,7 @@ BACKENDS = {
         Backend(
             "mapanything", CHECKPOINTS["mapanything"].licence, True, "jcr.reconstruct.backends:_mapanything"
         ),
+        Backend("marker", "Apache-2.0", True, "jcr.reconstruct.backends:_marker"),
         Backend("predictions", "your network's", False, "jcr.reconstruct.backends:_predictions", True),
     )
 }
@@ -116,6 +120,8 @@ def chosen(options: ReconstructOptions) -> str:
     """The name of the back end that `auto` stands for here, or the one that was asked for."""
     if options.backend != "auto":
         return options.backend
+    if options.board is not None:
+        return "marker"
     if options.weights is None:
         return "colmap"
     return "predictions" if options.weights.endswith(".npz") else "dust3r"
@@ -152,6 +158,14 @@ def _mapanything(capture: Capture, options: ReconstructOptions, progress: Progre
 
     weights = options.weights or CHECKPOINTS["mapanything"].hub_id
     return reconstruct(capture, MapAnythingOptions(weights, device_of(options)), progress)
+
+
+def _marker(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.marker import MarkerOptions, reconstruct
+
+    if options.board is None:
+        raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
+    return reconstruct(capture, MarkerOptions(options.board, device=device_of(options)), progress)
 
 
 def _predictions(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:

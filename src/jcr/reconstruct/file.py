@@ -21,6 +21,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "format": FORMAT,
         "backend": reconstruction.backend,
         "is_metric": reconstruction.is_metric,
+        "metric_std": reconstruction.metric_std,
         "notes": list(reconstruction.notes),
         "intrinsics": asdict(reconstruction.intrinsics),
         "pointmap_intrinsics": asdict(reconstruction.pointmap_intrinsics),
@@ -65,6 +66,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 ),
                 backend=about["backend"],
                 is_metric=about["is_metric"],
+                metric_std=about["metric_std"],
                 notes=tuple(about["notes"]),
             )
     except FileNotFoundError:

@@ -13,6 +13,8 @@ from numpy import ndarray
 
 from jcr.records import Intrinsics
 
+WITHIN_FOLD = 0.9
+"""Share of the distance at which a distortion folds over, up to which its inverse is used."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 _WIDEST_TANGENT = 10.0
 """Rays farther than 84° from the optical axis are beyond this model."""
@@ -116,10 +118,19 @@ def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:
 
 
 def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
-    """The largest undistorted pinhole grid whose every pixel lies in the frame, its long side as asked."""
-    u, v = np.linspace(-0.5, lens.width - 0.5, 100), np.linspace(-0.5, lens.height - 0.5, 100)
-    left, right = (undistort(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (-0.5, lens.width - 0.5))
-    top, bottom = (undistort(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (-0.5, lens.height - 0.5))
+    """The largest undistorted pinhole grid whose every pixel lies in the frame, its long side as asked.
+
+    Of a distortion that folds over, what lies within the fold: a rectangle of the frame's shape.
+    """
+    corners = np.array([[-0.5, -0.5], [lens.width - 0.5, lens.height - 0.5]])
+    if (fold_px := fold_distance_px(lens)) is not None:
+        centre, half = np.array([lens.cx, lens.cy]), np.array([lens.width, lens.height]) / 2
+        reach = WITHIN_FOLD * fold_px * half / np.linalg.norm(half)
+        corners = np.clip(np.stack([centre - reach, centre + reach]), *corners)
+    (u0, v0), (u1, v1) = corners
+    u, v = np.linspace(u0, u1, 100), np.linspace(v0, v1, 100)
+    left, right = (undistort(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
+    top, bottom = (undistort(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
     x0, x1 = float(left.max()), float(right.min())
     y0, y1 = float(top.max()), float(bottom.min())
     scale = long_side_px / max((x1 - x0) * lens.fx, (y1 - y0) * lens.fy)

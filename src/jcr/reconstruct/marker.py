@@ -1,0 +1,278 @@
+"""The marker back end: metric camera poses from a board or tags of known size, for those who have one.
+
+Pose of a plane from its points: IPPE (Collins and Bartoli, IJCV 2014), then least squares in pixels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.optimize import least_squares
+
+from jcr.capture.images import read_image
+from jcr.errors import NotTrustedError
+from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, rotation_log, transform
+from jcr.progress import Progress
+from jcr.reconstruct.board import Board, Sighting, boards, most_seen
+from jcr.reconstruct.lens import WITHIN_FOLD, fold_distance_px, pinhole_inside, undistort_image
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+
+PRINTED = 0.002
+"""Relative one-sigma error of a printed board's size."""
+FEWEST_POINTS = 4
+WORST_PX = 3.0
+"""A board whose points miss by more (rms) is bent, or no such board."""
+AMBIGUOUS = 1.5
+"""A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
+LENS_IMAGES = 4
+"""Fewest images of a board that determine a lens."""
+REACH = 0.4
+"""Share of a camera's distance to the board that things beside it may rise towards the camera."""
+
+
+@dataclass(frozen=True)
+class MarkerOptions:
+    """Camera poses from a board."""
+
+    board: str
+    """What to look for, as `board.KINDS` has it."""
+    pointmap_size_px: int = 400
+    """Long side of the dense pointmaps."""
+    neighbours: int = 5
+    """Other images that each is compared with for its pointmap."""
+    dense: bool = True
+    """Off: cameras alone, with pointmaps of no confidence."""
+    device: str = "cpu"
+    """Where the plane sweep runs: cpu or cuda."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Of one body in one image."""
+
+    camera_from_body: Float[ndarray, "4 4"]
+    rms_px: float
+
+
+def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | None = None) -> Reconstruction:
+    """Cameras and pointmaps in metres; the recon frame is the board's, or that of the tag seen most often.
+
+    Unknown intrinsics are calibrated from the board. Raises InputError for a board that is none, and
+    NotTrustedError when fewer than three images show it.
+    """
+    report = progress or (lambda stage, fraction: None)
+    readings = boards(options.board)
+    images = [read_image(capture.folder / name) for name in capture.images]
+    report("board", 0.0)
+    board, seen = most_seen(readings, images)
+    report("board", 1.0)
+    seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
+    notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
+    lens, lens_notes = _lens(capture, board, seen)
+    notes += lens_notes
+    if (fold_px := fold_distance_px(lens)) is not None:
+        seen = [_within(sightings, lens, fold_px) for sightings in seen]
+        notes.append(
+            f"the lens distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used"
+        )
+    poses = [{s.body: pose for s in sightings if (pose := _pose(s, lens))} for sightings in seen]
+    recon_from_camera, recon_from_body = _placed(poses)
+    rows = np.array(sorted(recon_from_camera), dtype=int)
+    if len(rows) < 3:
+        raise NotTrustedError(
+            f"{len(rows)} of {len(capture)} images show {options.board} well enough; check its size and kind, "
+            "that it lies flat and wholly in view, or use a back end that needs no marker"
+        )
+    if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
+        notes.append(f"the board is not seen, or not sharply, in {', '.join(missing)}")
+    sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
+    cameras = np.stack([recon_from_camera[row] for row in rows])
+    if len(recon_from_body) > 1:
+        cameras, recon_from_body = _refined(cameras, recon_from_body, sightings, lens)
+    tracks = _tracks(sightings, recon_from_body)
+    pinhole = pinhole_inside(lens, options.pointmap_size_px)
+    colors = np.stack([undistort_image(images[row], lens, pinhole) for row in rows])
+    points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
+    if options.dense:
+        from jcr.reconstruct.dense import dense_pointmaps
+        from jcr.reconstruct.views import choose_neighbours, sweep_planes
+
+        points, confidence = dense_pointmaps(
+            colors,
+            cameras,
+            pinhole,
+            choose_neighbours(tracks, cameras, options.neighbours),
+            sweep_planes(_raised(tracks, cameras), cameras, count=96),
+            options.device,
+            report,
+        )
+    return Reconstruction(
+        image_index=rows,
+        recon_from_camera=cameras,
+        intrinsics=lens,
+        pointmap_intrinsics=pinhole,
+        points_in_recon=points,
+        confidence=confidence,
+        colors=colors,
+        tracks=tracks,
+        backend="marker",
+        is_metric=True,
+        metric_std=PRINTED,
+        notes=tuple(notes),
+    )
+
+
+def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) -> tuple[Intrinsics, list[str]]:
+    """The given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
+    if capture.intrinsics is not None:
+        return capture.intrinsics, []
+    shown = [s for sightings in seen for s in sightings]
+    images = sum(map(bool, seen))
+    if images < LENS_IMAGES:
+        raise NotTrustedError(
+            f"{images} of {len(capture)} images show {board.name}, {LENS_IMAGES} are needed to find the unknown "
+            "lens from it; check the board's kind and size, or give the intrinsics"
+        )
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+    rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
+        [s.x_in_body.astype(np.float32) for s in shown],
+        [s.x_px.astype(np.float32) for s in shown],
+        capture.image_size,
+        np.eye(3),
+        np.zeros(5),
+        flags=flags,
+    )
+    (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
+    k1, k2 = (float(k) for k in distortion.ravel()[:2])
+    lens = Intrinsics(
+        float(fx), float(fy), float(cx), float(cy), *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)
+    )
+    return lens, [f"the lens comes from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"]
+
+
+def _within(sightings: Sequence[Sighting], lens: Intrinsics, fold_px: float) -> list[Sighting]:
+    """The sightings whose points all lie where the distortion has an inverse."""
+    centre, limit_px = np.array([lens.cx, lens.cy]), WITHIN_FOLD * fold_px
+    return [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
+
+
+def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
+    """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
+    x, x_px = sighting.x_in_body, sighting.x_px
+    if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
+        return None
+    camera = lens.matrix, np.array(lens.distortion)
+    count, rotations, translations, _ = cv2.solvePnPGeneric(x, x_px, *camera, flags=cv2.SOLVEPNP_IPPE)
+    found = []
+    for k in range(count):
+        turn, shift = cv2.solvePnPRefineLM(x, x_px, *camera, rotations[k], translations[k])
+        missed = cv2.projectPoints(x, turn, shift, *camera)[0].reshape(-1, 2) - x_px
+        pose = transform(rotation_exp(turn.ravel()), shift.ravel())
+        found.append(Pose(pose, float(np.sqrt((missed**2).sum(1).mean()))))
+    found.sort(key=lambda pose: pose.rms_px)
+    if not found or found[0].rms_px > WORST_PX:
+        return None
+    for other in found[1:]:
+        apart_deg = float(
+            rotation_between_deg(found[0].camera_from_body[:3, :3], other.camera_from_body[:3, :3])
+        )
+        if apart_deg > 5 and other.rms_px < AMBIGUOUS * found[0].rms_px + 0.05:
+            return None
+    return found[0]
+
+
+def _placed(
+    poses: Sequence[dict[int, Pose]],
+) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
+    """Cameras by row and bodies by number in one frame, chained from the body seen most often.
+
+    A camera is placed by the body that it sees best, a body by the camera that sees it best.
+    """
+    counts: dict[int, int] = {}
+    for bodies in poses:
+        for body in bodies:
+            counts[body] = counts.get(body, 0) + 1
+    cameras: dict[int, Float[ndarray, "4 4"]] = {}
+    if not counts:
+        return cameras, {}
+    placed = {max(sorted(counts), key=lambda body: counts[body]): np.eye(4)}
+    while True:
+        new = [
+            row for row, bodies in enumerate(poses) if row not in cameras and bodies.keys() & placed.keys()
+        ]
+        if not new:
+            return cameras, placed
+        for row in new:
+            body = min(poses[row].keys() & placed.keys(), key=lambda b: poses[row][b].rms_px)
+            cameras[row] = placed[body] @ inverse(poses[row][body].camera_from_body)
+        for body in counts.keys() - placed.keys():
+            seers = [row for row in cameras if body in poses[row]]
+            if seers:
+                row = min(seers, key=lambda r: poses[r][body].rms_px)
+                placed[body] = cameras[row] @ poses[row][body].camera_from_body
+
+
+def _refined(
+    cameras: Float[ndarray, "m 4 4"],
+    bodies: dict[int, Float[ndarray, "4 4"]],
+    sightings: Sequence[Sequence[Sighting]],
+    lens: Intrinsics,
+) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
+    """All cameras and bodies adjusted to all points at once; the first body stays."""
+    numbers = list(bodies)
+    moving = {body: len(cameras) + k for k, body in enumerate(numbers[1:])}
+    camera = lens.matrix, np.array(lens.distortion)
+
+    def posed(unknowns: Float[ndarray, " u"]) -> tuple[ndarray, dict[int, ndarray]]:
+        step = unknowns.reshape(-1, 6)
+        start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers[1:]])])
+        moved = transform(start[:, :3, :3] @ rotation_exp(step[:, 3:]), start[:, :3, 3] + step[:, :3])
+        placed = {body: moved[row] for body, row in moving.items()}
+        return moved[: len(cameras)], {numbers[0]: bodies[numbers[0]]} | placed
+
+    def missed(unknowns: Float[ndarray, " u"]) -> Float[ndarray, " r"]:
+        recon_from_camera, recon_from_body = posed(unknowns)
+        residual = []
+        for camera_from_recon, shown in zip(inverse(recon_from_camera), sightings, strict=True):
+            for s in shown:
+                camera_from_body = camera_from_recon @ recon_from_body[s.body]
+                turn = rotation_log(camera_from_body[:3, :3])
+                x_px = cv2.projectPoints(s.x_in_body, turn, camera_from_body[:3, 3], *camera)[0]
+                residual.append((x_px.reshape(-1, 2) - s.x_px).ravel())
+        return np.concatenate(residual)
+
+    unknowns = 6 * (len(cameras) + len(moving))
+    return posed(least_squares(missed, np.zeros(unknowns), loss="soft_l1", x_scale="jac", max_nfev=30).x)
+
+
+def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:
+    place: dict[tuple[int, int], int] = {}
+    points, image, x_px, point = [], [], [], []
+    for row, shown in enumerate(sightings):
+        for s in shown:
+            x_in_recon = apply(bodies[s.body], s.x_in_body)
+            for k, index in enumerate(s.index):
+                if (s.body, index) not in place:
+                    place[s.body, index] = len(points)
+                    points.append(x_in_recon[k])
+                image.append(row)
+                x_px.append(s.x_px[k])
+                point.append(place[s.body, index])
+    return Tracks(np.array(image), np.array(x_px), np.array(point), np.array(points))
+
+
+def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
+    """The points, and the same ones as near to the cameras as things beside the board may come."""
+    on_board = tracks.points_in_recon
+    middle = recon_from_camera[:, :3, 3].mean(0)
+    raised = on_board + REACH * (middle - on_board)
+    return replace(
+        tracks,
+        image=np.tile(tracks.image, 2),
+        x_px=np.tile(tracks.x_px, (2, 1)),
+        point=np.concatenate([tracks.point, tracks.point + len(on_board)]),
+        points_in_recon=np.concatenate([on_board, raised]),
+    )
