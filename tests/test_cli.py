@@ -18,16 +18,6 @@ def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **options)
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """The bundled capture, run once."""
-    out = tmp_path_factory.mktemp("run") / "tabletop"
-    finished = run_jcr("run", tabletop, out, "--quiet")
-    assert finished.returncode == 0, finished.stderr
-    assert "report:" in finished.stdout
-    return out
-
-
 def test_the_bundled_capture_is_calibrated_to_a_fraction_of_a_millimetre(done: Path, tabletop: Path):
     compared = run_jcr("compare", done, tabletop, "--json")
     assert compared.returncode == 0

@@ -4,6 +4,8 @@
 Scale never hides in a 4x4: a similarity is a rigid `a_from_b` and a scale that is applied first.
 """
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -104,6 +106,13 @@ def rotation_between_deg(
 ) -> Float[ndarray, "..."] | np.floating:
     """Angle in degrees between two (stacks of) rotations."""
     return np.degrees(rotation_angle(np.swapaxes(a, -1, -2) @ b))
+
+
+def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
+    """Roll, pitch, yaw (rad) about the fixed axes x, y, z: R = Rz(yaw)·Ry(pitch)·Rx(roll); at gimbal lock yaw is 0."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of gimbal lock, where any of the equal answers will do
+        return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
 def require_rigid(matrix: Float[ndarray, "4 4"], where: str) -> Float[ndarray, "4 4"]:

@@ -104,11 +104,9 @@ def build_map(
     progress: Progress | None = None,
 ) -> RunResult:
     """Cloud, map and report again, from the capture and the calibration that the run folder `out` names."""
+    capture = read_capture_of(out)
     state = _read_state(Path(out))
-    if "capture" not in state:
-        raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
     with _run_folder(Path(out)) as folder:
-        capture = read_capture(state["capture"])
         options = RunOptions(
             ReconstructOptions(**state["options"]["reconstruct"]),
             CalibrateOptions(**state["options"]["calibrate"]),
@@ -119,6 +117,14 @@ def build_map(
         result = _map(capture, folder, options, result, progress)
         _report(capture, result)
         return result
+
+
+def read_capture_of(out: str | Path) -> Capture:
+    """The capture that a run folder was made from; InputError where there is no run, or no such capture any more."""
+    state = _read_state(Path(out))
+    if "capture" not in state:
+        raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
+    return read_capture(state["capture"])
 
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:

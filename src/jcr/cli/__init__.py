@@ -24,6 +24,7 @@ COMMANDS = {
     "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
+    "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
     "compare": "difference of two calibrations in mm and degrees",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README",

@@ -94,7 +94,7 @@ def _extract(
     width, height = lenses[0].width, lenses[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
-    cameras = [_camera_of(resized(lens, *size), known) for lens in lenses]
+    cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
     names = [f"{row:05d}.png" for row in range(len(images))]
     # Images are entered beforehand: extraction threads would number them in the order in which they finish.
     with closing(pycolmap.Database.open(database)) as db:
@@ -218,7 +218,7 @@ def _tracks(model: pycolmap.Reconstruction, rows: list[int], lens: Intrinsics) -
     )
 
 
-def _camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
+def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     """COLMAP's one camera: the given lens, or a focal length and two radial coefficients to refine."""
     centre = [lens.cx + _HALF_PIXEL, lens.cy + _HALF_PIXEL]
     if not known:
@@ -233,7 +233,7 @@ def _camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
 
 
 def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
-    """Of a camera that `_camera_of` made for an unknown lens; in images of the size of `like`."""
+    """Of a camera that `camera_of` made for an unknown lens; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
     centre = cx - _HALF_PIXEL, cy - _HALF_PIXEL

@@ -5,7 +5,6 @@ n(R) has the covariance J C Jᵀ with J = dn/dr at r = 0.
 """
 
 import json
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import skew
+from jcr.geometry import roll_pitch_yaw, skew
 
 GIMBAL_LOCK = np.radians(89.9)
 """Pitch beyond which roll and yaw turn about nearly the same axis."""
@@ -63,31 +62,6 @@ def notations(
 def matrix_json(a_from_b: Float[ndarray, "4 4"]) -> str:
     """The matrix as nested lists, which Python, NumPy, JSON and YAML read, with every digit."""
     return "[" + ",\n ".join(json.dumps(row) for row in a_from_b.tolist()) + "]"
-
-
-def static_transform_publisher(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> str:
-    """The ROS 2 command that publishes the transform."""
-    x, y, z = parent_from_child[:3, 3]
-    qx, qy, qz, qw = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat(canonical=True)
-    return (
-        f"ros2 run tf2_ros static_transform_publisher --x {x:.9f} --y {y:.9f} --z {z:.9f} "
-        f"--qx {qx:.9f} --qy {qy:.9f} --qz {qz:.9f} --qw {qw:.9f} "
-        f"--frame-id {parent} --child-frame-id {child}"
-    )
-
-
-def urdf_origin(a_from_b: Float[ndarray, "4 4"]) -> str:
-    """The origin element of a URDF or xacro joint."""
-    xyz = " ".join(f"{x:.9f}" for x in a_from_b[:3, 3])
-    rpy = " ".join(f"{x:.9f}" for x in roll_pitch_yaw(a_from_b[:3, :3]))
-    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
-
-
-def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
-    """Roll, pitch, yaw (rad) about fixed axes; at gimbal lock the yaw is 0."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # at gimbal lock, which `notations` tells the reader instead
-        return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
 def quaternion_jacobian(quat_xyzw: Float[ndarray, "4"]) -> Float[ndarray, "4 3"]:

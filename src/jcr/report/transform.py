@@ -3,18 +3,10 @@
 import json
 from html import escape
 
+from jcr.export.ros import CHILD, PARENT, static_transform_publisher, urdf_origin
 from jcr.records import HandEye
 from jcr.report.markup import filled, significant
-from jcr.report.notations import (
-    Notation,
-    matrix_json,
-    notations,
-    static_transform_publisher,
-    urdf_origin,
-)
-
-PARENT, CHILD = "tool0", "camera_color_optical_frame"
-"""Frame names of the ROS line, where the reader puts their own."""
+from jcr.report.notations import Notation, matrix_json, notations
 
 
 def transform_section(hand_eye: HandEye) -> str:

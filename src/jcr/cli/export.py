@@ -1,0 +1,310 @@
+"""`jcr export`: a run's calibration and map in the formats of other tools."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import tyro
+from scipy.spatial.transform import Rotation
+
+from jcr.errors import InputError
+from jcr.export import ros
+from jcr.export.provenance import Provenance
+from jcr.files import write_text
+from jcr.geometry import transform
+
+if TYPE_CHECKING:
+    from jcr.calibrate.file import CalibrationFile
+    from jcr.export.views import PosedImages
+    from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
+    from jcr.represent.scene import SceneMap
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
+
+    Frames and units are named in every file. Map, images and cameras are in the robot's base frame, metres.
+
+    examples:
+      jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
+      jcr export out/table urdf --to-root camera_link
+      jcr export out/table octomap table.bt --voxel-size 0.02
+      jcr export out/table nerfstudio splat/ --undistort
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    format: Annotated[str | None, tyro.conf.Positional] = None
+    """ros2, moveit, urdf, xacro, easy_handeye2, covariance, camera_info, ply, glb, octomap, esdf, spheres, nerfstudio,
+    colmap or rerun."""
+    path: Annotated[Path | None, tyro.conf.Positional] = None
+    """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
+    parent_frame: str = "tool0"
+    """The gripper frame whose poses the capture has."""
+    child_frame: str = "camera_color_optical_frame"
+    """The camera's optical frame: x right, y down, z forward."""
+    base_frame: str = "base_link"
+    """The robot's base, the frame of everything mapped."""
+    to_root: str | None = None
+    """Give the transform of this link instead, from which the camera's other frames hang (e.g. camera_link)."""
+    root_from_optical: tuple[float, float, float, float, float, float, float] | None = None
+    """Of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL` prints
+    it; by default they share their origin and are turned as REP-103 has it."""
+    voxel_size: float | None = None
+    """Metres, for octomap and esdf; by default the map's cell."""
+    unknown: Literal["occupied", "free"] | None = None
+    """How places count that nobody has seen: by default as occupied in esdf, as free (left out) in spheres."""
+    excess: float | None = None
+    """Metres by which spheres may reach into free space; by default two cells of the map."""
+    undistort: bool = False
+    """Resample the images of nerfstudio and colmap to a pinhole camera."""
+    link_images: bool = False
+    """Link to the capture's images instead of copying them."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row of the table."""
+
+    name: str
+    file: str
+    """In OUT/export, where the user names none; ends with / for a folder."""
+    about: str
+    write: Callable[["Run", Path], None]
+
+
+def main(arguments: Arguments) -> int:
+    """Write the file, say where, and warn where the calibration is not to be trusted: exit status 0 or 3."""
+    formats = {row.name: row for row in FORMATS}
+    if arguments.format not in formats:
+        wrong = "no format is named" if arguments.format is None else f"{arguments.format!r} is no format"
+        listed = "; ".join(f"{row.name} ({row.about})" for row in FORMATS)
+        raise InputError(f"{wrong}; take one of: {listed}")
+    row = formats[arguments.format]
+    if arguments.root_from_optical and not arguments.to_root:
+        raise InputError("--root-from-optical: needs --to-root LINK, the link it is told in")
+    run = Run(arguments)
+    path = arguments.path or arguments.out / "export" / row.file
+    if path.is_dir() and not row.file.endswith("/"):
+        raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    row.write(run, path)
+    sys.stderr.write(f"wrote {path}: {row.about}\n")
+    if run.doubt is not None:
+        sys.stderr.write(f"error: not to be trusted, and the file says so: {run.doubt}\n")
+        return 3
+    return 0
+
+
+class Run:
+    """A run folder and how to export it; what a format does not need is not read."""
+
+    def __init__(self, arguments: Arguments) -> None:
+        self.arguments = arguments
+        if self.calibration.gripper_from_camera is None:
+            why = self.calibration.warnings[0]
+            raise InputError(
+                f"{arguments.out}: found no calibration to export ({why}); run it on a mended capture"
+            )
+
+    @cached_property
+    def calibration(self) -> "CalibrationFile":
+        """calibration.json."""
+        from jcr.calibrate.file import read_calibration
+
+        return read_calibration(self.arguments.out)
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the calibration is not to be trusted; None when it is."""
+        return None if self.calibration.converged else self.calibration.warnings[0]
+
+    @property
+    def provenance(self) -> Provenance:
+        """Of what is in the base frame."""
+        ros.require_frame_name(self.arguments.base_frame)
+        return Provenance(self.arguments.base_frame, self.doubt)
+
+    @property
+    def mount(self) -> ros.CameraMount:
+        """The camera on the gripper, as the user wants its frames."""
+        arguments, uncertainty = self.arguments, self.calibration.uncertainty
+        assert uncertainty is not None  # wherever there is a transform
+        mount = ros.camera_mount(
+            np.array(self.calibration.gripper_from_camera),
+            np.array(uncertainty.covariance),
+            arguments.parent_frame,
+            arguments.child_frame,
+            arguments.base_frame,
+            self.doubt,
+        )
+        if arguments.to_root is None:
+            return mount
+        if arguments.root_from_optical is None:
+            return ros.on_root(mount, arguments.to_root)
+        x, y, z, *quat_xyzw = arguments.root_from_optical
+        length = float(np.linalg.norm(quat_xyzw))
+        if not abs(length - 1) < 1e-2 or not np.isfinite([x, y, z]).all():
+            raise InputError(
+                f"--root-from-optical: its quaternion has length {length:.3g}, not 1; give x y z (m) qx qy qz qw"
+            )
+        rotation = Rotation.from_quat(quat_xyzw).as_matrix()
+        return ros.on_root(mount, arguments.to_root, transform(rotation, np.array([x, y, z])))
+
+    @property
+    def lens(self) -> "Intrinsics":
+        """As calibrated."""
+        from jcr.records import Intrinsics
+
+        lens = self.calibration.intrinsics
+        assert lens is not None  # wherever images were reconstructed
+        k1, k2, p1, p2, k3 = lens.distortion
+        return Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, (k1, k2, p1, p2, k3))
+
+    @cached_property
+    def scene(self) -> "SceneMap":
+        """map.safetensors."""
+        from jcr.represent.scene import load_map
+
+        return load_map(self.arguments.out)
+
+    @cached_property
+    def cloud(self) -> "PointCloud":
+        """cloud.ply."""
+        from jcr.export.points import read_cloud
+
+        return read_cloud(self.arguments.out / "cloud.ply")
+
+    @cached_property
+    def capture(self) -> "Capture":
+        """The images and poses the run was made from."""
+        from jcr.pipeline import read_capture_of
+
+        return read_capture_of(self.arguments.out)
+
+    @cached_property
+    def reconstruction(self) -> "Reconstruction":
+        """reconstruction.npz."""
+        from jcr.reconstruct.file import read_reconstruction
+
+        return read_reconstruction(self.arguments.out / "reconstruction.npz")
+
+    @property
+    def views(self) -> "PosedImages":
+        """The registered images in the base frame."""
+        from jcr.export.views import posed_images
+
+        scale = self.calibration.scale
+        assert scale is not None  # wherever there is a transform
+        base_from_recon = np.array(self.calibration.base_from_recon)
+        return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
+
+
+def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
+    """The format whose file is that text about the camera on the gripper."""
+    return lambda run, path: write_text(path, text(run.mount))
+
+
+def _ros2(run: Run, path: Path) -> None:
+    mount = run.mount
+    write_text(path, ros.ros2_launch(mount))
+    sys.stdout.write(
+        ros.static_transform_publisher(mount.parent, mount.child, mount.parent_from_child) + "\n"
+    )
+
+
+def _easy_handeye2(run: Run, path: Path) -> None:
+    write_text(path, ros.easy_handeye2(run.mount, path.stem))
+
+
+def _camera_info(run: Run, path: Path) -> None:
+    write_text(path, ros.camera_info(run.mount, run.lens))
+
+
+def _ply(run: Run, path: Path) -> None:
+    from jcr.export.points import write_cloud
+
+    write_cloud(path, run.cloud, run.provenance)
+
+
+def _glb(run: Run, path: Path) -> None:
+    from jcr.export.mesh import write_glb
+
+    write_glb(path, run.scene, run.provenance)
+
+
+def _octomap(run: Run, path: Path) -> None:
+    from jcr.export.volume import write_octomap
+
+    write_octomap(path, run.scene, run.provenance, run.arguments.voxel_size)
+
+
+def _esdf(run: Run, path: Path) -> None:
+    from jcr.export.volume import write_esdf
+
+    unknown = run.arguments.unknown or "occupied"
+    write_esdf(path, run.scene, run.provenance, unknown, run.arguments.voxel_size)
+
+
+def _spheres(run: Run, path: Path) -> None:
+    from jcr.export.volume import write_spheres
+
+    write_spheres(path, run.scene, run.provenance, run.arguments.unknown or "free", run.arguments.excess)
+
+
+def _nerfstudio(run: Run, path: Path) -> None:
+    from jcr.export.views import write_nerfstudio
+
+    options = run.arguments.undistort, run.arguments.link_images
+    write_nerfstudio(path, run.views, run.cloud, run.provenance, *options)
+
+
+def _colmap(run: Run, path: Path) -> None:
+    from jcr.export.views import write_colmap
+
+    write_colmap(path, run.views, run.provenance, run.arguments.undistort, run.arguments.link_images)
+
+
+def _rerun(run: Run, path: Path) -> None:
+    from jcr.export.rrd import write_rrd
+
+    base_from_gripper = run.capture.base_from_gripper[run.reconstruction.image_index]
+    write_rrd(path, run.views, base_from_gripper, run.cloud, run.scene, run.provenance)
+
+
+FORMATS = (
+    Format("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file", _ros2),
+    Format(
+        "moveit",
+        "hand_eye.launch.py",
+        "launch file as MoveIt Calibration saves it",
+        _of_mount(ros.moveit_launch),
+    ),
+    Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _of_mount(ros.urdf)),
+    Format("xacro", "hand_eye.xacro", "macro that adds the camera link and joint", _of_mount(ros.xacro)),
+    Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
+    Format(
+        "covariance",
+        "hand_eye.yaml",
+        "PoseWithCovarianceStamped, 36 numbers",
+        _of_mount(ros.pose_with_covariance),
+    ),
+    Format("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _camera_info),
+    Format("ply", "cloud.ply", "points, colours, labels", _ply),
+    Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
+    Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),
+    Format("esdf", "esdf.npz", "voxels of signed distance", _esdf),
+    Format("spheres", "spheres.npz", "spheres that cover what is solid", _spheres),
+    Format(
+        "nerfstudio",
+        "nerfstudio/",
+        "transforms.json, images and first points for a splat or NeRF",
+        _nerfstudio,
+    ),
+    Format("colmap", "colmap/", "COLMAP model in the base frame, binary and text", _colmap),
+    Format("rerun", "run.rrd", "recording for the Rerun viewer", _rerun),
+)

@@ -1,0 +1,22 @@
+"""What every exported file says of itself: its frame, its units, and whether to trust it."""
+
+from dataclasses import dataclass
+
+from jcr import __version__
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Of which frame a file's numbers are, and why they are not to be trusted, where they are not."""
+
+    frame: str
+    doubt: str | None = None
+    """The reason the calibration gives; None when it converged."""
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Frame, unit, version, and a warning where there is a doubt: each one line."""
+        about = {"frame": self.frame, "unit": "m", "made_by": f"jcr {__version__}"}
+        if self.doubt is None:
+            return about
+        return about | {"warning": f"NOT TO BE TRUSTED: {' '.join(self.doubt.split())}"}

@@ -1,0 +1,268 @@
+"""The camera's place on the gripper as ROS tools take it: tf2, URDF, xacro, easy_handeye2, MoveIt, camera_info.
+
+Every text names its frames and units, and says so where the calibration is not to be trusted.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr import __version__
+from jcr.errors import InputError
+from jcr.geometry import inverse, roll_pitch_yaw, skew, transform
+from jcr.records import Intrinsics
+
+PARENT, CHILD, BASE = "tool0", "camera_color_optical_frame", "base_link"
+"""Frame names where the user gives none."""
+
+ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
+"""REP-103: the root link has x forward, y left, z up; the optical frame z forward, x right, y down."""
+
+_FRAME_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*")
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """A frame of the camera, fixed on the gripper, under its names in ROS."""
+
+    parent: str
+    child: str
+    parent_from_child: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "6 6"]
+    """As geometry_msgs orders it: x, y, z (m), rotation about x, y, z (rad), all along axes of the parent."""
+    base: str = BASE
+    """The robot's base, for the formats that ask for it."""
+    doubt: str | None = None
+    """Why the calibration is not to be trusted; None when it is."""
+
+
+def camera_mount(
+    gripper_from_camera: Float[ndarray, "4 4"],
+    covariance: Float[ndarray, "7 7"],
+    parent: str = PARENT,
+    child: str = CHILD,
+    base: str = BASE,
+    doubt: str | None = None,
+) -> CameraMount:
+    """The optical frame on the gripper; `covariance` is in `jcr.records.COVARIANCE_ORDER`.
+
+    Raises InputError for names that are none in ROS, and where two frames have the same one.
+    """
+    for name in (parent, child, base):
+        require_frame_name(name)
+    if parent == child:
+        raise InputError(f"parent and child frame are both {parent!r}; name two different frames")
+    return CameraMount(parent, child, gripper_from_camera, covariance[:6, :6], base, doubt)
+
+
+def on_root(
+    mount: CameraMount, root: str, root_from_optical: Float[ndarray, "4 4"] = ROOT_FROM_OPTICAL
+) -> CameraMount:
+    """The mount of the link from which a camera's own frames hang, for a frame can have one parent only.
+
+    parent_from_root = parent_from_optical · inverse(root_from_optical). With q the root's place seen from the
+    optical frame in axes of the parent, the errors (dt, r) move the root by dt + r × q.
+    """
+    require_frame_name(root)
+    if root in (mount.parent, mount.child):
+        raise InputError(f"root frame {root!r}: is the name of another frame; name the camera's root link")
+    optical_from_root = inverse(root_from_optical)
+    q = mount.parent_from_child[:3, :3] @ optical_from_root[:3, 3]
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -skew(q)
+    return CameraMount(
+        mount.parent,
+        root,
+        mount.parent_from_child @ optical_from_root,
+        jacobian @ mount.covariance @ jacobian.T,
+        mount.base,
+        mount.doubt,
+    )
+
+
+def require_frame_name(name: str) -> None:
+    """InputError for what tf2 or XML would not take as a frame's name."""
+    if not _FRAME_NAME.fullmatch(name):
+        raise InputError(f"frame {name!r}: write letters, digits, _ . - and /, and no / in front")
+
+
+def static_transform_publisher(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> str:
+    """The ROS 2 command that publishes the transform."""
+    arguments = _publisher_arguments(parent, child, parent_from_child)
+    return f"ros2 run tf2_ros static_transform_publisher {' '.join(arguments)}"
+
+
+def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
+    """The origin element of a URDF or xacro joint."""
+    xyz, rpy = parent_from_child[:3, 3], roll_pitch_yaw(parent_from_child[:3, :3])
+    return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
+
+
+def ros2_launch(mount: CameraMount) -> str:
+    """A ROS 2 launch file (XML) that publishes the transform."""
+    arguments = " ".join(_publisher_arguments(mount.parent, mount.child, mount.parent_from_child))
+    return f"""<launch>
+{_xml_comment(mount)}
+  <node pkg="tf2_ros" exec="static_transform_publisher" name="hand_eye_publisher" args="{arguments}"/>
+</launch>
+"""
+
+
+def moveit_launch(mount: CameraMount) -> str:
+    """A ROS 2 launch file (Python), laid out as MoveIt Calibration saves its own."""
+    arguments = _publisher_arguments(mount.parent, mount.child, mount.parent_from_child)
+    rows = "\n".join(
+        f'                "{name}", "{value}",'
+        for name, value in zip(arguments[::2], arguments[1::2], strict=True)
+    )
+    return f'''{_comments(mount)}
+"""EYE-IN-HAND: {mount.parent} -> {mount.child}"""
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description() -> LaunchDescription:
+    nodes = [
+        Node(
+            package="tf2_ros",
+            executable="static_transform_publisher",
+            output="log",
+            arguments=[
+{rows}
+            ],
+        ),
+    ]
+    return LaunchDescription(nodes)
+'''
+
+
+def urdf(mount: CameraMount) -> str:
+    """A URDF of the two links and the fixed joint between them."""
+    return f"""<?xml version="1.0"?>
+<robot name="hand_eye">
+{_xml_comment(mount)}
+  <link name="{mount.parent}"/>
+  <link name="{mount.child}"/>
+  <joint name="{mount.child}_joint" type="fixed">
+    <parent link="{mount.parent}"/>
+    <child link="{mount.child}"/>
+    {urdf_origin(mount.parent_from_child)}
+  </joint>
+</robot>
+"""
+
+
+def xacro(mount: CameraMount) -> str:
+    """A xacro macro that adds the camera's link and joint to a robot: <xacro:hand_eye_camera/>."""
+    return f"""<?xml version="1.0"?>
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+{_xml_comment(mount)}
+  <xacro:macro name="hand_eye_camera" params="parent:={mount.parent} child:={mount.child}">
+    <link name="${{child}}"/>
+    <joint name="${{child}}_joint" type="fixed">
+      <parent link="${{parent}}"/>
+      <child link="${{child}}"/>
+      {urdf_origin(mount.parent_from_child)}
+    </joint>
+  </xacro:macro>
+</robot>
+"""
+
+
+def easy_handeye2(mount: CameraMount, name: str) -> str:
+    """A .calib file of easy_handeye2, whose publisher finds it as ~/.ros2/easy_handeye2/calibrations/NAME.calib."""
+    content = {
+        "parameters": {
+            "name": name,
+            "calibration_type": "eye_in_hand",
+            "robot_base_frame": mount.base,
+            "robot_effector_frame": mount.parent,
+            "tracking_base_frame": mount.child,
+            "tracking_marker_frame": "none",
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": {
+            "translation": dict(zip("xyz", mount.parent_from_child[:3, 3].tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", _quat_xyzw(mount.parent_from_child), strict=True)),
+        },
+    }
+    return _yaml(mount, content, flow=False)
+
+
+def pose_with_covariance(mount: CameraMount) -> str:
+    """A geometry_msgs/PoseWithCovarianceStamped as YAML: 36 numbers, row by row."""
+    content = {
+        "header": {"frame_id": mount.parent},
+        "pose": {
+            "pose": {
+                "position": dict(zip("xyz", mount.parent_from_child[:3, 3].tolist(), strict=True)),
+                "orientation": dict(zip("xyzw", _quat_xyzw(mount.parent_from_child), strict=True)),
+            },
+            "covariance": mount.covariance.ravel().tolist(),
+        },
+    }
+    order = "covariance: x y z in m, then rotation about x y z in rad, along axes of the parent frame"
+    return _yaml(mount, content, order)
+
+
+def camera_info(mount: CameraMount, lens: Intrinsics) -> str:
+    """The intrinsics as camera_info_manager reads them; pixels, (0, 0) is the centre of the first."""
+
+    def matrix(values: ndarray) -> dict[str, Any]:
+        return {"rows": len(values), "cols": values.shape[1], "data": values.ravel().tolist()}
+
+    content = {
+        "image_width": lens.width,
+        "image_height": lens.height,
+        "camera_name": mount.child.replace("/", "_"),
+        "camera_matrix": matrix(lens.matrix),
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": matrix(np.array([lens.distortion])),
+        "rectification_matrix": matrix(np.eye(3)),
+        "projection_matrix": matrix(np.column_stack([lens.matrix, np.zeros(3)])),
+    }
+    return _yaml(mount, content, "intrinsics in pixels; distortion k1 k2 p1 p2 k3")
+
+
+def notes(mount: CameraMount) -> list[str]:
+    """What every file says of itself."""
+    about = f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"
+    return [about] if mount.doubt is None else [about, f"NOT TO BE TRUSTED: {mount.doubt}"]
+
+
+def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:
+    names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    values = [*parent_from_child[:3, 3], *_quat_xyzw(parent_from_child)]
+    numbers = [word for pair in zip(names, map(_number, values), strict=True) for word in pair]
+    return [*numbers, "--frame-id", parent, "--child-frame-id", child]
+
+
+def _quat_xyzw(a_from_b: Float[ndarray, "4 4"]) -> list[float]:
+    return Rotation.from_matrix(a_from_b[:3, :3]).as_quat(canonical=True).tolist()
+
+
+def _number(value: float) -> str:
+    return f"{value:.12f}"
+
+
+def _comments(mount: CameraMount, *more: str) -> str:
+    return "\n".join(f"# {' '.join(line.split())}" for line in [*notes(mount), *more])
+
+
+def _xml_comment(mount: CameraMount) -> str:
+    # Two hyphens would end the comment.
+    text = "; ".join(" ".join(line.split()) for line in notes(mount))
+    return f"  <!-- {re.sub('-(?=-)', '- ', text)} -->"
+
+
+def _yaml(mount: CameraMount, content: dict[str, Any], *more: str, flow: bool | None = None) -> str:
+    body = yaml.safe_dump(content, sort_keys=False, default_flow_style=flow, width=110)
+    return f"{_comments(mount, *more)}\n{body}"

@@ -1,0 +1,58 @@
+"""A recording for the Rerun viewer: cloud, surface, cameras with their pictures, grippers."""
+
+from pathlib import Path
+
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.export.provenance import Provenance
+from jcr.export.views import PosedImages
+from jcr.files import written_whole
+from jcr.records import PointCloud
+from jcr.represent.scene import SceneMap
+from jcr.represent.surface import surface_mesh
+
+_GRIPPER_AXES_M = 0.05
+
+
+def write_rrd(
+    path: Path,
+    views: PosedImages,
+    base_from_gripper: Float[ndarray, "m 4 4"],
+    cloud: PointCloud,
+    scene: SceneMap,
+    provenance: Provenance,
+) -> None:
+    """Write a .rrd; `base_from_gripper` are the gripper poses of the `views`.
+
+    Raises InputError without rerun-sdk, which is 500 MB and therefore an extra of its own.
+    """
+    try:
+        import rerun as rr  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError("rerun: needs rerun-sdk (500 MB); pip install 'jcr[rerun]'") from None
+    vertices, faces, colors = surface_mesh(scene)
+    lens = views.lens
+    with written_whole(path) as temporary:
+        recording = rr.RecordingStream("jcr")
+        recording.save(temporary)
+        about = "\n".join(f"{name}: {text}" for name, text in provenance.notes.items())
+        recording.log("about", rr.TextDocument(about), static=True)
+        recording.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        recording.log("base/cloud", rr.Points3D(cloud.points_in_base, colors=cloud.color), static=True)
+        surface = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colors)
+        recording.log("base/surface", surface, static=True)
+        poses = zip(views.images, views.base_from_camera, base_from_gripper, strict=True)
+        for image, base_from_camera, gripper in poses:
+            at = rr.Transform3D(translation=gripper[:3, 3], mat3x3=gripper[:3, :3])
+            recording.log(f"base/grippers/{image}", at, rr.TransformAxes3D(_GRIPPER_AXES_M), static=True)
+            at = rr.Transform3D(translation=base_from_camera[:3, 3], mat3x3=base_from_camera[:3, :3])
+            pinhole = rr.Pinhole(
+                image_from_camera=lens.matrix,
+                resolution=[lens.width, lens.height],
+                camera_xyz=rr.ViewCoordinates.RDF,
+            )
+            picture = rr.EncodedImage(path=views.folder / image)
+            recording.log(f"base/cameras/{image}", at, pinhole, picture, static=True)
+        recording.disconnect()

@@ -1,0 +1,184 @@
+"""The pictures with their camera poses in the robot's metric frame: for splats, radiance fields and COLMAP."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+
+from jcr.capture.images import read_image
+from jcr.errors import InputError
+from jcr.export.points import write_cloud
+from jcr.export.provenance import Provenance
+from jcr.geometry import apply_similarity, inverse, scale_translation
+from jcr.reconstruct.lens import distort, pinhole_inside, undistort, undistort_image
+from jcr.reconstruct.sfm import camera_of
+from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction, Tracks
+
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_ORIENTATION = 0x0112
+"""The EXIF tag that says how a picture is to be turned."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The registered images of a capture, their cameras in the base frame and what they saw in common."""
+
+    folder: Path
+    """Of the capture."""
+    images: tuple[str, ...]
+    """Relative to that folder."""
+    base_from_camera: Float[ndarray, "m 4 4"]
+    lens: Intrinsics
+    tracks: Tracks
+    """As the reconstruction has them; see `points_in_base` for the points."""
+    points_in_base: Float[ndarray, "p 3"]
+
+
+def posed_images(
+    capture: Capture, reconstruction: Reconstruction, base_from_recon: Float[ndarray, "4 4"], scale: float
+) -> PosedImages:
+    """The images of a run in the base frame, metres.
+
+    The cameras are the reconstruction's, moved as one body: they agree with each other to a fraction of a pixel,
+    which the gripper poses of most arms do not.
+    """
+    return PosedImages(
+        capture.folder,
+        tuple(capture.images[row] for row in reconstruction.image_index),
+        base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale),
+        reconstruction.intrinsics,
+        reconstruction.tracks,
+        apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
+    )
+
+
+def write_nerfstudio(
+    folder: Path, views: PosedImages, cloud: PointCloud, provenance: Provenance, undistorted: bool, link: bool
+) -> None:
+    """Write transforms.json, images/ and points.ply (where a splat starts from) into a new folder.
+
+    Cameras are camera-to-world with OpenGL's axes (x right, y up, z backward). nerfstudio turns, shifts and scales
+    the scene unless told not to: `--orientation-method none --center-method none --auto-scale-poses False`.
+    """
+    with _new_folder(folder) as made:
+        names, lens = _place_images(made / "images", views, undistorted, link)
+        k1, k2, p1, p2, k3 = lens.distortion
+        content = {
+            "camera_model": "OPENCV" if any(lens.distortion) else "PINHOLE",
+            "fl_x": lens.fx,
+            "fl_y": lens.fy,
+            # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.
+            "cx": lens.cx + 0.5,
+            "cy": lens.cy + 0.5,
+            "w": lens.width,
+            "h": lens.height,
+            **({"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2} if any(lens.distortion) else {}),
+            "ply_file_path": "points.ply",
+            "frames": [
+                {
+                    "file_path": f"images/{name}",
+                    "transform_matrix": (base_from_camera @ _OPENGL_FROM_OPENCV).tolist(),
+                }
+                for name, base_from_camera in zip(names, views.base_from_camera, strict=True)
+            ],
+            "about": provenance.notes
+            | {"axes": "camera x right, y up, z backward; world as the robot's base"},
+        }
+        (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n")
+        write_cloud(made / "points.ply", cloud, provenance)
+
+
+def write_colmap(
+    folder: Path, views: PosedImages, provenance: Provenance, undistorted: bool, link: bool
+) -> None:
+    """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
+    with _new_folder(folder) as made:
+        names, lens = _place_images(made / "images", views, undistorted, link)
+        model = _colmap_model(views, names, lens)
+        model.extract_colors_for_all_images(str(made / "images"))
+        sparse = made / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        model.write_binary(str(sparse))
+        model.write_text(str(sparse))
+        about = "".join(f"{name}: {text}\n" for name, text in provenance.notes.items())
+        (made / "README.txt").write_text(
+            f"{about}COLMAP's world is that frame; cameras are world to camera.\n"
+        )
+
+
+def _colmap_model(views: PosedImages, names: list[str], lens: Intrinsics) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera_of(lens, known=True))
+    x_px = views.tracks.x_px if lens == views.lens else _undistorted_px(views.tracks.x_px, views.lens, lens)
+    inside = ((x_px >= -0.5) & (x_px < [lens.width - 0.5, lens.height - 0.5])).all(1)
+    place = np.zeros(len(x_px), int)  # of each observation among those of its image
+    for row, (name, camera_from_base) in enumerate(zip(names, inverse(views.base_from_camera), strict=True)):
+        mine = inside & (views.tracks.image == row)
+        place[mine] = np.arange(mine.sum())
+        image = pycolmap.Image(name=name, keypoints=x_px[mine] + 0.5, camera_id=1, image_id=row + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_base[:3]))
+    tracks = [pycolmap.Track() for _ in views.points_in_base]
+    for k in np.flatnonzero(inside):
+        tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
+    for xyz, track in zip(views.points_in_base, tracks, strict=True):
+        if track.length() >= 2:
+            model.add_point3D(xyz, track)
+    model.update_point_3d_errors()
+    return model
+
+
+def _undistorted_px(
+    x_px: Float[ndarray, "k 2"], lens: Intrinsics, pinhole: Intrinsics
+) -> Float[ndarray, "k 2"]:
+    return distort(pinhole, undistort(lens, x_px))
+
+
+def _place_images(
+    folder: Path, views: PosedImages, undistorted: bool, link: bool
+) -> tuple[list[str], Intrinsics]:
+    """Copy, link or undistort the images into a folder; their names there, and the lens that then holds."""
+    folder.mkdir()
+    names = [Path(image).name for image in views.images]
+    if len(set(names)) < len(names):
+        names = [image.replace("/", "_") for image in views.images]
+    if undistorted:
+        names = [f"{Path(name).stem}.png" for name in names]
+        pinhole = pinhole_inside(views.lens, max(views.lens.width, views.lens.height))
+        for image, name in zip(views.images, names, strict=True):
+            pixels = undistort_image(read_image(views.folder / image), views.lens, pinhole)
+            Image.fromarray(pixels).save(folder / name)
+        return names, pinhole
+    for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
+        source = (views.folder / image).resolve()
+        with Image.open(source) as opened:
+            turned = opened.getexif().get(_ORIENTATION, 1) != 1
+        if turned:  # which not every reader heeds
+            names[k] = f"{Path(name).stem}.png"
+            Image.fromarray(read_image(source)).save(folder / names[k])
+        elif link:
+            (folder / name).symlink_to(source)
+        else:
+            shutil.copyfile(source, folder / name)
+    return names, views.lens
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """A folder that appears whole or not at all; InputError where something is in the way."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise InputError(f"{folder}: is there already; name a new folder, or remove it first")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        made = Path(temporary) / "made"
+        made.mkdir()
+        yield made
+        made.replace(folder)

@@ -1,0 +1,153 @@
+"""The map's space as planners load it: OctoMap, a voxel grid of distances, spheres.
+
+All ask the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.export.provenance import Provenance
+from jcr.files import write_bytes, written_whole
+from jcr.represent.scene import FREE, OCCUPIED, SceneMap
+
+MAX_VOXELS = 50_000_000
+_SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
+
+
+def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: float | None = None) -> None:
+    """Write a binary OctoMap (.bt) with voxels of side `voxel` m, by default the map's cell.
+
+    A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
+    neither a surface nor anything unseen; all others are left out, which is how OctoMap says unknown.
+    Raises InputError without pyoctomap, and where the voxels would be too many.
+    """
+    try:
+        from pyoctomap import OcTree  # pyright: ignore[reportAttributeAccessIssue]
+    except ImportError:
+        raise InputError("octomap: needs pyoctomap; pip install 'jcr[planning]'") from None
+    voxel = _voxel(scene, voxel)
+    # OctoMap's voxels lie between whole multiples of their side; those that the workspace holds are asked.
+    low, high = np.ceil(scene.box[0] / voxel - 1e-6), np.floor(scene.box[1] / voxel + 1e-6)
+    centers = _centers(low * voxel, (high - low).astype(int), voxel).reshape(-1, 3)
+    state = scene.check_spheres(centers, voxel / 2, unknown="report")
+    tree = OcTree(voxel)
+    tree.updateNodes(centers[state == FREE], False, True)
+    tree.updateNodes(centers[state == OCCUPIED], True, True)
+    tree.updateInnerOccupancy()
+    first, rest = tree.writeBinary().split(b"\n", 1)
+    comments = "".join(f"# {name}: {text}\n" for name, text in provenance.notes.items())
+    write_bytes(path, first + b"\n" + comments.encode() + rest)
+
+
+def write_esdf(
+    path: Path,
+    scene: SceneMap,
+    provenance: Provenance,
+    unknown: Literal["occupied", "free"],
+    voxel: float | None = None,
+) -> None:
+    """Write the signed distance at the centres of voxels of side `voxel` m, by default the map's cell, as .npz.
+
+    `values` (nx,ny,nz) with x slowest, as cuRobo lays out its voxel tensor; `origin` (3,) the centre of the
+    first voxel; `voxel_size`; `dims` (3,) the sides of the grid; `pose` (7,) its centre and quaternion w x y z,
+    as cuRobo wants them; and as text `frame`, `unit`, `sign`, `unknown`.
+    """
+    voxel = _voxel(scene, voxel)
+    count = np.floor((scene.box[1] - scene.box[0]) / voxel + 1e-6).astype(int)
+    centers = _centers(scene.box[0], count, voxel)
+    values = scene.query(centers.reshape(-1, 3), unknown).distance.reshape(count)
+    dims = voxel * count
+    with written_whole(path) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(
+            stream,
+            allow_pickle=False,
+            values=values.astype(np.float32),
+            origin=centers[0, 0, 0],
+            voxel_size=np.array(voxel),
+            dims=dims,
+            pose=np.array([*(scene.box[0] + dims / 2), 1.0, 0.0, 0.0, 0.0]),
+            sign=np.array(_SIGN),
+            unknown=np.array(unknown),
+            **{name: np.array(text) for name, text in provenance.notes.items()},
+        )
+
+
+def write_spheres(
+    path: Path,
+    scene: SceneMap,
+    provenance: Provenance,
+    unknown: Literal["occupied", "free"],
+    excess: float | None = None,
+) -> None:
+    """Write the spheres of `covering_spheres` as .npz: `centers` (n,3) and `radii` (n,) m."""
+    centers, radii = covering_spheres(scene, unknown, excess)
+    with written_whole(path) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(
+            stream,
+            allow_pickle=False,
+            centers=centers,
+            radii=radii,
+            unknown=np.array(unknown),
+            **{name: np.array(text) for name, text in provenance.notes.items()},
+        )
+
+
+def covering_spheres(
+    scene: SceneMap, unknown: Literal["occupied", "free"], excess: float | None = None
+) -> tuple[Float[ndarray, "n 3"], Float[ndarray, " n"]]:
+    """Centres (n,3) and radii (n,) m of spheres that hold what is solid and reach at most `excess` m beyond it.
+
+    By default the excess is two of the map's cells; space is looked at in steps of a quarter of it. As the distance
+    d changes by no more than one goes, a sphere about c of radius excess - d(c) reaches no farther, and every
+    solid place lies in the voxel, of half diagonal h, of a point with d ≤ h. The deepest of those points that are
+    not yet covered become centres first; a point is covered where its whole voxel is.
+    """
+    excess = 2 * scene.cell if excess is None else excess
+    step = _voxel(scene, excess / 4)
+    half = 0.5 * np.sqrt(3.0) * step
+    count = np.ceil((scene.box[1] - scene.box[0]) / step - 1e-6).astype(int)
+    points = _centers(scene.box[0], count, step)
+    distance = scene.query(points.reshape(-1, 3), unknown).distance.reshape(count)
+    left = distance <= half
+    radii = excess - distance
+    candidates = np.argwhere(left)
+    candidates = candidates[np.argsort(distance[left], kind="stable")]
+    chosen = []
+    for at in candidates:
+        if left[tuple(at)]:
+            _uncover(left, at, float(radii[tuple(at)] - half) / step)
+            chosen.append(at)
+    index = tuple(np.array(chosen, dtype=int).reshape(-1, 3).T)
+    return points[index], radii[index].astype(np.float64)
+
+
+def _uncover(left: Bool[ndarray, "x y z"], at: Integer[ndarray, "3"], reach: float) -> None:
+    """Clear the points within `reach` steps of the point `at`."""
+    low = np.maximum(at - int(reach), 0)
+    high = np.minimum(at + int(reach) + 1, left.shape)
+    x, y, z = np.ogrid[tuple(slice(a, b) for a, b in zip(low - at, high - at, strict=True))]
+    left[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] &= x * x + y * y + z * z > reach * reach
+
+
+def _centers(lower: ndarray, count: ndarray, voxel: float) -> Float[ndarray, "x y z 3"]:
+    """Centres of a grid of voxels."""
+    axes = [corner + voxel * (np.arange(n) + 0.5) for corner, n in zip(lower, count, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+
+
+def _voxel(scene: SceneMap, side: float | None) -> float:
+    """The voxels' side, by default the map's cell; InputError where it is no length or makes too many voxels."""
+    side = scene.cell if side is None else side
+    extent = scene.box[1] - scene.box[0]
+    if not 0 < side <= extent.min():
+        raise InputError(f"voxels of {side:g} m: give a length between 0 and {extent.min():.2f} m")
+    if np.prod(extent / side) > MAX_VOXELS:
+        raise InputError(
+            f"voxels of {side:g} m: are over {MAX_VOXELS // 10**6} million in this map; take a larger size"
+        )
+    return side
