@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from jcr.bench.real import run as run_real
 from jcr.calibrate.calibrate import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
@@ -235,3 +236,17 @@ def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg,
     assert 1e3 * np.linalg.norm(found[:3, 3] - true[:3, 3]) < limit_mm
     assert rotation_between_deg(found[:3, :3], true[:3, :3]) < limit_deg
     assert hand_eye.converged == trusted
+
+
+def test_the_table_of_real_captures_holds_each_against_its_reference(tmp_path):
+    _, gripper_from_camera = capture_of(tmp_path / "bench", charuco(), count=5)
+    off = gripper_from_camera.copy()
+    off[:3, 3] += [0.03, 0.0, 0.04]
+    (tmp_path / "bench" / "reference.json").write_text(json.dumps({"gripper_from_camera": off.tolist()}))
+    table = run_real(tmp_path, ["bench=charuco:7x6:0.030:0.022:DICT_4X4_50"])
+    off_mm = [float(line.split("|")[4]) for line in table.splitlines() if "DICT_4X4_50` |" in line]
+    assert off_mm == pytest.approx([50.0], abs=1.0)
+    with pytest.raises(InputError, match="other: no such capture"):
+        run_real(tmp_path, ["other=chessboard:8x5:0.025"])
+    with pytest.raises(InputError, match=r"no folder below it holds a reference\.json"):
+        run_real(tmp_path / "bench", [])

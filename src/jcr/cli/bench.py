@@ -18,6 +18,7 @@ BENCHES = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
+    "real": "real captures in DIR, against the references stored beside them",
     "run": "the whole job on the bundled capture: time and memory of each stage",
 }
 
@@ -29,10 +30,15 @@ class Arguments:
     examples:
       jcr bench calibrate
       jcr bench run --out docs/results
+      jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, calibrate, pairs or run."""
+    """align, calibrate, pairs, real or run."""
+    captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
+    """For real: the folder that holds capture folders, each with a reference.json."""
+    boards: tuple[str, ...] = ()
+    """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder."""
 
@@ -44,7 +50,14 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"bench {arguments.name}: no such bench; there are {names}")
     from jcr.files import write_text
 
-    table = heading(arguments.name) + import_module(f"jcr.bench.{arguments.name}").run()
+    bench = import_module(f"jcr.bench.{arguments.name}")
+    if arguments.name != "real":
+        found = bench.run()
+    elif arguments.captures is None:
+        raise InputError("bench real: name the folder that holds the captures, as in jcr bench real captures")
+    else:
+        found = bench.run(arguments.captures, arguments.boards)
+    table = heading(arguments.name) + found
     sys.stdout.write(table)
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", table)
