@@ -260,7 +260,7 @@ def test_torch_differentiates_every_answer(scene: SceneMap):
     with torch.no_grad():
         rise = scene.query(x + step).occupancy - sample.occupancy
     steep = of_occupancy.norm(dim=1) > 10
-    assert steep.sum() > 50
+    assert steep.sum() > 20
     assert (rise[steep] / 1e-4 / of_occupancy.norm(dim=1)[steep]).median() == pytest.approx(1, abs=0.1)
 
 

@@ -16,9 +16,11 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.files import write_bytes
+from jcr.geometry import apply, require_rigid
 from jcr.represent.chunks import in_chunks
 from jcr.represent.distance import DistanceGrid, distance_grid
 from jcr.represent.fields import Fields, FieldShape, Lattice
+from jcr.represent.robot import JointValues, RobotSpheres, load_robot
 from jcr.represent.sample import Sample
 from jcr.represent.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
@@ -134,11 +136,31 @@ class SceneMap:
         share = np.linspace(0.0, 1.0, int(np.ceil(longest / self.seen.cell)) + 1)
         centers = starts[..., None, :] + share[:, None] * (ends - starts)[..., None, :]
         along = np.broadcast_to(np.asarray(radii, np.float32)[..., None], centers.shape[:-1])
-        states = self.check_spheres(centers, along, unknown)
-        if unknown == "report":
-            surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
-            return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
-        return np.asarray(states.any(-1))
+        return _worst(self.check_spheres(centers, along, unknown), unknown)
+
+    def check_robot(
+        self,
+        robot: str | Path | RobotSpheres,
+        joint_values: JointValues,
+        unknown: Unknown = "occupied",
+        base_from_robot: Float[ndarray, "4 4"] | None = None,
+        ignore_links: tuple[str, ...] = (),
+    ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
+        """Whether a robot touches something at joint values (…,dof); answers as `check_spheres`.
+
+        `robot` is a URDF file, or what `jcr.represent.robot.load_robot` made of it: spheres that cover the
+        collision shapes. Joint values (rad, m) are in the order of `RobotSpheres.joint_names` (as in the URDF),
+        or a mapping from these names. `base_from_robot` maps the URDF's root link to the map's base frame;
+        `ignore_links` names links that may touch, e.g. the one that stands on the table. The robot's own
+        links are not checked against each other. Raises InputError as `load_robot` and
+        `RobotSpheres.centers` do.
+        """
+        spheres = robot if isinstance(robot, RobotSpheres) else load_robot(robot)
+        spheres = spheres.without(tuple(ignore_links))
+        centers = spheres.centers(joint_values)
+        if base_from_robot is not None:
+            centers = apply(require_rigid(np.asarray(base_from_robot, float), "base_from_robot"), centers)
+        return _worst(self.check_spheres(centers, spheres.radii, unknown), unknown)
 
     def _touches(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], unknown: str
@@ -249,6 +271,14 @@ def _from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap
     fields = Fields(shapes, seen.box, lattices)
     fields.load_state_dict({name.removeprefix("fields."): value for name, value in tensors.items()})
     return SceneMap(fields, seen, tuple(about["label_names"]), about["history"])
+
+
+def _worst(states: Bool[ndarray, "*batch k"] | UInt8[ndarray, "*batch k"], unknown: str) -> ndarray:
+    """Of the k answers for one thing, the answer for all of it."""
+    if unknown == "report":
+        surface, unseen = (states == OCCUPIED).any(-1), (states == UNKNOWN).any(-1)
+        return np.where(surface, OCCUPIED, np.where(unseen, UNKNOWN, FREE)).astype(np.uint8)
+    return np.asarray(states.any(-1))
 
 
 def _check_choice(unknown: str) -> None:

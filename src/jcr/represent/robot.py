@@ -1,0 +1,244 @@
+"""A robot as spheres: its URDF's collision shapes covered by spheres, and where joint values put them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from jcr.errors import InputError
+from jcr.geometry import apply, rotation_exp, transform
+
+VOXELS, CANDIDATES = 100_000, 1000
+"""At most so many in a shape's bounding box; and of these, drawn as centres of spheres at a time."""
+
+JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
+
+
+@dataclass(frozen=True)
+class RobotJoint:
+    """How a link hangs on another."""
+
+    parent: int
+    child: int
+    """Rows of `RobotSpheres.links`."""
+    parent_from_joint: Float[ndarray, "4 4"]
+    axis: Float[ndarray, "3"]
+    kind: str
+    """revolute, continuous, prismatic or fixed."""
+    column: int | None
+    """Of the joint values; None when fixed."""
+    multiplier: float = 1.0
+    offset: float = 0.0
+    """Of a joint that mimics another: value = multiplier · other + offset."""
+
+
+@dataclass(frozen=True)
+class RobotSpheres:
+    """Spheres fixed to links, and the joints, parents before children."""
+
+    links: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    """Joints that move, in the order of the URDF: the order of joint values."""
+    joints: tuple[RobotJoint, ...]
+    link: Int[ndarray, " s"]
+    """Row of `links` that each sphere is fixed to."""
+    centers_in_link: Float[ndarray, "s 3"]
+    radii: Float[ndarray, " s"]
+
+    def without(self, names: tuple[str, ...]) -> "RobotSpheres":
+        """The robot without the spheres of some links; InputError for a link that it does not have."""
+        unknown = set(names) - set(self.links)
+        if unknown:
+            raise InputError(f"links {sorted(unknown)}: the robot has only {', '.join(self.links)}")
+        kept = ~np.isin(self.link, [self.links.index(name) for name in names])
+        return RobotSpheres(
+            self.links,
+            self.joint_names,
+            self.joints,
+            self.link[kept],
+            self.centers_in_link[kept],
+            self.radii[kept],
+        )
+
+    def centers(self, joint_values: JointValues) -> Float[ndarray, "*batch s 3"]:
+        """Sphere centres (…,s,3) in the frame of the robot's root link, for joint values (…,dof) rad or m.
+
+        Values are in the order of `joint_names`, or a mapping from these names to values (…). Raises
+        InputError for other names, another number of values, or one that is not finite.
+        """
+        values = self._in_order(joint_values)
+        batch = values.shape[:-1]
+        root_from_link = np.broadcast_to(np.eye(4), (len(self.links), *batch, 4, 4)).copy()
+        for joint in self.joints:
+            motion = np.broadcast_to(np.eye(4), (*batch, 4, 4))
+            if joint.column is not None:
+                along = (joint.multiplier * values[..., joint.column] + joint.offset)[..., None] * joint.axis
+                slides = joint.kind == "prismatic"
+                motion = (
+                    transform(np.eye(3), along) if slides else transform(rotation_exp(along), np.zeros(3))
+                )
+            root_from_link[joint.child] = root_from_link[joint.parent] @ joint.parent_from_joint @ motion
+        pose = np.moveaxis(root_from_link[self.link], 0, -3)
+        return (pose[..., :3, :3] @ self.centers_in_link[:, :, None])[..., 0] + pose[..., :3, 3]
+
+    def _in_order(self, joint_values: JointValues) -> Float[ndarray, "*batch dof"]:
+        names = ", ".join(self.joint_names)
+        if isinstance(joint_values, Mapping):
+            wrong = set(joint_values) ^ set(self.joint_names)
+            if wrong:
+                raise InputError(f"joints {sorted(wrong)}: missing or unknown; the robot's are {names}")
+            columns = [np.asarray(joint_values[name], float) for name in self.joint_names]
+            joint_values = np.stack(np.broadcast_arrays(*columns), -1)
+        values = np.asarray(joint_values, float)
+        if values.ndim == 0 or values.shape[-1] != len(self.joint_names):
+            raise InputError(
+                f"joint values of shape {values.shape}: expected (…, {len(self.joint_names)}), for {names}"
+            )
+        if not np.isfinite(values).all():
+            raise InputError("joint values: one is not finite; give radians, or metres where a joint slides")
+        return values
+
+
+def load_robot(urdf: str | Path, excess: float = 0.01) -> RobotSpheres:
+    """The robot of a URDF file, its collision shapes covered by spheres that stick out by about `excess` (m).
+
+    Boxes, cylinders, spheres and meshes; a link without collision shape has no spheres. The result is kept, so
+    that asking again for an unchanged file is quick. Raises InputError where the file or a mesh of it cannot be
+    read, or nothing is there to collide with.
+    """
+    path = Path(urdf)
+    if not path.is_file():
+        raise InputError(f"{path}: no such URDF file")
+    if not excess > 0:
+        raise InputError(f"excess {excess}: give metres above 0, e.g. 0.01")
+    return _load(path.resolve(), path.stat().st_mtime_ns, excess)
+
+
+@lru_cache(maxsize=8)
+def _load(path: Path, changed_ns: int, excess: float) -> RobotSpheres:
+    import yourdfpy
+
+    try:
+        robot: Any = yourdfpy.URDF.load(
+            str(path),
+            build_scene_graph=False,
+            build_collision_scene_graph=True,
+            load_meshes=False,
+            load_collision_meshes=True,
+            force_collision_mesh=False,
+        )
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read as URDF ({error})") from error
+    links = tuple(link.name for link in robot.robot.links)
+    joints = _joints(robot, links, path)
+    scene = robot.collision_scene
+    link, centers, radii = [], [], []
+    found = dict.fromkeys(links, 0)
+    for node in scene.graph.nodes_geometry:
+        on = scene.graph.transforms.parents[node]
+        link_from_shape, name = scene.graph.get(frame_to=node, frame_from=on)
+        while on not in found:  # a mesh file may be a tree of its own
+            on = scene.graph.transforms.parents[on]
+            link_from_shape, name = scene.graph.get(frame_to=node, frame_from=on)
+        found[on] += 1
+        center, radius = covering_spheres(scene.geometry[name], np.asarray(link_from_shape), excess)
+        link.append(np.full(len(radius), links.index(on)))
+        centers.append(center)
+        radii.append(radius)
+    for each in robot.robot.links:
+        if found[each.name] < len(each.collisions):
+            raise InputError(f"{path}: a collision mesh of link {each.name} cannot be found; mend its path")
+    if not radii:
+        raise InputError(f"{path}: no link has a <collision> shape, so nothing can collide")
+    return RobotSpheres(
+        links,
+        tuple(robot.actuated_joint_names),
+        joints,
+        np.concatenate(link),
+        np.concatenate(centers),
+        np.concatenate(radii),
+    )
+
+
+def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint, ...]:
+    """The joints of a yourdfpy.URDF, parents before children."""
+    columns = {name: k for k, name in enumerate(robot.actuated_joint_names)}
+    waiting, reached, joints = list(robot.robot.joints), {robot.base_link}, []
+    while waiting:
+        ready = [joint for joint in waiting if joint.parent in reached]
+        if not ready:
+            raise InputError(
+                f"{path}: joint {waiting[0].name} hangs on no link that reaches {robot.base_link}"
+            )
+        for joint in ready:
+            if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+                raise InputError(f"{path}: joint {joint.name} is {joint.type}, which is not supported")
+            leader, multiplier, offset = joint.name, 1.0, 0.0
+            if joint.mimic is not None:
+                leader = joint.mimic.joint
+                multiplier = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
+                offset = float(joint.mimic.offset or 0.0)
+            axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
+            joints.append(
+                RobotJoint(
+                    links.index(joint.parent),
+                    links.index(joint.child),
+                    np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
+                    axis / np.linalg.norm(axis),
+                    joint.type,
+                    None if joint.type == "fixed" else columns[leader],
+                    multiplier,
+                    offset,
+                )
+            )
+            reached.add(joint.child)
+            waiting.remove(joint)
+    return tuple(joints)
+
+
+def covering_spheres(
+    shape: trimesh.Trimesh, link_from_shape: Float[ndarray, "4 4"], excess: float
+) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
+    """Centres (s,3) in the link and radii (s,) of spheres that together hold all of a solid shape.
+
+    A ball about an inner place, larger by `excess` (m) than its depth, sticks out of the shape by no more, but
+    for half a voxel of the search (a sixth of the excess, for shapes up to 15 cm). Of such balls, always the
+    one that holds most of what none holds yet is taken (greedy set cover).
+    """
+    if isinstance(shape, trimesh.primitives.Sphere):
+        ball: Any = shape.primitive
+        return apply(link_from_shape, np.asarray(ball.center)[None]), np.array([float(ball.radius)])
+    pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
+    voxels: Any = shape.voxelized(pitch).fill()
+    points = np.asarray(voxels.points)
+    depth = pitch * distance_transform_edt(np.pad(voxels.matrix, 1))[1:-1, 1:-1, 1:-1][voxels.matrix]
+    radius = depth - pitch / 2 + excess
+    slack = pitch * np.sqrt(3) / 2  # the solid may fill the whole of each voxel
+
+    draw, tree = np.random.default_rng(0), cKDTree(points)
+    missing, chosen = np.ones(len(points), bool), []
+    while missing.any():
+        of = np.flatnonzero(missing)
+        candidates = draw.choice(of, min(CANDIDATES, len(of)), replace=False)
+        held = tree.query_ball_point(points[candidates], radius[candidates] - slack)
+        rows = np.repeat(np.arange(len(candidates)), [len(row) for row in held])
+        holds = csr_array(
+            (np.ones(len(rows), np.float32), (rows, np.concatenate(held))), (len(held), len(points))
+        )
+        while True:
+            gain = holds @ missing.astype(np.float32)
+            best = int(gain.argmax())
+            if gain[best] == 0:
+                break
+            chosen.append(candidates[best])
+            missing[held[best]] = False
+    return apply(link_from_shape, points[chosen]), radius[chosen]
