@@ -11,6 +11,7 @@ import pytest
 
 import jcr
 from jcr.cli import COMMANDS
+from jcr.export.points import read_cloud
 
 
 def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
@@ -45,6 +46,26 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert len(content["images"]) == 12
     std_mm = content["uncertainty"]["translation_std_mm"]
     assert 1e3 * max(content["next_poses"][-1]["expected_std"][:3]) < max(std_mm)
+
+
+def test_an_added_image_extends_the_map_and_stays(done: Path, tabletop: Path, tmp_path: Path):
+    out, pose = tmp_path / "run", tmp_path / "pose.json"
+    shutil.copytree(done, out)
+    frame = json.loads((tabletop / "capture.json").read_text())["frames"][3]
+    pose.write_text(json.dumps(frame["base_from_gripper"]))
+    before = json.loads((out / "calibration.json").read_text())["gripper_from_camera"]
+    image = tabletop / frame["image"]
+    added = run_jcr("map", out, "--add", image, pose, "--quiet")
+    assert added.returncode == 0, added.stderr
+    assert json.loads((out / "calibration.json").read_text())["gripper_from_camera"] == before
+    assert [f["base_from_gripper"] for f in json.loads((out / "added" / "added.json").read_text())["frames"]]
+    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
+    again = run_jcr("map", out, "--quiet")
+    assert again.returncode == 0, again.stderr
+    assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
+    twice = run_jcr("map", out, "--add", image, pose)
+    assert twice.returncode == 2
+    assert "added before" in twice.stderr
 
 
 def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabletop: Path):

@@ -7,7 +7,7 @@ import fcntl
 import hashlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,12 +17,13 @@ from jcr import __version__
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.calibrate.calibrate import calibrate as calibrate_stage
 from jcr.calibrate.file import CalibrationFile, calibration_file, failed_file, write_calibration
+from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import write_cloud
 from jcr.files import write_text
 from jcr.progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, chosen, reconstruct
+from jcr.reconstruct.backends import ReconstructOptions, chosen, device_of, reconstruct
 from jcr.reconstruct.file import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.build import build_scene
@@ -76,8 +77,9 @@ def run(
     """
     options = _with_backend(options, backend)
     with _run_folder(Path(out)) as folder:
+        added = read_added(folder, capture)
         result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, folder, options, result, progress)
+        result = _map(capture, added, folder, options, result, progress)
         _report(capture, result)
         return result
 
@@ -101,9 +103,14 @@ def build_map(
     cloud: CloudOptions | None = None,
     map: MapOptions | None = None,
     *,
+    add: Sequence[tuple[Path, Path]] = (),
     progress: Progress | None = None,
 ) -> RunResult:
-    """Cloud, map and report again, from the capture and the calibration that the run folder `out` names."""
+    """Cloud, map and report again, from the capture and the calibration that the run folder `out` names.
+
+    `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
+    not the calibration, and every later map of the folder has them.
+    """
     capture = read_capture_of(out)
     state = _read_state(Path(out))
     with _run_folder(Path(out)) as folder:
@@ -113,8 +120,9 @@ def build_map(
             cloud or CloudOptions(),
             map or MapOptions(),
         )
+        added = with_images(read_added(folder, capture), add)
         result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, folder, options, result, progress)
+        result = _map(capture, added, folder, options, result, progress)
         _report(capture, result)
         return result
 
@@ -128,7 +136,7 @@ def read_capture_of(out: str | Path) -> Capture:
 
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
-    report = progress or (lambda stage, fraction: None)
+    report = progress or _silent
     made_from = _fingerprint(capture, asdict(options.reconstruct))
     state = _read_state(folder)
     start = time.perf_counter()
@@ -165,12 +173,23 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
 
 
 def _map(
-    capture: Capture, folder: Path, options: RunOptions, result: RunResult, progress: Progress | None
+    capture: Capture,
+    added: Capture,
+    folder: Path,
+    options: RunOptions,
+    result: RunResult,
+    progress: Progress | None,
 ) -> RunResult:
     start = time.perf_counter()
-    cloud = point_cloud(capture, result.reconstruction, result.hand_eye, options=options.cloud)
+    reconstruction, device = result.reconstruction, device_of(options.reconstruct)
+    if len(added):
+        from jcr.reconstruct.added import extend
+
+        reconstruction = extend(reconstruction, result.hand_eye, added, device, progress or _silent)
+        write_added(added, capture)
+    cloud = point_cloud(capture, reconstruction, result.hand_eye, options=options.cloud)
     write_cloud(folder / "cloud.ply", cloud)
-    scene = build_scene(cloud, options.map, progress)
+    scene = build_scene(cloud, options.map, progress, device=device)
     scene.save(folder / "map.safetensors")
     timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
     content = result.calibration.model_copy(update={"timings_s": timings})
@@ -183,6 +202,10 @@ def _report(capture: Capture, result: RunResult) -> None:
     from jcr.report.html import report_html
 
     write_text(result.out / "report.html", report_html(capture, result))
+
+
+def _silent(stage: str, fraction: float) -> None:
+    """Progress that nobody asked for."""
 
 
 def _with_backend(options: RunOptions | None, backend: str | None) -> RunOptions:

@@ -13,15 +13,20 @@ from jcr.represent.options import MapOptions
 
 @dataclass(frozen=True)
 class Arguments:
-    """(Re)build cloud, map and report of a run with other options.
+    """(Re)build cloud, map and report of a run with other options, or with further images.
 
     examples:
       jcr map out/tabletop --preset paper
       jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
+      jcr map out/tabletop --add left.png left.json --add right.png right.json
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
+    add: tyro.conf.UseAppendAction[tuple[tuple[Path, Path], ...]] = ()
+    """A new image, and a file with its base_from_gripper (4x4 in metres: .json, .npy, or text); again for more,
+    oldest first. The calibration stays. What a new image sees through is removed from the map; a thing that
+    was not there before needs two new images. This and every later map of the run has them (OUT/added)."""
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     quiet: bool = False
@@ -34,6 +39,8 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
 
     with progress_bars(arguments.quiet) as progress:
-        result = build_map(arguments.out, arguments.cloud, arguments.map, progress=progress)
+        result = build_map(
+            arguments.out, arguments.cloud, arguments.map, add=arguments.add, progress=progress
+        )
     sys.stdout.write(f"map: {result.out / 'map.safetensors'}\nreport: {result.out / 'report.html'}\n")
     return 0

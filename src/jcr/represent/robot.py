@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
@@ -218,13 +218,14 @@ def covering_spheres(
         ball: Any = shape.primitive
         return apply(link_from_shape, np.asarray(ball.center)[None]), np.array([float(ball.radius)])
     pitch = max(excess / 3, float(np.prod(shape.extents) / VOXELS) ** (1 / 3))
-    voxels: Any = shape.voxelized(pitch).fill()
+    voxels = cast(Any, shape.voxelized(pitch)).fill()
     points = np.asarray(voxels.points)
-    depth = pitch * distance_transform_edt(np.pad(voxels.matrix, 1))[1:-1, 1:-1, 1:-1][voxels.matrix]
+    solid = np.pad(voxels.matrix, 1)
+    depth = pitch * np.asarray(distance_transform_edt(solid))[solid]
     radius = depth - pitch / 2 + excess
     slack = pitch * np.sqrt(3) / 2  # the solid may fill the whole of each voxel
 
-    draw, tree = np.random.default_rng(0), cKDTree(points)
+    draw, tree = np.random.default_rng(0), KDTree(points)
     missing, chosen = np.ones(len(points), bool), []
     while missing.any():
         of = np.flatnonzero(missing)

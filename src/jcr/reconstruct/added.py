@@ -1,0 +1,163 @@
+"""New images of a calibrated camera: their pointmaps, and what they contradict in the older ones.
+
+The camera's place follows from the gripper's, so that nothing is calibrated again. Depth comes from the plane
+sweep, whichever back end made the reconstruction. A scene changes between images; what a later one sees through,
+or sees in the way of an older ray, is taken from the older pointmaps.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.capture.images import read_image
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse, scale_translation
+from jcr.progress import Progress
+from jcr.reconstruct.dense import dense_pointmaps
+from jcr.reconstruct.lens import undistort_image
+from jcr.reconstruct.views import choose_neighbours, sweep_planes
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
+
+NEIGHBOURS = 6
+"""Images that a new one is compared with; at most half of them are other new ones."""
+REACH = 1.5
+"""The planes of the sweep span so much more than the known points: a new thing may be taller than all others."""
+CONTRADICTION = 0.015
+"""Relative difference of depths by which one surface lies before another, beyond noise of depth and poses."""
+LEAST_SHARE = 0.005
+"""Of a new image's pixels that must get a depth, or it shows nothing of the scene."""
+
+
+def extend(
+    reconstruction: Reconstruction,
+    hand_eye: HandEye,
+    added: Capture,
+    device: str,
+    report: Progress,
+) -> Reconstruction:
+    """The reconstruction with further images, oldest first, whose gripper poses are known.
+
+    Their rows come last; where a later image contradicts an earlier one, the earlier's confidence is 0. Raises
+    InputError for an image that shares no view with the others.
+    """
+    lens, pinhole = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
+    base_from_camera = added.base_from_gripper @ hand_eye.gripper_from_camera
+    recon_from_new = scale_translation(
+        inverse(hand_eye.base_from_recon) @ base_from_camera, 1 / hand_eye.scale
+    )
+    old, new = len(reconstruction.recon_from_camera), len(added)
+    recon_from_camera = np.concatenate([reconstruction.recon_from_camera, recon_from_new])
+    pictures = [undistort_image(read_image(added.folder / name), lens, pinhole) for name in added.images]
+    colors = np.concatenate([reconstruction.colors, np.stack(pictures)])
+    tracks = _with_projections(reconstruction.tracks, recon_from_new, pinhole, old)
+
+    near = choose_neighbours(tracks, recon_from_camera, old + new - 1)
+    neighbours = {}
+    for row in range(old, old + new):
+        others = near[row]
+        latest = others[others >= old][: NEIGHBOURS // 2]
+        neighbours[row] = np.concatenate([latest, others[others < old][: NEIGHBOURS - len(latest)]])
+    # Old images take part with a depth of their own, so that depths can be cross-checked.
+    taken = np.unique(np.concatenate([*neighbours.values(), np.arange(old, old + new)]))
+    for row in taken[taken < old]:
+        neighbours[row] = near[row][np.isin(near[row], taken)][:NEIGHBOURS]
+    planes = sweep_planes(tracks, recon_from_camera)
+    middle = planes.mean(1, keepdims=True)
+    points, confidence = dense_pointmaps(
+        colors[taken],
+        recon_from_camera[taken],
+        pinhole,
+        [np.searchsorted(taken, neighbours[row]) for row in taken],
+        (middle + REACH * (planes - middle))[taken],
+        device,
+        report,
+    )
+    points, confidence = points[-new:], confidence[-new:]
+    for name, of_image in zip(added.images, confidence, strict=True):
+        if (of_image > 0).mean() < LEAST_SHARE:
+            raise InputError(
+                f"{added.folder / name}: no depth can be found in it; its pose may be wrong, or it shows nothing "
+                "that other images show"
+            )
+    # In the unit of the back end's own confidence, so that one threshold serves both.
+    known = reconstruction.confidence[reconstruction.confidence > 0]
+    if len(known):
+        confidence = confidence * (np.median(known) / np.median(confidence[confidence > 0]))
+    points = np.concatenate([reconstruction.points_in_recon, points])
+    confidence = np.concatenate([reconstruction.confidence, confidence])
+    camera_from_recon = inverse(recon_from_camera)
+    for later in range(old, old + new):
+        for earlier in range(later):
+            gone = contradicted(
+                (points[earlier], confidence[earlier] > 0, camera_from_recon[earlier]),
+                (points[later], confidence[later] > 0, camera_from_recon[later]),
+                pinhole,
+            )
+            confidence[earlier][gone] = 0.0
+    first = int(reconstruction.image_index.max()) + 1
+    return replace(
+        reconstruction,
+        image_index=np.concatenate([reconstruction.image_index, first + np.arange(new)]),
+        recon_from_camera=recon_from_camera,
+        points_in_recon=points,
+        confidence=confidence,
+        colors=colors,
+    )
+
+
+View = tuple[Float[ndarray, "h w 3"], Bool[ndarray, "h w"], Float[ndarray, "4 4"]]
+"""Points in the recon frame, where they are known, and camera_from_recon."""
+
+
+def contradicted(earlier: View, later: View, pinhole: Intrinsics) -> Bool[ndarray, "h w"]:
+    """Pixels of an earlier view whose point the later one sees through, or whose ray meets the later's surface."""
+    x_earlier, known, earlier_from_recon = earlier
+    x_later, known_later, later_from_recon = later
+    gone = np.zeros(known.shape, bool)
+
+    # Seen through: the later view's surface lies behind the point, all around its pixel.
+    surface = _nearest_around(apply(later_from_recon, x_later)[..., 2], known_later)
+    u, v, depth, inside = _pixels(later_from_recon, x_earlier[known], pinhole)
+    gone[known] = inside & (depth < (1 - CONTRADICTION) * np.where(inside, surface[v, u], 0.0))
+
+    # In the way: points of the later view lie before the earlier one's surface, all around their pixel.
+    surface = _nearest_around(apply(earlier_from_recon, x_earlier)[..., 2], known)
+    u, v, depth, inside = _pixels(earlier_from_recon, x_later[known_later], pinhole)
+    before = inside & (depth < (1 - CONTRADICTION) * np.where(inside, surface[v, u], 0.0))
+    hits = np.zeros(known.shape, np.float32)
+    np.add.at(hits, (v[before], u[before]), 1.0)
+    # The later view's points may be sparser than the earlier's pixels, but one alone proves nothing.
+    return (gone | (cv2.blur(hits, (3, 3), borderType=cv2.BORDER_CONSTANT) * 9 >= 2)) & known
+
+
+def _pixels(
+    camera_from_recon: Float[ndarray, "4 4"], x_in_recon: Float[ndarray, "n 3"], pinhole: Intrinsics
+) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
+    """Nearest pixel u, v (n,), depth (n,), and whether it lies in the image (else the pixel is 0, 0)."""
+    x, y, z = apply(camera_from_recon, x_in_recon).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = np.round(pinhole.fx * x / z + pinhole.cx), np.round(pinhole.fy * y / z + pinhole.cy)
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < pinhole.width) & (v < pinhole.height)
+    return np.where(inside, u, 0).astype(int), np.where(inside, v, 0).astype(int), z, inside
+
+
+def _nearest_around(depth: Float[ndarray, "h w"], known: Bool[ndarray, "h w"]) -> Float[ndarray, "h w"]:
+    """The smallest depth known in 5x5 pixels; 0 where the pixel itself has none."""
+    nearest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), np.ones((5, 5), np.uint8))
+    return np.where(known, nearest, 0.0)
+
+
+def _with_projections(
+    tracks: Tracks, recon_from_new: Float[ndarray, "k 4 4"], pinhole: Intrinsics, first: int
+) -> Tracks:
+    """The tracks, with what points of theirs would lie in the frames of new images; for choosing views only."""
+    image, x_px, point = [tracks.image], [tracks.x_px], [tracks.point]
+    for row, new_from_recon in enumerate(inverse(recon_from_new), start=first):
+        u, v, _, inside = _pixels(new_from_recon, tracks.points_in_recon, pinhole)
+        image.append(np.full(inside.sum(), row))
+        x_px.append(np.stack([u, v], -1)[inside].astype(float))
+        point.append(np.flatnonzero(inside))
+    return Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), tracks.points_in_recon)
