@@ -14,7 +14,7 @@ LAYERS = [
     {"export"},
     {"simulate"},
     {"report"},
-    {"check", "pipeline"},
+    {"check", "live", "pipeline"},
     {"bench"},
     {"cli"},
     {"__main__"},

@@ -10,18 +10,13 @@ from jcr.calibrate.conventions import better_reading, explained
 from jcr.calibrate.hand_eye import solve_hand_eye
 from jcr.calibrate.next_poses import ASSUMED_NOISE, NextPose, next_poses
 from jcr.calibrate.observability import observability
-from jcr.capture.images import read_image
+from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
 from jcr.progress import Progress
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.reconstruct.lens import fold_distance_px
 from jcr.records import Capture, HandEye, Observability
-
-BLURRED = 0.25
-"""Share of the median image's sharpness below which an image is called blurred."""
-DARK, BRIGHT = 12, 243
-"""Mean grey levels of 255 beyond which an image shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -101,19 +96,14 @@ def check(
 
 def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
     """Mean grey level and relative sharpness of every image."""
-    import cv2
-
-    brightness, sharpness = [], []
-    for name in capture.images:
-        grey = cv2.cvtColor(read_image(capture.folder / name), cv2.COLOR_RGB2GRAY)
-        brightness.append(float(grey.mean()))
-        sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
-    return np.array(brightness), np.array(sharpness) / max(float(np.median(sharpness)), 1e-9)
+    looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
+    brightness, sharpness = np.array(looks).T
+    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9)
 
 
 def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):
     for name, grey, sharp in zip(capture.images, brightness, sharpness, strict=True):
-        if not DARK < grey < BRIGHT:
-            yield f"{name} is nearly {'black' if grey <= DARK else 'white'}; expose it anew"
+        if (fault := exposure_fault(grey)) is not None:
+            yield f"{name} is {fault}; expose it anew"
         elif sharp < BLURRED:
             yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"

@@ -3,6 +3,7 @@
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
@@ -12,6 +13,10 @@ from jcr.errors import InputError
 
 MAX_PIXELS = 64_000_000
 """Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
+BLURRED = 0.25
+"""Share of the usual sharpness below which an image is called blurred."""
+DARK, BRIGHT = 12, 243
+"""Mean grey levels of 255 beyond which an image shows nothing."""
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
@@ -48,3 +53,16 @@ def _refuse_size(path: Path, size: tuple[int, int]) -> None:
         raise InputError(
             f"{path}: {size[0]}x{size[1]} is over {MAX_PIXELS // 1_000_000} million pixels; shrink the image"
         )
+
+
+def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, float]:
+    """Mean grey level, and variance of the Laplacian, which falls when an image is blurred."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def exposure_fault(brightness: float) -> str | None:
+    """What an image of that mean grey level is, if it shows nothing."""
+    if DARK < brightness < BRIGHT:
+        return None
+    return "nearly black" if brightness <= DARK else "nearly white"

@@ -14,6 +14,7 @@ from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.records import Capture, Intrinsics
 
+FILE = "capture.json"
 MIN_FRAMES = 3
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
@@ -26,7 +27,7 @@ def read_capture(path: str | Path) -> Capture:
     not rigid, in millimetres, or fewer than three frames.
     """
     path = Path(path)
-    folder, file = (path, path / "capture.json") if path.is_dir() else (path.parent, path)
+    folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if not path.exists():
         raise InputError(f"{path}: no such capture; name a folder that holds a capture.json")
     if not file.is_file():
@@ -57,7 +58,7 @@ def read_capture(path: str | Path) -> Capture:
     )
     check_metres(poses, str(file))
     size = _common_size(folder, images)
-    return Capture(folder, images, poses, size, _intrinsics(content.get("intrinsics"), size, file))
+    return Capture(folder, images, poses, size, read_lens(content.get("intrinsics"), size, file))
 
 
 def read_json(file: Path) -> Any:
@@ -143,7 +144,8 @@ def _common_size(folder: Path, images: tuple[str, ...]) -> tuple[int, int]:
     return first
 
 
-def _intrinsics(value: Any, size: tuple[int, int], file: Path) -> Intrinsics | None:
+def read_lens(value: Any, size: tuple[int, int], file: Path) -> Intrinsics | None:
+    """The lens of images of `size` from the "intrinsics" of a capture.json; InputError if it cannot be."""
     if value is None:
         return None
     where = f"{file}: intrinsics"

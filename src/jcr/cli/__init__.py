@@ -17,6 +17,7 @@ from types import ModuleType
 from jcr.errors import InputError, NotTrustedError
 
 COMMANDS = {
+    "capture": "a capture taken live, with advice while one works",
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
     "check": "reads and judges a capture before any heavy work",

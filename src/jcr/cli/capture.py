@@ -1,0 +1,122 @@
+"""`jcr capture`: a capture taken live, picture by picture, with advice while one works."""
+
+import json
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from jcr.live.collect import CollectOptions
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jcr.live.asks import Answer, Ask
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Collect a capture with a camera and the gripper poses of a robot, and see what is still missing.
+
+    Each picture is taken when the arm rests, and kept when it is sharp and still; OUT/live.html shows the
+    pictures, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command goes on.
+
+    examples:
+      jcr capture captures/table --camera 0 --poses ur:192.168.0.2
+      jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses tcp
+      jcr capture captures/table --camera 0 --poses typed --images 10
+      JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 0.0.0.0:7464
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the capture; one that was begun is gone on with."""
+    camera: str = "0"
+    """V4L2 device number, address of a stream (rtsp://…), or a video file."""
+    poses: str = "tcp"
+    """tcp: a program sends them (docs/capture.md); ur:HOST[:PORT]: a Universal Robots arm; typed: by hand."""
+    listen: str = "127.0.0.1:7464"
+    """With tcp: address and port to listen on; any but this machine's own needs a token."""
+    token: str | None = None
+    """With tcp: what the client must send first; better given as JCR_TOKEN, which other users do not see."""
+    timeout: float = 600.0
+    """With tcp: end when no pose came for so many seconds."""
+    intrinsics_from: Path | None = None
+    """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else estimated."""
+    collect: CollectOptions = field(default_factory=CollectOptions)
+    json: bool = False
+    """Print a JSON line per picture on stdout."""
+    quiet: bool = False
+    """Say nothing on stderr but errors."""
+
+
+def main(arguments: Arguments) -> int:
+    """Collect until there are enough pictures."""
+    from jcr.live.camera import opened
+    from jcr.live.collect import collect
+    from jcr.live.folder import LiveFolder
+
+    def say(text: str) -> None:
+        if not arguments.quiet:
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+    def tell(answer: "Answer", lines: list[str]) -> None:
+        if arguments.json:
+            sys.stdout.write(json.dumps(answer) + "\n")
+            sys.stdout.flush()
+        say("\n".join(lines))
+
+    live = LiveFolder(arguments.out, _lens(arguments.intrinsics_from))
+    say(f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
+    with opened(arguments.camera) as frames:
+        collect(live, frames, _asks(arguments, say), arguments.collect, tell)
+    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command goes on"
+    say(f"{len(live.names)} pictures in {arguments.out}{more}; next: jcr check {arguments.out}")
+    return 0
+
+
+def _asks(arguments: Arguments, say: Any) -> "Iterator[Ask]":
+    from jcr.errors import InputError
+    from jcr.live.line_server import Listen, bound, served_poses
+    from jcr.live.typed import typed_poses
+    from jcr.live.ur import ur_poses
+
+    kind, _, address = arguments.poses.partition(":")
+    if kind == "typed" and not address:
+        yield from typed_poses(sys.stdin, say)
+    elif kind == "ur" and address:
+        yield from ur_poses(*_address(address, 30003, "--poses ur:"), say)
+    elif kind == "tcp" and not address:
+        host, port = _address(arguments.listen, 7464, "--listen ")
+        token = arguments.token or os.environ.get("JCR_TOKEN")
+        listen = Listen(host, port, token, arguments.timeout)
+        with bound(listen) as server:
+            say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
+            yield from served_poses(server, listen)
+    else:
+        raise InputError(f"--poses {arguments.poses}: give tcp, ur:HOST or typed")
+
+
+def _address(text: str, port: int, option: str) -> tuple[str, int]:
+    from jcr.errors import InputError
+
+    host, _, number = text.rpartition(":") if ":" in text else (text, "", str(port))
+    if not host or not number.isdigit() or not int(number) < 65536:
+        raise InputError(f"{option}{text}: no address; write HOST:PORT such as 127.0.0.1:{port}")
+    return host, int(number)
+
+
+def _lens(file: Path | None) -> dict[str, Any] | None:
+    from jcr.capture.read import read_json
+    from jcr.errors import InputError
+
+    if file is None:
+        return None
+    content = read_json(file)
+    lens = content.get("intrinsics") if isinstance(content, dict) else None
+    if not isinstance(lens, dict):
+        raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
+    return {key: lens[key] for key in ("fx", "fy", "cx", "cy", "distortion") if key in lens}

@@ -1,0 +1,92 @@
+"""Taking a capture: each request for a picture is judged, answered, and kept before the next is heard."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.images import brightness_and_sharpness, read_image
+from jcr.files import write_text
+from jcr.live.asks import Answer, Ask
+from jcr.live.camera import Frame
+from jcr.live.coverage import as_answer, coverage, in_words, page
+from jcr.live.folder import LiveFolder
+from jcr.live.look import Picture, grid, picture
+from jcr.live.ur import REST, farther
+
+SAME_PLACE = (0.005, np.radians(1.0))
+"""m, rad: a second picture from within this adds nothing."""
+
+
+@dataclass(frozen=True)
+class CollectOptions:
+    """How pictures are taken."""
+
+    images: int = 12
+    """Stop with so many pictures."""
+    patience: float = 5.0
+    """Seconds to wait for a picture at rest."""
+    reach: tuple[float, float, float, float, float, float] | None = None
+    """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
+
+
+def collect(
+    live: LiveFolder,
+    frames: Iterator[Frame],
+    asks: Iterator[Ask],
+    options: CollectOptions,
+    tell: Callable[[Answer, list[str]], None],
+) -> None:
+    """Take pictures into the folder until there are enough, or nobody asks any more, or the video ends.
+
+    `tell` hears each answer, with the lines a person reads. live.html in the folder shows how it goes.
+    """
+    reach = None if options.reach is None else np.array(options.reach).reshape(2, 3)
+    kept = [_as_kept(live, name) for name in live.names]
+    _show(live, reach, f"{len(live.names)} pictures of {options.images}")
+    for ask in asks if len(live.names) < options.images else ():
+        try:
+            taken = _taken(live, frames, kept, ask, options.patience)
+        except StopIteration:
+            tell({"accepted": False, "reason": "the video has ended"}, ["the video has ended"])
+            ask.answer({"accepted": False, "reason": "the video has ended", "done": True})
+            return
+        if isinstance(taken, str):
+            answer: Answer = {"accepted": False, "reason": taken}
+            lines, headline = [f"refused: {taken}"], f"Refused: {taken}"
+        else:
+            name = live.add(taken.image, ask.base_from_gripper)
+            kept.append(taken)
+            found = coverage(live, reach)
+            answer = {"accepted": True, "image": name, "done": len(live.names) >= options.images}
+            answer |= as_answer(found)
+            headline = f"{len(live.names)} pictures of {options.images}"
+            lines = [f"kept {name}", *in_words(found)]
+        _show(live, reach, headline)
+        ask.answer(answer)
+        tell(answer, lines)
+        if len(live.names) >= options.images:
+            return
+
+
+def _taken(
+    live: LiveFolder, frames: Iterator[Frame], kept: list[Picture], ask: Ask, patience_s: float
+) -> Picture | str:
+    for name, pose in zip(live.names, live.poses, strict=True):
+        if not farther(pose, ask.base_from_gripper, SAME_PLACE):
+            return f"the gripper is where {name} was taken; move on"
+    taken = picture(frames, kept, patience_s)
+    if ask.current is not None and farther(ask.base_from_gripper, ask.current(), REST):
+        return "the arm moved while the picture was taken; let it rest"
+    return taken
+
+
+def _as_kept(live: LiveFolder, name: str) -> Picture:
+    image = read_image(live.folder / name)
+    return Picture(image, grid(image), brightness_and_sharpness(image)[1])
+
+
+def _show(live: LiveFolder, reach: Float[ndarray, "2 3"] | None, headline: str) -> None:
+    write_text(live.folder / "live.html", page(live, coverage(live, reach), headline))

@@ -1,0 +1,86 @@
+"""The capture folder while it grows: whole after every picture, so that stopping loses nothing."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.capture.images import read_image
+from jcr.capture.read import FILE, contained, read_json, read_lens, read_rigid
+from jcr.errors import InputError
+from jcr.files import write_bytes, write_text
+
+THUMBNAIL_PX = 240
+
+
+class LiveFolder:
+    """A capture folder that pictures are added to; what it holds already is kept."""
+
+    def __init__(self, folder: Path, lens: dict[str, Any] | None = None):
+        """Raises InputError when `folder` holds a capture.json that cannot be gone on with."""
+        self.folder = folder
+        self.names: list[str] = []
+        self.poses: list[Float[ndarray, "4 4"]] = []
+        self.lens = lens
+        self.size: tuple[int, int] | None = None
+        self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; name a folder for the capture")
+        if (folder / FILE).exists():
+            self._resume(read_json(folder / FILE))
+
+    def _resume(self, content: Any) -> None:
+        file = self.folder / FILE
+        if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+            raise InputError(f'{file}: has no list "frames"; name a new folder for the capture')
+        for row, frame in enumerate(content["frames"]):
+            if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
+                raise InputError(f"{file}: frame {row} names no image; name a new folder for the capture")
+            where = f"{file}: frame {row}"
+            height, width = read_image(contained(self.folder, frame["image"], where)).shape[:2]
+            self.size = (width, height)
+            self.names.append(frame["image"])
+            self.poses.append(read_rigid(frame.get("base_from_gripper"), where))
+        self.lens = self.lens or content.get("intrinsics")
+        self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
+
+    def add(self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"]) -> str:
+        """Keep a picture (RGB) and its pose, and return the picture's name; capture.json is whole again after."""
+        size = (image.shape[1], image.shape[0])
+        if self.size not in (None, size):
+            raise InputError(
+                f"{self.folder}: holds pictures of {self.size[0]}x{self.size[1]} pixels, the camera gives "
+                f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
+            )
+        if self.lens is not None:
+            read_lens(self.lens, size, self.folder / FILE)
+        name = f"images/{self._next_number():03d}.png"
+        bgr = np.ascontiguousarray(image[..., ::-1])
+        write_bytes(self.folder / name, cv2.imencode(".png", bgr)[1].tobytes())
+        height = round(THUMBNAIL_PX * size[1] / size[0])
+        small = cv2.resize(bgr, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
+        write_bytes(self.folder / self.thumbnail(name), cv2.imencode(".jpg", small)[1].tobytes())
+        self.size = size
+        self.names.append(name)
+        self.poses.append(base_from_gripper)
+        frames = [
+            {"image": name, "base_from_gripper": pose.tolist()}
+            for name, pose in zip(self.names, self.poses, strict=True)
+        ]
+        content = {"frames": frames, "intrinsics": self.lens, **self.rest}
+        write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")
+        return name
+
+    @staticmethod
+    def thumbnail(name: str) -> str:
+        """Where the small copy of a picture lies, in the folder."""
+        return f"thumbnails/{Path(name).stem}.jpg"
+
+    def _next_number(self) -> int:
+        numbers = [int(match[1]) for name in self.names if (match := re.match(r"images/(\d+)\.", name))]
+        return max(numbers, default=-1) + 1

@@ -1,0 +1,152 @@
+"""Gripper poses over TCP, one JSON object a line, from any program that can open a socket (docs/capture.md).
+
+A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) says that the arm rests there now;
+the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.
+"""
+
+import hmac
+import ipaddress
+import json
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jcr.errors import InputError
+from jcr.live.asks import Answer, Ask, pose_of_numbers
+
+MAX_LINE = 65_536
+"""Bytes; a pose takes a few hundred."""
+ANSWER_S = 10.0
+"""A client that does not take its answer within this is gone."""
+
+
+@dataclass(frozen=True)
+class Listen:
+    """Where to listen, and to whom."""
+
+    host: str = "127.0.0.1"
+    port: int = 7464
+    token: str | None = None
+    """What a client's first line must carry, `{"token": "…"}`; required when others can reach us."""
+    timeout_s: float = 600.0
+    """Without a word for so long the capture ends."""
+
+
+def served_poses(server: socket.socket, listen: Listen) -> Iterator[Ask]:
+    """A request per good line, from one client at a time; a bad line is answered, a bad client dropped.
+
+    Raises InputError when nobody says anything for `timeout_s`.
+    """
+    while True:
+        try:
+            client, _ = server.accept()
+        except TimeoutError:
+            raise _silence(listen) from None
+        with client:
+            client.settimeout(listen.timeout_s)
+            done = yield from _served(client, listen)
+        if done:
+            return
+
+
+def bound(listen: Listen) -> socket.socket:
+    """The listening socket; InputError where it cannot be had, or is open to others without a token."""
+    if not _is_loopback(listen.host) and not listen.token:
+        raise InputError(
+            f"--listen {listen.host}:{listen.port}: others can reach that address; give a --token that the "
+            "client sends first, or listen on 127.0.0.1"
+        )
+    try:
+        server = socket.create_server((listen.host, listen.port))
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"--listen {listen.host}:{listen.port}: {error}; choose an address of this machine and a free port"
+        ) from None
+    server.settimeout(listen.timeout_s)
+    return server
+
+
+def _served(client: socket.socket, listen: Listen):
+    """Requests of one client; returns whether it said that it is done."""
+    stream = client.makefile("rb")
+    welcome = listen.token is None
+    while True:
+        try:
+            line = stream.readline(MAX_LINE + 1)
+        except TimeoutError:
+            raise _silence(listen) from None
+        except OSError:
+            return False
+        if not line:
+            return False
+        if len(line) > MAX_LINE:
+            _answer(client, _refusal(f"a line of more than {MAX_LINE} bytes"))
+            return False
+        message = _parsed(line)
+        if not welcome:
+            given = message.get("token") if isinstance(message, dict) else None
+            if not hmac.compare_digest(str(given).encode(), str(listen.token).encode()):
+                _answer(client, _refusal("the first line must be the right token"))
+                return False
+            welcome = True
+            _answer(client, {"accepted": True})
+        elif isinstance(message, dict) and message.get("done") is True:
+            return True
+        elif isinstance(message, str):
+            _answer(client, _refusal(message))
+        else:
+            try:
+                yield _ask(message, client)
+            except InputError as error:
+                _answer(client, _refusal(str(error)))
+
+
+def _parsed(line: bytes) -> dict[str, Any] | str:
+    try:
+        message = json.loads(line)
+    except (ValueError, RecursionError):
+        return 'not JSON; send {"base_from_gripper": [[…], […], […], […]]} on one line'
+    return message if isinstance(message, dict) else "not a JSON object"
+
+
+def _ask(message: dict[str, Any], client: socket.socket) -> Ask:
+    if "base_from_gripper" not in message:
+        raise InputError('no "base_from_gripper" in the line; send 4 rows of 4 numbers in metres')
+    try:
+        numbers = np.array(message["base_from_gripper"], dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        raise InputError("base_from_gripper: not numbers; send 4 rows of 4 in metres") from None
+    return Ask(pose_of_numbers(numbers, "base_from_gripper"), lambda answer: _answer(client, answer))
+
+
+def _answer(client: socket.socket, answer: Answer) -> None:
+    """Send a line; a client that has gone misses it, and the picture is kept all the same."""
+    before = client.gettimeout()
+    client.settimeout(ANSWER_S)
+    try:
+        client.sendall(json.dumps(answer).encode() + b"\n")
+    except OSError:
+        return
+    finally:
+        client.settimeout(before)
+
+
+def _refusal(reason: str) -> Answer:
+    return {"accepted": False, "reason": reason}
+
+
+def _silence(listen: Listen) -> InputError:
+    return InputError(
+        f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the pictures "
+        "taken are kept and the same command goes on"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,69 @@
+"""Whether what the camera shows can be kept: at rest, sharp, exposed, and not what it showed before."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+
+from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
+from jcr.live.camera import Frame
+
+REST_S = 0.2
+"""Two pictures so far apart show whether anything moves."""
+STILL = 2.5
+"""Mean grey levels by which pictures at rest differ on a 160 px wide grid: pixel noise of sigma 10 gives 1.9,
+a shift of one pixel in 640 of a textured tabletop 3."""
+GRID_PX = 160
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that was kept, and what later ones are held against."""
+
+    image: UInt8[ndarray, "h w 3"]
+    grid: Float32[ndarray, "gh gw"]
+    sharpness: float
+
+
+def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> Picture | str:
+    """The first picture at rest that can be kept, or after `patience_s` the reason why none could.
+
+    Those `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
+    file.
+    """
+    earlier = next(frames)
+    end = earlier.time_s + patience_s
+    reason = "no second picture came"
+    while True:
+        frame = next(frames)
+        if frame.time_s - earlier.time_s < REST_S:
+            continue
+        before, now = grid(earlier.image), grid(frame.image)
+        earlier = frame
+        grey, sharpness = brightness_and_sharpness(frame.image)
+        usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
+        if np.abs(now - before).mean() > STILL:
+            reason = "the picture moves; let the arm come to rest and nothing move in view"
+        elif (fault := exposure_fault(grey)) is not None:
+            reason = f"the picture is {fault}; change light or exposure"
+        elif sharpness < BLURRED * usual:
+            reason = f"the picture is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
+        elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
+            reason = (
+                "the gripper moved but the picture is as before; is the stream frozen, the camera another?"
+            )
+        else:
+            return Picture(frame.image, now, sharpness)
+        if frame.time_s > end:
+            return reason
+
+
+def grid(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "gh gw"]:
+    """Grey levels without their mean, coarse enough for a sensor's noise to vanish."""
+    height = max(1, round(GRID_PX * image.shape[0] / image.shape[1]))
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    coarse = cv2.resize(grey, (GRID_PX, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return coarse - coarse.mean()
