@@ -32,14 +32,13 @@ class Coverage:
 
 def coverage(live: LiveFolder, reach: Float[ndarray, "2 3"] | None = None) -> Coverage:
     """What the gripper poses in the folder will show, whatever is in the pictures."""
-    if not live.poses:
-        return Coverage(0, (), None, None, None)
+    if len(live.poses) < 2:
+        return Coverage(len(live.poses), (), None, None, None)
     poses = np.stack(live.poses)
     now, (proposed,) = next_poses(poses, 1, reach=reach)
-    seen = observability(poses) if len(poses) >= 2 else None
     return Coverage(
         len(poses),
-        () if seen is None else seen.unobservable,
+        observability(poses).unobservable,
         now if len(poses) >= 3 else None,
         proposed,
         live.names[proposed.like],
@@ -49,7 +48,8 @@ def coverage(live: LiveFolder, reach: Float[ndarray, "2 3"] | None = None) -> Co
 def in_words(found: Coverage) -> list[str]:
     """A line on what is covered, and lines with the next pose."""
     if found.next_pose is None:
-        return ["no picture yet"]
+        first = "one picture; " if found.pictures else "no picture yet; "
+        return [first + "turn the wrist by 20° or more, and move, between pictures"]
     pose = found.next_pose
     lines = [f"{found.pictures} pictures" + "".join(f"; not shown yet: {name}" for name in found.unseen)]
     if found.expected_std is not None and not found.unseen:
@@ -76,10 +76,10 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta http-equiv
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>jcr capture</title>
 <style>:root{{color-scheme:light dark}}body{{font:15px system-ui,sans-serif;margin:1.5em;max-width:70em}}
 figure{{display:inline-block;margin:0 .6em .6em 0}}figcaption{{font-size:.8em;opacity:.7}}img{{width:180px}}
-svg{{width:20em;max-width:100%;border:1px solid #8888;float:right;margin:0 0 1em 1em}}
+pre{{white-space:pre-wrap}}svg{{width:20em;max-width:100%;border:1px solid #8888;float:right;margin:0 0 1em 1em}}
 .bar{{display:inline-block;width:12em;height:.7em;background:#8884;margin:0 .6em}}
 .bar i{{display:block;height:100%;background:#2a7}}p{{margin:.3em 0}}</style>
-<h1>{verdict}</h1>{plan}<p>{text}</p>{bars}<h2>Pictures</h2>{pictures}</html>
+<h1>{verdict}</h1>{plan}<pre>{text}</pre>{bars}<h2>Pictures</h2>{pictures}</html>
 """
 
 
@@ -90,7 +90,7 @@ def page(live: LiveFolder, found: Coverage, message: str) -> str:
         "</figure>"
         for name in reversed(live.names)
     )
-    text = "<br>".join(escape(line) for line in in_words(found))
+    text = "\n".join(escape(line) for line in in_words(found))
     return _PAGE.format(
         verdict=escape(message), plan=_plan(live, found), text=text, bars=_bars(found), pictures=pictures
     )

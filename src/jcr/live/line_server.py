@@ -4,6 +4,7 @@ A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) sa
 the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.
 """
 
+import contextlib
 import hmac
 import ipaddress
 import json
@@ -83,13 +84,13 @@ def _served(client: socket.socket, listen: Listen):
         if not line:
             return False
         if len(line) > MAX_LINE:
-            _answer(client, _refusal(f"a line of more than {MAX_LINE} bytes"))
+            _dismiss(client, f"a line of more than {MAX_LINE} bytes")
             return False
         message = _parsed(line)
         if not welcome:
             given = message.get("token") if isinstance(message, dict) else None
             if not hmac.compare_digest(str(given).encode(), str(listen.token).encode()):
-                _answer(client, _refusal("the first line must be the right token"))
+                _dismiss(client, "the first line must be the right token")
                 return False
             welcome = True
             _answer(client, {"accepted": True})
@@ -132,6 +133,17 @@ def _answer(client: socket.socket, answer: Answer) -> None:
         return
     finally:
         client.settimeout(before)
+
+
+def _dismiss(client: socket.socket, reason: str) -> None:
+    """A last answer, which closing with unread bytes behind it would take back."""
+    _answer(client, _refusal(reason))
+    client.settimeout(0.2)
+    with contextlib.suppress(OSError):
+        client.shutdown(socket.SHUT_WR)
+        for _ in range(16):
+            if not client.recv(MAX_LINE):
+                return
 
 
 def _refusal(reason: str) -> Answer:
