@@ -17,6 +17,7 @@ from jcr.errors import InputError
 BENCHES = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
+    "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
     "real": "real captures in DIR, against the references stored beside them",
     "run": "the whole job on the bundled capture: time and memory of each stage",
@@ -34,7 +35,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, calibrate, pairs, real or run."""
+    """align, calibrate, map, pairs, real or run."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from jcr.represent.chunks import in_chunks
-from jcr.represent.seen import CROSSED, HIT
+from jcr.represent.seen import CROSSED
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
@@ -73,10 +73,17 @@ class Sample:
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
             state = scene.seen.at(x)
-            occupancy = scene.fields(x, ("occupancy",))["occupancy"][:, 0].sigmoid()
+            # Most of a workspace is unseen, where the field need not be asked.
+            (seen,) = state.nonzero(as_tuple=True)
+            occupancy, unknown = torch.full_like(x[:, 0], unseen), torch.ones_like(state, dtype=torch.bool)
+            if len(seen) == 0:
+                return occupancy, unknown
+            inner = scene.fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()
             # A cell that was hit but not crossed lies behind the surface: it can be solid, never free.
-            known = ((state & CROSSED) != 0) | (((state & HIT) != 0) & (occupancy >= 0.5))
-            return torch.where(known, occupancy, unseen), ~known
+            known = ((state[seen] & CROSSED) != 0) | (inner >= 0.5)
+            occupancy = occupancy.index_put((seen,), torch.where(known, inner, unseen))
+            unknown = unknown.index_put((seen,), ~known)
+            return occupancy, unknown
 
         return self._given(in_chunks(occupancy_unknown, self._x))
 
