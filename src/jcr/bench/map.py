@@ -64,7 +64,7 @@ class MapScore:
     """Of the workspace."""
     color_psnr: float
     label_iou: float
-    """Mean over the labels; as `color_psnr`, on the surface where the map has it."""
+    """Mean over the labels; as `color_psnr`, on the surface where the map knows it."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ def _accuracy(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str
     lines = [
         f"Scene `tabletop` of `jcr simulate`, {VIEWS} views, {POINTS:,} points with true masks as labels; shares of "
         "the workspace within 0.36 x 0.40 m of the middle, in %. F-score, precision and recall of occupied places "
-        "against the surface that the images show, at 10 mm and 5 mm; colour and labels where the map has that surface "
-        "(within 10 mm).",
+        "against the surface that the images show, at 10 mm and 5 mm; colour and labels where the map knows that "
+        "surface.",
         "",
         "| poses | preset | training | F 10 | P 10 | R 10 | F 5 | P 5 | R 5 | false free inside | more than 5 mm in | "
         "false occupied in seen free space | more than 10 mm off | colour PSNR | label mIoU | unknown |",
@@ -305,7 +305,7 @@ def score(scene: SceneMap, places: Places) -> MapScore:
         rates[f"f_{limit}mm"] = float(2 * precision * recall / max(precision + recall, 1e-9))
     inside, free = places.inside, places.seen_free
     called_free = scene.query(x, unknown="occupied").occupancy < 0.5
-    mapped = to_map < 0.01
+    mapped = ~scene.query(surface.x_in_base).unknown
     at = scene.query(surface.x_in_base[mapped])
     return MapScore(
         **rates,

@@ -92,6 +92,10 @@ def carve(
     for step in (0.0, -cell / 2):
         index, inside = seen.index(points_in_base + step * ray)
         flat[index[inside]] = flat[index[inside]] | HIT
+    # A ray shows its line, not the whole of a cell: next to the unseen, where no surface was found between, the
+    # rest of the cell may belong to a thing that gave no points.
+    unsure = dilate(seen.state == 0, 1) & ~dilate((seen.state & HIT) != 0, 1)
+    seen.state[unsure] = 0
     return seen
 
 
