@@ -2,7 +2,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
+
+from jcr.geometry import apply, transform
+from jcr.simulate.scenes import make_scene
+from jcr.simulate.truth import read_truth
 
 ROOT = Path(__file__).parent.parent
 
@@ -22,6 +28,18 @@ def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
     assert finished.returncode == 0, finished.stderr
     assert "report:" in finished.stdout
     return out
+
+
+@pytest.fixture(scope="session")
+def true_mesh(tabletop: Path) -> trimesh.Trimesh:
+    """The simulated table of the bundled capture and all that stands on it, in the base frame."""
+    scene = make_scene("tabletop", read_truth(tabletop).seed)
+    base_from_table = transform(np.eye(3), scene.table_center_in_base)
+    placed = [(base_from_table, part.mesh) for part in scene.table]
+    placed += [(thing.base_from_object, part.mesh) for thing in scene.objects for part in thing.parts]
+    return trimesh.util.concatenate(
+        [trimesh.Trimesh(apply(where, mesh.vertices), mesh.faces, process=False) for where, mesh in placed]
+    )
 
 
 @pytest.fixture(scope="session")

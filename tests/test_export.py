@@ -342,18 +342,9 @@ def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
     assert "comment frame arm_base" in header and "comment unit m" in header
 
 
-def true_mesh(tabletop: Path) -> trimesh.Trimesh:
-    """The simulated table and all that stands on it, in the base frame."""
-    scene = make_scene("tabletop", read_truth(tabletop).seed)
-    base_from_table = transform(np.eye(3), scene.table_center_in_base)
-    placed = [(base_from_table, part.mesh) for part in scene.table]
-    placed += [(thing.base_from_object, part.mesh) for thing in scene.objects for part in thing.parts]
-    return trimesh.util.concatenate(
-        [trimesh.Trimesh(apply(where, mesh.vertices), mesh.faces, process=False) for where, mesh in placed]
-    )
-
-
-def test_mesh_lies_on_the_true_surface_and_faces_free_space(done: Path, tabletop: Path, tmp_path: Path):
+def test_mesh_lies_on_the_true_surface_and_faces_free_space(
+    done: Path, true_mesh: trimesh.Trimesh, tmp_path: Path
+):
     loaded = trimesh.load_scene(export(done, "glb", tmp_path / "map.glb"))
     assert loaded.metadata["frame"] == "base_link" and loaded.metadata["unit"] == "m"
     mesh = loaded.to_geometry()
@@ -362,10 +353,9 @@ def test_mesh_lies_on_the_true_surface_and_faces_free_space(done: Path, tabletop
     rows = np.random.default_rng(0).choice(
         len(mesh.faces), 3000, p=mesh.area_faces / mesh.area, replace=False
     )
-    truth = true_mesh(tabletop)
-    _, distance, at = trimesh.proximity.closest_point(truth, mesh.triangles_center[rows])
+    _, distance, at = trimesh.proximity.closest_point(true_mesh, mesh.triangles_center[rows])
     assert np.median(distance) < 0.003 and np.percentile(distance, 95) < 0.01
-    assert ((mesh.face_normals[rows] * truth.face_normals[at]).sum(1) > 0).mean() > 0.9
+    assert ((mesh.face_normals[rows] * true_mesh.face_normals[at]).sum(1) > 0).mean() > 0.9
     # The colours are those of the nearest points of the cloud.
     cloud = read_cloud(done / "cloud.ply")
     near, at = cKDTree(cloud.points_in_base).query(mesh.vertices)
