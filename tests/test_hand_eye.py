@@ -132,7 +132,7 @@ def test_covariance_matches_a_jackknife_over_images():
     noise = (full.robot_noise.translation, full.robot_noise.rotation)
     left_out = []
     for k in range(30):
-        fit = fit_poses(gripper, camera, start, 1.0 - np.eye(30)[k], noise)
+        fit = fit_poses(gripper, camera, start, ~np.eye(30, dtype=bool)[k], noise)
         left_out.append(error(problem, fit.gripper_from_camera, fit.scale))
     jackknife = 29 / 30 * ((np.array(left_out) - np.mean(left_out, 0)) ** 2).sum(0)
     ratio = np.sqrt(jackknife / np.diag(full.covariance))
@@ -146,7 +146,9 @@ def test_held_out_error_is_that_of_a_fit_without_the_image():
     start = (full.gripper_from_camera, full.scale, full.base_from_recon)
     noise = (full.robot_noise.translation, full.robot_noise.rotation)
     missed = [
-        np.linalg.norm(fit_poses(gripper, camera, start, 1.0 - np.eye(8)[k], noise).translation_residual[k])
+        np.linalg.norm(
+            fit_poses(gripper, camera, start, ~np.eye(8, dtype=bool)[k], noise).translation_residual[k]
+        )
         for k in range(8)
     ]
     assert full.held_out is not None

@@ -59,6 +59,18 @@ class Tracks:
     point: Int[ndarray, " k"]
     """Row of `points_in_recon`."""
     points_in_recon: Float[ndarray, "p 3"]
+    from_pointmaps: bool = False
+    """Matched between pointmaps, with errors that neighbours share, instead of found in the images."""
+
+
+@dataclass(frozen=True)
+class CameraEvidence:
+    """What the pictures alone say of the cameras, and how surely; the robot was not asked."""
+
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    covariance: Float[ndarray, "r r"]
+    """Of the cameras' twists (v, ω) in recon axes, T ← [exp(ω) R, exp(ω) c + v], camera by camera; r = 6m. The
+    recon frame is the first camera's, which is therefore exact."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +92,13 @@ class Reconstruction:
     tracks: Tracks
     backend: str
     is_metric: bool = False
+    """Whether the unit is meant to be the metre."""
     metric_std: float | None = None
     """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
     notes: tuple[str, ...] = ()
     """What the user should know: images not registered, distortion dropped."""
+    evidence: CameraEvidence | None = None
+    """In the same frame, where the robot's poses had a say in `recon_from_camera` or cameras err beside them."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +149,16 @@ relative scale error (scale_true = exp(s)·scale)."""
 
 
 @dataclass(frozen=True)
+class ScaleCheck:
+    """The robot's metre against that of a metric network: an independent check of the scale."""
+
+    off_percent: float
+    """By how much the network's lengths are too long (negative: too short)."""
+    std_percent: float
+    """One-sigma uncertainty that the calibration leaves in that."""
+
+
+@dataclass(frozen=True)
 class HandEye:
     """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
 
@@ -163,6 +188,8 @@ class HandEye:
     """Per pose: why it was rejected, None when used."""
     reprojection_px: Float[ndarray, " n"] | None = None
     """Per pose: median reprojection error after bundle adjustment; NaN where it took no part."""
+    scale_check: ScaleCheck | None = None
+    """None where the reconstruction's unit is not meant to be the metre."""
 
 
 @dataclass(frozen=True)

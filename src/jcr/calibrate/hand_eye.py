@@ -8,7 +8,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibrate.observability import observability
-from jcr.calibrate.pose_fit import Cues, PoseFit, deleted_residuals
+from jcr.calibrate.pose_fit import Cues, PoseFit
 from jcr.calibrate.residuals import paper_residuals
 from jcr.calibrate.robust import robust_fit
 from jcr.errors import InputError
@@ -28,13 +28,16 @@ def solve_hand_eye(
     *,
     robot_noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
 ) -> HandEye:
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
     Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
     the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
-    (m, rad), estimated when None. Raises InputError on shapes, values or counts that cannot be poses; motion
-    that shows too little is an answer (`observability`, `converged`), not an exception.
+    (m, rad), estimated when None. `camera_covariance` (6n,6n) is that of the camera poses where they are not
+    exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
+    counts that cannot be poses; motion that shows too little is an answer (`observability`, `converged`), not an
+    exception.
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
@@ -48,9 +51,17 @@ def solve_hand_eye(
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
 
+    if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
+        raise InputError(
+            f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
+        )
+
     # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit.
     order = np.lexsort(gripper.reshape(n, 16).T)
-    fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues)
+    if camera_covariance is not None:
+        rows = (6 * order[:, None] + np.arange(6)).ravel()
+        camera_covariance = camera_covariance[np.ix_(rows, rows)]
+    fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues, camera_covariance)
     back = np.argsort(order)
     used = used_sorted[back]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
@@ -148,10 +159,7 @@ def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
     """Each used image predicted by a fit to the others; None when too few are left to fit."""
     if used.sum() < 4:
         return None
-    sigma = np.repeat(fit.noise, 3)
-    residual = np.concatenate([fit.translation_residual, fit.rotation_residual], axis=1) / sigma
-    missed = deleted_residuals(residual[used], fit.hat[used]) * sigma
-    metres, radians = np.linalg.norm(missed.reshape(-1, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(fit.missed[used].reshape(-1, 2, 3), axis=2).mean(0)
     return HeldOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )

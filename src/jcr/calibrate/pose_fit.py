@@ -4,12 +4,16 @@ The reported gripper pose of image i differs from `base_from_recon · S_λ(recon
 robot's own noise: σ_t per axis of position, σ_r per axis of orientation. Both are estimated with the rest
 unless given (restricted maximum likelihood), so the covariance is that of the robot at hand. Working with
 images instead of motions keeps their errors independent, and makes the result blind to their order.
+
+Camera poses are taken as exact beside the robot's, unless their joint covariance is given: then both errors count
+(generalised least squares), which is what kinematic alignment does, to first order and with the robot's noise
+estimated. Few images, or a robot better than the cameras, need it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.stats import chi2, f
 
@@ -64,8 +68,10 @@ class PoseFit:
     """Of the two estimates; infinite when the noise was given."""
     hessian: Float[ndarray, "13 13"]
     """Of the negative log likelihood, prior included."""
-    hat: Float[ndarray, "n 6 6"]
-    """Covariance of the prediction at each pose, in units of σ (translation 3, rotation 3)."""
+    missed: Float[ndarray, "n 6"]
+    """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
+    missed_covariance: Float[ndarray, "n 6 6"]
+    """What to expect of that, the pose's own noise included."""
 
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
@@ -102,51 +108,146 @@ def fit_poses(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
     start: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],
-    weights: Float[ndarray, " n"],
+    used: Bool[ndarray, " n"],
     noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
     iterations: int = 50,
 ) -> PoseFit:
-    """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon); noise in (m, rad)."""
-    x, scale, z = start
-    cues = cues or Cues()
-    sigma_t, sigma_r = noise or (5e-4, np.radians(0.1))
-    dof, hessian = (np.inf, np.inf), np.eye(13)
+    """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon) on the `used` poses.
+
+    `noise` is the robot's in (m, rad). `camera_covariance` is that of the twists (v, ω) of the cameras in recon
+    axes, T ← [exp(ω) R, exp(ω) c + v]; None where the cameras are exact beside the robot.
+    """
+    unknowns, cues = start, cues or Cues()
+    robot = noise or (5e-4, np.radians(0.1))
+    dof = (np.inf, np.inf)
+    poses = (base_from_gripper, recon_from_camera, used, camera_covariance, cues)
     for _ in range(iterations):
-        r_t, r_r, j_t, j_r = _residuals(x, scale, z, base_from_gripper, recon_from_camera)
-        h_t = np.einsum("n,nij,nik->jk", weights, j_t, j_t)
-        h_r = np.einsum("n,nij,nik->jk", weights, j_r, j_r)
-        prior_h, prior_g = _prior(x, scale, cues)
-        hessian = h_t / sigma_t**2 + h_r / sigma_r**2 + prior_h
+        system = _system(unknowns, robot, *poses)
+        settled = True
         if noise is None:
-            inverse_h = np.linalg.inv(hessian)
-            m = weights.sum()
-            dof = (
-                max(3 * m - float((inverse_h * h_t).sum()) / sigma_t**2, 0.1),
-                max(3 * m - float((inverse_h * h_r).sum()) / sigma_r**2, 0.1),
-            )
-            squares = float(weights @ (r_t**2).sum(1)), float(weights @ (r_r**2).sum(1))
-            before = (sigma_t, sigma_r)
-            sigma_t, sigma_r = robot_noise(squares, dof, before)
-            settled = abs(sigma_t / before[0] - 1) < 1e-6 and abs(sigma_r / before[1] - 1) < 1e-6
-            hessian = h_t / sigma_t**2 + h_r / sigma_r**2 + prior_h
-        else:
-            settled = True
-        gradient = (
-            np.einsum("n,nij,ni->j", weights, j_t, r_t) / sigma_t**2
-            + np.einsum("n,nij,ni->j", weights, j_r, r_r) / sigma_r**2
-            + prior_g
-        )
-        step = -np.linalg.solve(hessian, gradient)
+            before, (robot, dof) = robot, _estimated_noise(system, robot)
+            settled = bool(np.allclose(robot, before, rtol=1e-6, atol=0.0))
+            system = _system(unknowns, robot, *poses)
+        step = -np.linalg.solve(system.hessian, system.gradient)
         # A wild start on nearly unobservable motions must not throw rotations around the circle.
         step *= min(1.0, 0.5 / max(np.abs(step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300))
-        x, scale, z = _moved(x, scale, z, step)
-        if settled and float(step @ hessian @ step) < 1e-14:
+        unknowns = _moved(*unknowns, step)
+        if settled and float(step @ system.hessian @ step) < 1e-14:
             break
-    r_t, r_r, j_t, j_r = _residuals(x, scale, z, base_from_gripper, recon_from_camera)
-    jacobian = np.concatenate([j_t / sigma_t, j_r / sigma_r], axis=1)
-    hat = jacobian @ np.linalg.inv(hessian) @ np.swapaxes(jacobian, 1, 2)
-    return PoseFit(x, scale, z, r_t, r_r, (sigma_t, sigma_r), dof, hessian, hat)
+    system = _system(unknowns, robot, *poses)
+    missed, missed_covariance = _missed(system, robot)
+    return PoseFit(
+        *unknowns,
+        system.residual[:, :3],
+        system.residual[:, 3:],
+        robot,
+        dof,
+        system.hessian,
+        missed,
+        missed_covariance,
+    )
+
+
+@dataclass(frozen=True)
+class _System:
+    """The equations at one value of the unknowns; r = 6 times the used poses, s = 6n."""
+
+    residual: Float[ndarray, "n 6"]
+    jacobian: Float[ndarray, "n 6 13"]
+    used: Bool[ndarray, " n"]
+    spread: Float[ndarray, "s s"] | None
+    """Covariance that the cameras' errors give the residuals."""
+    weight: Float[ndarray, " r"] | Float[ndarray, "r r"]
+    """Inverse covariance of the used residuals; its diagonal where they are independent."""
+    hessian: Float[ndarray, "13 13"]
+    gradient: Float[ndarray, "13"]
+
+    def weighed(self, x: Float[ndarray, "r *k"]) -> Float[ndarray, "r *k"]:
+        """`weight` times x."""
+        return (self.weight * x.T).T if self.weight.ndim == 1 else self.weight @ x
+
+    def projected(self) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
+        """P r, and the diagonal blocks of P = W - W J H⁻¹ Jᵀ W: what residuals say once the unknowns are fitted
+        (Searle et al., "Variance components", 1992, section 6.6)."""
+        m = int(self.used.sum())
+        by_unknown = self.weighed(self.jacobian[self.used].reshape(6 * m, 13)).reshape(m, 6, 13)
+        if self.weight.ndim == 1:
+            own = self.weight.reshape(m, 6, 1) * np.eye(6)
+        else:
+            own = self.weight.reshape(m, 6, m, 6)[range(m), :, range(m)]
+        explained = by_unknown @ np.linalg.inv(self.hessian) @ np.swapaxes(by_unknown, 1, 2)
+        return self.weighed(self.residual[self.used].ravel()).reshape(m, 6), own - explained
+
+
+def _system(
+    unknowns: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],
+    robot: tuple[float, float],
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    used: Bool[ndarray, " n"],
+    camera_covariance: Float[ndarray, "r r"] | None,
+    cues: Cues,
+) -> _System:
+    residual, jacobian = _residuals(*unknowns, base_from_gripper, recon_from_camera)
+    variance = np.tile(np.repeat(np.square(robot), 3), used.sum())
+    spread, weight = None, 1.0 / variance
+    if camera_covariance is not None:
+        n = len(used)
+        by_camera = _by_camera(*unknowns, recon_from_camera)
+        blocks = camera_covariance.reshape(n, 6, n, 6).swapaxes(1, 2)
+        spread = by_camera[:, None] @ blocks @ np.swapaxes(by_camera, 1, 2)
+        spread = spread.swapaxes(1, 2).reshape(6 * n, 6 * n)
+        rows = np.repeat(used, 6)
+        weight = np.linalg.inv(spread[np.ix_(rows, rows)] + np.diag(variance))
+    prior_hessian, prior_gradient = _prior(*unknowns[:2], cues)
+    system = _System(residual, jacobian, used, spread, weight, prior_hessian, prior_gradient)
+    j = jacobian[used].reshape(-1, 13)
+    weighed = system.weighed(j)
+    return replace(
+        system,
+        hessian=weighed.T @ j + prior_hessian,
+        gradient=weighed.T @ residual[used].ravel() + prior_gradient,
+    )
+
+
+def _estimated_noise(
+    system: _System, robot: tuple[float, float]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """One step of restricted maximum likelihood for the robot's noise, and its degrees of freedom."""
+    told, own = system.projected()
+    variance = np.repeat(np.square(robot), 3)
+    squares = ((variance * told) ** 2).sum(0)
+    degrees = (variance * np.einsum("mii->mi", own)).sum(0)
+    dof = max(float(degrees[:3].sum()), 0.1), max(float(degrees[3:].sum()), 0.1)
+    return robot_noise((float(squares[:3].sum()), float(squares[3:].sum())), dof, robot), dof
+
+
+def _missed(
+    system: _System, robot: tuple[float, float]
+) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
+    """Each pose's residual from a fit without it, and its covariance; of a used pose P_ii⁻¹ (P r)_i and P_ii⁻¹."""
+    sigma, used = np.repeat(robot, 3), system.used
+    missed, covariance = np.empty_like(system.residual), np.empty((len(used), 6, 6))
+    told, own = system.projected()
+    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
+    missed[used] = sigma * np.einsum("mij,mj->mi", without, sigma * told)
+    covariance[used] = sigma[:, None] * without * sigma
+    inverse_hessian = np.linalg.inv(system.hessian)
+    rows = np.repeat(used, 6)
+    for i in np.flatnonzero(~used):
+        residual, jacobian, own_spread = system.residual[i], system.jacobian[i], np.diag(sigma**2)
+        if system.spread is not None:
+            # What the other cameras' errors tell of this one's (best linear unbiased prediction).
+            shared = system.spread[6 * i : 6 * i + 6, rows]
+            gain = shared @ system.weight
+            residual = residual - gain @ system.residual[used].ravel()
+            jacobian = jacobian - gain @ system.jacobian[used].reshape(-1, 13)
+            own_spread = own_spread + system.spread[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] - gain @ shared.T
+        missed[i] = residual
+        covariance[i] = own_spread + jacobian @ inverse_hessian @ jacobian.T
+    return missed, covariance
 
 
 def pose_information(
@@ -155,8 +256,8 @@ def pose_information(
     """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its picture shows."""
     # Any frame and unit of the reconstruction will do: the base's, in metres.
     camera = base_from_gripper @ gripper_from_camera
-    _, _, j_t, j_r = _residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
-    j = np.concatenate([j_t / noise[0], j_r / noise[1]], axis=1)
+    _, j = _residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
+    j /= np.repeat(noise, 3)[:, None]
     return np.swapaxes(j, 1, 2) @ j
 
 
@@ -175,27 +276,39 @@ def _residuals(
     z: Float[ndarray, "4 4"],
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Float[ndarray, "n 3 13"], Float[ndarray, "n 3 13"]]:
-    """Residuals of position (base axes) and orientation (gripper axes) and their Jacobians.
+) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
+    """Residuals of position (base axes) and orientation (gripper axes) and their Jacobian.
 
     Perturbations: R_X ← exp(ω) R_X, t_X + dt, λ·exp(s), R_Z ← exp(ζ) R_Z, t_Z + dz.
     """
     predicted = predict(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
-    r_t = predicted[:, :3, 3] - base_from_gripper[:, :3, 3]
-    r_r = rotation_log(np.swapaxes(base_from_gripper[:, :3, :3], 1, 2) @ rotation)
+    turned = rotation_log(np.swapaxes(base_from_gripper[:, :3, :3], 1, 2) @ rotation)
+    residual = np.concatenate([predicted[:, :3, 3] - base_from_gripper[:, :3, 3], turned], axis=1)
     arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
-    n = len(predicted)
-    j_t = np.zeros((n, 3, 13))
-    j_t[:, :, TRANSLATION] = -rotation
-    j_t[:, :, ROTATION] = -rotation @ skew(x[:3, 3])
-    j_t[:, :, 6] = arm
-    j_t[:, :, BASE_TRANSLATION] = np.eye(3)
-    j_t[:, :, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
-    j_r = np.zeros((n, 3, 13))
-    j_r[:, :, ROTATION] = -np.eye(3)
-    j_r[:, :, BASE_ROTATION] = np.swapaxes(rotation, 1, 2)
-    return r_t, r_r, j_t, j_r
+    j = np.zeros((len(predicted), 6, 13))
+    j[:, :3, TRANSLATION] = -rotation
+    j[:, :3, ROTATION] = -rotation @ skew(x[:3, 3])
+    j[:, :3, 6] = arm
+    j[:, :3, BASE_TRANSLATION] = np.eye(3)
+    j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
+    j[:, 3:, ROTATION] = -np.eye(3)
+    j[:, 3:, BASE_ROTATION] = np.swapaxes(rotation, 1, 2)
+    return residual, j
+
+
+def _by_camera(
+    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
+) -> Float[ndarray, "n 6 6"]:
+    """Derivative of the residuals by the twist (v, ω) of each camera, T ← [exp(ω) R, exp(ω) c + v]."""
+    base_from_recon = z[:3, :3]
+    predicted = predict(x, scale, z, recon_from_camera)[:, :3, :3]
+    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
+    j = np.zeros((len(predicted), 6, 6))
+    j[:, :3, :3] = scale * base_from_recon
+    j[:, :3, 3:] = -base_from_recon @ skew(scale * recon_from_camera[:, :3, 3] - lever)
+    j[:, 3:, 3:] = np.swapaxes(predicted, 1, 2) @ base_from_recon
+    return j
 
 
 def _prior(

@@ -33,23 +33,25 @@ def robust_fit(
     recon_from_camera: Poses,
     noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
 ) -> tuple[PoseFit, Bool[ndarray, " n"]]:
     """The fit to the images that agree with each other, and which those are.
 
     With fewer than five images there is nothing to vote with, and all are kept.
     """
     n = len(base_from_gripper)
+    given = (noise, cues, camera_covariance)
     if n < 5:
         everything = np.ones(n, dtype=bool)
-        return _fit(base_from_gripper, recon_from_camera, everything, noise, cues), everything
+        return _fit(base_from_gripper, recon_from_camera, everything, *given), everything
     trusted = _least_trimmed(base_from_gripper, recon_from_camera)
-    fit = _fit(base_from_gripper, recon_from_camera, trusted, noise, cues)
+    fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
     for _ in range(10):
-        agreeing = _agreeing(fit, trusted, noise)
+        agreeing = _agreeing(fit, noise)
         if agreeing.sum() < 4 or (agreeing == trusted).all():
             break
         trusted = agreeing
-        fit = _fit(base_from_gripper, recon_from_camera, trusted, noise, cues)
+        fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
     return fit, trusted
 
 
@@ -59,23 +61,19 @@ def _fit(
     trusted: Bool[ndarray, " n"],
     noise: tuple[float, float] | None,
     cues: Cues | None,
+    camera_covariance: Float[ndarray, "r r"] | None,
 ) -> PoseFit:
-    weights = trusted.astype(float)
-    start = closed_form(base_from_gripper, recon_from_camera, weights)
+    start = closed_form(base_from_gripper, recon_from_camera, trusted.astype(float))
     # A negative or vanishing scale is no reconstruction's; the fit needs a positive one to start from.
     scale = start[1] if start[1] > 0 else max(abs(start[1]), 1e-6)
-    return fit_poses(base_from_gripper, recon_from_camera, (start[0], scale, start[2]), weights, noise, cues)
+    start = (start[0], scale, start[2])
+    return fit_poses(base_from_gripper, recon_from_camera, start, trusted, noise, cues, camera_covariance)
 
 
-def _agreeing(
-    fit: PoseFit, trusted: Bool[ndarray, " n"], noise: tuple[float, float] | None
-) -> Bool[ndarray, " n"]:
+def _agreeing(fit: PoseFit, noise: tuple[float, float] | None) -> Bool[ndarray, " n"]:
     """Images whose distance from a fit *without them* is within what noise explains."""
-    sigma = np.repeat(np.maximum(fit.noise, 1e-9), 3)
-    residual = np.concatenate([fit.translation_residual, fit.rotation_residual], axis=1) / sigma
-    # A used image pulled the fit towards itself (variance I − H); an unused one meets its error bar (I + H).
-    spread = np.eye(6) + np.where(trusted[:, None, None], -0.999, 1.0) * fit.hat
-    distance = np.einsum("ni,ni->n", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
+    gap = np.linalg.solve(fit.missed_covariance, fit.missed[..., None])[..., 0]
+    distance = np.einsum("ni,ni->n", fit.missed, gap)
     nu = min(min(fit.degrees_of_freedom), 1e6) if noise is None else 1e6
     within_noise = distance < 6 * f_distribution.isf(REJECT_AT, 6, nu)
     small = (np.linalg.norm(fit.translation_residual, axis=1) < TOLERANCE[0]) & (

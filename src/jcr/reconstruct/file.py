@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from jcr.errors import InputError
 from jcr.files import written_whole
-from jcr.records import Intrinsics, Reconstruction, Tracks
+from jcr.records import CameraEvidence, Intrinsics, Reconstruction, Tracks
 
 FORMAT = "jcr.reconstruction/1"
 
@@ -36,7 +37,13 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "track_x_px": reconstruction.tracks.x_px,
         "track_point": reconstruction.tracks.point,
         "track_points_in_recon": reconstruction.tracks.points_in_recon,
+        "tracks_from_pointmaps": np.array(reconstruction.tracks.from_pointmaps),
     }
+    if (evidence := reconstruction.evidence) is not None:
+        arrays |= {
+            "evidence_recon_from_camera": evidence.recon_from_camera,
+            "evidence_covariance": evidence.covariance,
+        }
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
 
@@ -63,11 +70,13 @@ def read_reconstruction(path: Path) -> Reconstruction:
                     file["track_x_px"],
                     file["track_point"],
                     file["track_points_in_recon"],
+                    bool(file["tracks_from_pointmaps"]),
                 ),
                 backend=about["backend"],
                 is_metric=about["is_metric"],
                 metric_std=about["metric_std"],
                 notes=tuple(about["notes"]),
+                evidence=_evidence(file),
             )
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
@@ -75,6 +84,12 @@ def read_reconstruction(path: Path) -> Reconstruction:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
+
+
+def _evidence(file: Mapping[str, np.ndarray]) -> CameraEvidence | None:
+    if "evidence_covariance" not in file:
+        return None
+    return CameraEvidence(file["evidence_recon_from_camera"], file["evidence_covariance"])
 
 
 def _intrinsics(fields: dict[str, Any]) -> Intrinsics:
