@@ -152,6 +152,40 @@ def test_out_of_memory_halves_the_batch_and_says_so(
     np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
 
 
+def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_says_so(
+    loaded: LoadedNetwork,
+    images: PreparedImages,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(Dust3r, "device", torch.device("cuda"))
+    encode = predict._Predictor._encode
+    tried = []
+
+    def encode_on_the_cpu_alone(self, rows):
+        if self.device.type == "cuda":
+            tried.append(len(rows))
+            raise torch.cuda.OutOfMemoryError("out of memory")
+        return encode(self, rows)
+
+    monkeypatch.setattr(predict._Predictor, "_encode", encode_on_the_cpu_alone)
+    monkeypatch.setitem(predict.MAX_BATCH, "cuda", 4)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    with caplog.at_level(logging.WARNING):
+        pairs, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))
+    assert tried == [4, 2, 1]
+    assert [note.split(":")[1] for note in notes] == [
+        " going on with 2 pairs at a time",
+        " going on with 1 pairs at a time",
+        " going on, slowly, on the CPU",
+    ]
+    assert all(note in caplog.text for note in notes)
+    monkeypatch.undo()
+    undisturbed = predicted(loaded, images, options(tmp_path / "none", cache_gb=0.0))
+    np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
+
+
 def test_file_round_trip_and_faults(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     edges = complete_pairs(3)

@@ -62,7 +62,7 @@ def hand_eye_error(truth: Truth, found: KinematicAlignment) -> np.ndarray:
 
 def test_exact_input_gives_the_hand_eye_transform_metres_and_the_base_frame():
     truth = robot(3, 0, PairErrors(pixel=0.0, warp=0.0, outliers=0.0))
-    found = align_kinematic(truth.predictions, truth.base_from_gripper, KinematicOptions(0.0, 0.0))
+    found = align_kinematic(truth.predictions, truth.base_from_gripper, KinematicOptions((0.0, 0.0)))
     # Three views of 48x36 float32 points.
     assert np.abs(hand_eye_error(truth, found)).max() < 1e-4
     np.testing.assert_allclose(found.alignment.recon_from_camera, truth.base_from_camera, atol=1e-4)
@@ -77,7 +77,7 @@ def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
         alignment = align(truth.predictions, FEW_PIXELS)
         guess, scale = hand_eye_from_motions(truth.base_from_gripper, alignment.recon_from_camera)
         found = align_kinematic(
-            truth.predictions, truth.base_from_gripper, KinematicOptions(0.0, 0.0, FEW_PIXELS)
+            truth.predictions, truth.base_from_gripper, KinematicOptions((0.0, 0.0), FEW_PIXELS)
         )
         free.append(
             [np.linalg.norm(guess[:3, 3] - truth.gripper_from_camera[:3, 3]), abs(scale / truth.scale - 1)]
@@ -99,7 +99,7 @@ def test_covariance_covers_the_error():
     for seed in range(8):
         truth = robot(5, seed, noise=noise)
         found = align_kinematic(
-            truth.predictions, truth.base_from_gripper, KinematicOptions(*noise, FEW_PIXELS)
+            truth.predictions, truth.base_from_gripper, KinematicOptions(noise, FEW_PIXELS)
         )
         error = hand_eye_error(truth, found)
         squared.append(error @ np.linalg.solve(found.covariance, error))
@@ -110,7 +110,7 @@ def test_covariance_covers_the_error():
 def test_gripper_poses_move_only_within_the_robots_noise():
     noise = 0.002, 0.006
     truth = robot(6, 3, noise=noise)
-    found = align_kinematic(truth.predictions, truth.base_from_gripper, KinematicOptions(*noise, FEW_PIXELS))
+    found = align_kinematic(truth.predictions, truth.base_from_gripper, KinematicOptions(noise, FEW_PIXELS))
     moved = inverse(truth.base_from_gripper) @ found.base_from_gripper
     assert 0.2 * noise[0] < np.abs(moved[:, :3, 3]).mean() < 2 * noise[0]
     assert 0.2 * noise[1] < np.abs(rotation_log(moved[:, :3, :3])).mean() < 2 * noise[1]
@@ -123,7 +123,7 @@ def test_a_wrong_gripper_pose_is_named():
     truth = robot(6, 1)
     poses = truth.base_from_gripper.copy()
     poses[2, :3, 3] += [0.02, 0.0, 0.0]
-    found = align_kinematic(truth.predictions, poses, KinematicOptions(0.0005, 0.0017, FEW_PIXELS))
+    found = align_kinematic(truth.predictions, poses, KinematicOptions((0.0005, 0.0017), FEW_PIXELS))
     assert len(found.alignment.notes) == 1
     assert "#2" in found.alignment.notes[0]
 
@@ -146,7 +146,7 @@ def test_motions_without_rotation_leave_the_translation_open_and_say_so():
         )
         first_view[e] = (truth.depth[n][..., None] * _ray(predictions)).astype(np.float32)
     still = PairPredictions(predictions.edges, first_view, predictions.conf, second_view, predictions.conf2)
-    found = align_kinematic(still, poses, KinematicOptions(0.0005, 0.0017, FEW_PIXELS))
+    found = align_kinematic(still, poses, KinematicOptions((0.0005, 0.0017), FEW_PIXELS))
     assert np.sqrt(np.diag(found.covariance)[:3]).max() > 1.0
     assert np.sqrt(found.covariance[6, 6]) < 0.05
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr import __version__
+from jcr.auto import best_reconstruction
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.calibrate.calibrate import calibrate as calibrate_stage
 from jcr.calibrate.file import CalibrationFile, calibration_file, failed_file, write_calibration
@@ -22,8 +23,8 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import write_cloud
 from jcr.files import write_text
-from jcr.progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, chosen, device_of, reconstruct
+from jcr.progress import Progress, silent
+from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
 from jcr.reconstruct.file import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.build import build_scene
@@ -136,15 +137,18 @@ def read_capture_of(out: str | Path) -> Capture:
 
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
-    report = progress or _silent
-    made_from = _fingerprint(capture, asdict(options.reconstruct))
+    report = progress or silent
+    # What auto stands for changes with the weights that are on this machine.
+    made_from = _fingerprint(
+        capture, asdict(options.reconstruct) | {"backend": candidates(options.reconstruct)}
+    )
     state = _read_state(folder)
     start = time.perf_counter()
     try:
         if state.get("reconstruct") == made_from:
             reconstruction = read_reconstruction(folder / "reconstruction.npz")
         else:
-            reconstruction = reconstruct(capture, options.reconstruct, progress)
+            reconstruction = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
             write_reconstruction(folder / "reconstruction.npz", reconstruction)
         state = {
             "capture": str(capture.folder.resolve()),
@@ -158,7 +162,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         report("calibrate", 1.0)
     except NotTrustedError as error:
         timings = {"reconstruct": round(time.perf_counter() - start, 3)}
-        failed = failed_file(capture, chosen(options.reconstruct), str(error), timings, __version__)
+        failed = failed_file(capture, candidates(options.reconstruct)[-1], str(error), timings, __version__)
         write_calibration(folder / "calibration.json", failed)
         _write_log(folder, failed)
         raise
@@ -185,7 +189,7 @@ def _map(
     if len(added):
         from jcr.reconstruct.added import extend
 
-        reconstruction = extend(reconstruction, result.hand_eye, added, device, progress or _silent)
+        reconstruction = extend(reconstruction, result.hand_eye, added, device, progress or silent)
         write_added(added, capture)
     cloud = point_cloud(capture, reconstruction, result.hand_eye, options=options.cloud)
     write_cloud(folder / "cloud.ply", cloud)
@@ -202,10 +206,6 @@ def _report(capture: Capture, result: RunResult) -> None:
     from jcr.report.html import report_html
 
     write_text(result.out / "report.html", report_html(capture, result))
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """Progress that nobody asked for."""
 
 
 def _with_backend(options: RunOptions | None, backend: str | None) -> RunOptions:

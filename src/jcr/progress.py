@@ -8,11 +8,15 @@ Progress = Callable[[str, float], None]
 """Told the stage's name and the fraction of it that is done."""
 
 
+def silent(stage: str, fraction: float) -> None:
+    """Progress that nobody watches."""
+
+
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     """Yield the callable that stages report to; bars are drawn on a terminal, unless `quiet`."""
     if quiet or not sys.stderr.isatty():
-        yield lambda stage, fraction: None
+        yield silent
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn

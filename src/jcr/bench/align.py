@@ -215,7 +215,7 @@ def _hand_eye_trial(images: int, seed: int, noise: tuple[float, float]) -> Float
     free = align(predictions)
     held = (max(noise[0], 1e-5), max(noise[1], 1e-5))
     after = solve_hand_eye(base_from_gripper, free.recon_from_camera, robot_noise=held)
-    kinematic = align_kinematic(predictions, base_from_gripper, KinematicOptions(*noise))
+    kinematic = align_kinematic(predictions, base_from_gripper, KinematicOptions(noise))
     return np.array(
         [
             [

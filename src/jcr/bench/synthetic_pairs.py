@@ -1,15 +1,19 @@
 """Pairwise pointmaps of a known tabletop scene with the errors a network makes, and the truth beside them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_exp, transform
-from jcr.reconstruct.dust3r.pairs import PairPredictions
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
+from jcr.reconstruct.dust3r.pairs import PairPredictions, complete_pairs
+from jcr.reconstruct.lens import rays
 from jcr.records import Intrinsics
+from jcr.simulate.truth import read_truth, true_depth
 
 SPHERES = np.array([[0.12, 0.04, 0.08, 0.08], [-0.17, 0.13, 0.06, 0.06], [0.03, -0.21, 0.10, 0.10]])
 """Centre and radius, metres; they lie on the table z = 0."""
@@ -76,11 +80,24 @@ def synthetic_pairs(
     k = intrinsics or Intrinsics(0.95 * width, 0.95 * width, width / 2, height / 2, width, height)
     images = int(edges.max()) + 1
     base_from_camera = _cameras(images, rng)
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    ray = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x, dtype=float)], axis=-1)
-    depth = np.stack([_depth(pose, ray) for pose in base_from_camera])
-    x_in_camera = depth[..., None] * ray
+    depth = np.stack([_depth(pose, rays(k)) for pose in base_from_camera])
+    return predicted_pairs(
+        edges, base_from_camera, depth, k, errors, rng, carries_lens=intrinsics is not None
+    )
 
+
+def predicted_pairs(
+    edges: Int[ndarray, "e 2"],
+    base_from_camera: Float[ndarray, "n 4 4"],
+    depth: Float[ndarray, "n h w"],
+    k: Intrinsics,
+    errors: PairErrors,
+    rng: np.random.Generator,
+    carries_lens: bool,
+) -> tuple[PairPredictions, PairTruth]:
+    """What a network would predict of views of known depth (0: nothing there), each pair in a unit of its own."""
+    height, width = depth.shape[1:]
+    x_in_camera = depth[..., None] * rays(k)
     count = len(edges)
     unit = np.exp(rng.uniform(-np.log(2), np.log(2), count))
     spoilt = rng.permutation(count)[: errors.wrong_pairs + errors.noise_pairs]
@@ -88,7 +105,7 @@ def synthetic_pairs(
     confidence = np.empty((2, count, height, width), np.float32)
     for e, (first, second) in enumerate(edges):
         first_from_second = inverse(base_from_camera[first]) @ base_from_camera[second]
-        baseline_deg = np.degrees(np.arccos(np.clip((np.trace(first_from_second[:3, :3]) - 1) / 2, -1, 1)))
+        baseline_deg = float(np.degrees(rotation_angle(first_from_second[:3, :3])))
         turn = rotation_exp(np.radians(rng.normal(0, 1, 3) * errors.pair_turn_deg))
         first_from_second = transform(turn, np.zeros(3)) @ first_from_second
         if e in spoilt[: errors.wrong_pairs]:
@@ -96,30 +113,68 @@ def synthetic_pairs(
                 transform(rotation_exp(rng.normal(0, 0.5, 3)), rng.normal(0, 0.3, 3)) @ first_from_second
             )
         for view, image in enumerate((first, second)):
-            pose = first_from_second if view else np.eye(4)
-            exact = x_in_camera[image] @ pose[:3, :3].T + pose[:3, 3]
+            exact = apply(first_from_second, x_in_camera[image]) if view else x_in_camera[image]
             growth = 1 + view * baseline_deg / errors.baseline_growth_deg
             outlier = rng.random((height, width)) < errors.outliers
-            white = errors.pixel * growth * np.where(outlier, 20, 1) * depth[image]
-            stretched = exact * (1 + errors.warp * growth * _smooth(rng, height, width))[..., None]
-            bend = errors.bend * growth * np.stack([_smooth(rng, height, width) for _ in range(3)], axis=-1)
-            made = stretched + np.cross(bend, exact) + white[..., None] * rng.normal(size=exact.shape)
+            made = _with_errors(exact, depth[image], outlier, growth, errors, rng)
             if e in spoilt[errors.wrong_pairs :]:
                 made = rng.normal(0, 0.3, exact.shape) + [0, 0, 1]
             points[view, e] = unit[e] * made
             log_confidence = (
                 rng.normal(1.8, 0.3, (height, width)) - 3 * outlier - 0.01 * baseline_deg * (1 + view)
             )
-            confidence[view, e] = 1 + np.exp(log_confidence - 0.4 * np.clip(depth[image] - 1, 0, 2))
+            log_confidence -= 0.4 * np.clip(depth[image] - 1, 0, 2)
+            confidence[view, e] = np.where(depth[image] > 0, 1 + np.exp(log_confidence), 1)
     predictions = PairPredictions(
         edges=edges.astype(np.int64),
         pts3d=points[0],
         conf=confidence[0],
         pts3d_in_other_view=points[1],
         conf2=confidence[1],
-        intrinsics=intrinsics,
+        intrinsics=k if carries_lens else None,
     )
     return predictions, PairTruth(base_from_camera, depth, k, unit, spoilt)
+
+
+def _with_errors(
+    exact: Float[ndarray, "h w 3"],
+    depth: Float[ndarray, "h w"],
+    outlier: Bool[ndarray, "h w"],
+    growth: float,
+    errors: PairErrors,
+    rng: np.random.Generator,
+) -> Float[ndarray, "h w 3"]:
+    """Points with smooth errors along and across the sight and white ones in all directions."""
+    height, width = depth.shape
+    white = errors.pixel * growth * np.where(outlier, 20, 1) * depth
+    stretched = exact * (1 + errors.warp * growth * _smooth(rng, height, width))[..., None]
+    bend = errors.bend * growth * np.stack([_smooth(rng, height, width) for _ in range(3)], axis=-1)
+    return stretched + np.cross(bend, exact) + white[..., None] * rng.normal(size=exact.shape)
+
+
+def pairs_of_capture(
+    folder: Path, size: tuple[int, int] = (128, 96), errors: PairErrors | None = None, seed: int = 0
+) -> tuple[PairPredictions, PairTruth]:
+    """What a network would predict of all pairs of a simulated capture, from its true depth.
+
+    The images' size must be an odd multiple of `size`, so that the grid's pixels are pixels of the images.
+    """
+    truth = read_truth(folder)
+    lens, (width, height) = truth.intrinsics, size
+    factor = lens.width // width
+    if factor % 2 == 0 or (factor * width, factor * height) != (lens.width, lens.height):
+        raise InputError(
+            f"{folder}: images of {lens.width}x{lens.height} are no odd multiple of {width}x{height}"
+        )
+    count = len(truth.images)
+    middle = factor // 2
+    depth = np.stack([true_depth(truth, k)[middle::factor, middle::factor] for k in range(count)])
+    center = [(c - middle) / factor for c in (lens.cx, lens.cy)]
+    k = Intrinsics(lens.fx / factor, lens.fy / factor, *center, width, height)
+    edges, rng = complete_pairs(count), np.random.default_rng(seed)
+    return predicted_pairs(
+        edges, truth.base_from_camera, depth, k, errors or PairErrors(), rng, carries_lens=True
+    )
 
 
 def _cameras(count: int, rng: np.random.Generator) -> Float[ndarray, "n 4 4"]:

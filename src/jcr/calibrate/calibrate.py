@@ -14,8 +14,10 @@ from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
 from jcr.calibrate.residuals import paper_residuals
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
-from jcr.records import Capture, HandEye, HeldOut, Reconstruction, RobotNoise, Tracks
+from jcr.records import Capture, HandEye, HeldOut, Reconstruction, RobotNoise, ScaleCheck, Tracks
 
+FAR_SCALE = float(np.log(1.2))
+"""Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
 
@@ -39,23 +41,36 @@ def calibrate(
 ) -> HandEye:
     """Hand-eye calibration of the registered images; per-pose fields are in the reconstruction's order.
 
-    Raises NotTrustedError with fewer than two registered images.
+    Camera poses that come with their covariance are weighed with it. Bundle adjustment then follows on
+    correspondences found in the images; on those between pointmaps, whose errors neighbours share, its result
+    stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
+    images.
     """
-    options = options or CalibrateOptions()
+    hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
+    # A unit that somebody vouches for was used for the scale, and is no check of it.
+    independent = reconstruction.is_metric and reconstruction.metric_std is None
+    return _scale_checked(hand_eye) if independent else hand_eye
+
+
+def _calibrated(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> HandEye:
     gripper = capture.base_from_gripper[reconstruction.image_index]
-    camera = reconstruction.recon_from_camera
+    evidence = reconstruction.evidence
+    camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
     if len(camera) < 2:
         raise NotTrustedError(f"{len(camera)} of {len(capture)} images registered; overlap the views more")
     noise = None
     if options.robot_noise is not None:
         noise = (options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1])))
     cues = _cues(capture, reconstruction, options)
+    camera_covariance = None if evidence is None else evidence.covariance
     contradiction = None
     if cues is None and (metric_std := reconstruction.metric_std) is not None:
-        free = solve_hand_eye(gripper, camera, robot_noise=noise)
+        free = solve_hand_eye(gripper, camera, robot_noise=noise, camera_covariance=camera_covariance)
         contradiction = scale_contradiction(free, metric_std)
         cues = Cues(scale=(1.0, metric_std))
-    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues)
+    hand_eye = solve_hand_eye(
+        gripper, camera, robot_noise=noise, cues=cues, camera_covariance=camera_covariance
+    )
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
     if contradiction is not None:
         return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
@@ -79,7 +94,40 @@ def calibrate(
         noise,
         refine_lens=capture.intrinsics is None,
     )
-    return judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
+    refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
+    if tracks.from_pointmaps and not _better(refined.held_out, hand_eye.held_out):
+        return hand_eye
+    return refined
+
+
+def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
+    """Whether images left out are missed by less; not, where too few images tell."""
+    if one is None or other is None:
+        return False
+    return one.missed_m < other.missed_m
+
+
+def _scale_checked(hand_eye: HandEye) -> HandEye:
+    """With how far a network's own metre is from the robot's; a warning where it is far beyond its error."""
+    # A network's length of 1 is `scale` metres by the robot.
+    std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
+    check = ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
+    hand_eye = replace(hand_eye, scale_check=check)
+    if abs(np.log(hand_eye.scale)) < max(FAR_SCALE, 3 * np.sqrt(hand_eye.covariance[6, 6])):
+        return hand_eye
+    remark = f"{in_words(check)}; check the unit of the gripper poses"
+    return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+
+
+def in_words(check: ScaleCheck) -> str:
+    """How far the network's own scale is from the robot's, and how sure that is."""
+    off, std = check.off_percent, check.std_percent
+    if abs(off) < 2 * std:
+        return f"the network's own metre agrees with the robot's ({off:+.2g} ± {std:.2g} %)"
+    if off > 100:
+        return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
+    direction = "long" if off > 0 else "short"
+    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} by the robot's"
 
 
 def _cues(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:
@@ -109,7 +157,7 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     """The observations of the used images, whose rows are counted anew."""
     kept = used[tracks.image]
     row = np.cumsum(used) - 1
-    return Tracks(row[tracks.image[kept]], tracks.x_px[kept], tracks.point[kept], tracks.points_in_recon)
+    return replace(tracks, image=row[tracks.image[kept]], x_px=tracks.x_px[kept], point=tracks.point[kept])
 
 
 def _refined(

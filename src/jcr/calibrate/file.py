@@ -80,6 +80,13 @@ class Lens(_Part):
     height: int
 
 
+class NetworkScale(_Part):
+    """How far a metric network's own lengths are from the robot's (positive: too long), and how sure that is."""
+
+    off_percent: float
+    std_percent: float
+
+
 class Proposal(_Part):
     """A gripper pose worth adding, and what would then be known."""
 
@@ -109,6 +116,7 @@ class CalibrationFile(_Part):
     timings_s: dict[str, float]
     version: str
     next_poses: list[Proposal] = []
+    scale_check: NetworkScale | None = None
 
 
 def calibration_file(
@@ -120,7 +128,7 @@ def calibration_file(
 ) -> CalibrationFile:
     """The file of a calibration of `capture`."""
     std = np.sqrt(np.diag(hand_eye.covariance))
-    held_out = hand_eye.held_out
+    held_out, check = hand_eye.held_out, hand_eye.scale_check
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     return CalibrationFile(
         gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
@@ -164,6 +172,7 @@ def calibration_file(
             )
             for pose in _proposals(capture, reconstruction, hand_eye)
         ],
+        scale_check=None if check is None else NetworkScale(**vars(check)),
     )
 
 

@@ -18,6 +18,7 @@ from numpy import ndarray
 from scipy.stats import chi2, f
 
 from jcr.geometry import inverse, rotation_exp, rotation_log, skew, transform
+from jcr.records import REACH
 
 Poses = Float[ndarray, "n 4 4"]
 TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
@@ -33,12 +34,10 @@ PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
 """So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
 NOISE_FLOOR = (2e-5, np.radians(0.002))
 """m, rad; so that a perfect fit does not claim a perfect robot."""
-REACH = 0.45
-"""m. A joint's error shows in position as in orientation times the reach behind it: σ_t ≈ REACH · σ_r."""
 REACH_WEIGHT = 5.0
-"""That relation counts as so many observations. A lens that is slightly off disturbs positions more than
-orientations, and few images do not tell the two noises apart: without it, real captures trust positions too
-much."""
+"""The relation σ_t ≈ REACH · σ_r counts as so many observations. A lens that is slightly off disturbs positions
+more than orientations, and few images do not tell the two noises apart: without it, real captures trust
+positions too much."""
 
 
 @dataclass(frozen=True)

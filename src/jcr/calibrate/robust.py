@@ -16,12 +16,11 @@ from scipy.stats import f as f_distribution
 from jcr.calibrate.closed_form import closed_form, motions, sine_axis
 from jcr.calibrate.pose_fit import Cues, PoseFit, Poses, fit_poses, predict
 from jcr.geometry import nearest_rotation, rotation_angle
+from jcr.records import ARM
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
 MAX_TRIPLES = 1500
-ARM = 0.3
-"""Metres per radian, to add errors of position and orientation: 0.1 mm weighs as 0.02°."""
 REJECT_AT = 1e-5
 """Chance that a sound image is rejected, by the F distribution of its deleted residual."""
 TOLERANCE = (1e-3, np.radians(0.2))

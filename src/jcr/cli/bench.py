@@ -19,6 +19,7 @@ BENCHES = {
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
     "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
+    "predictions": "the whole job from pointmaps with a network's errors: error, honesty, map, time",
     "real": "real captures in DIR, against the references stored beside them",
     "run": "the whole job on the bundled capture: time and memory of each stage",
 }
@@ -35,7 +36,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, calibrate, map, pairs, real or run."""
+    """align, calibrate, map, pairs, predictions, real or run."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()

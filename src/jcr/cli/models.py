@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 
 from jcr.reconstruct.backends import BACKENDS
 from jcr.reconstruct.checkpoints import CHECKPOINTS
@@ -57,7 +56,7 @@ def models() -> list[Model]:
     for name, checkpoint in CHECKPOINTS.items():
         scale = "metres" if checkpoint.is_metric else "arbitrary"
         present = "yes" if checkpoint.is_cached() else "no: downloaded on first use"
-        if name == "mapanything" and find_spec(name) is None:
+        if not BACKENDS[name].is_installed():
             present = "no: its package is missing"
         rows.append(Model(name, checkpoint.hub_id, checkpoint.licence, scale, present))
     rows.append(Model("predictions", "", "your network's", "your file's is_metric", "yes"))

@@ -41,6 +41,10 @@ def summary(result: "RunResult") -> str:
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
         f"scale {hand_eye.scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
+    if hand_eye.scale_check is not None:
+        from jcr.calibrate.calibrate import in_words
+
+        lines.append(f"  {in_words(hand_eye.scale_check)}")
     if content.held_out is not None:
         held_out = content.held_out
         pixels = "" if held_out.reprojection_px is None else f", {held_out.reprojection_px:.2f} px"

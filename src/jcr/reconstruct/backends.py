@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.reconstruct.checkpoints import CHECKPOINTS
-from jcr.records import Capture, Reconstruction
+from jcr.records import CameraEvidence, Capture, Reconstruction
 
 BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "marker", "predictions"]
 
@@ -23,7 +24,8 @@ class ReconstructOptions:
     """What turns images into camera poses and pointmaps."""
 
     backend: BackendName = "auto"
-    """auto takes the best one whose weights are on this machine."""
+    """auto takes the best one whose weights are on this machine, and colmap besides where it is not to be
+    trusted."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks and dense matching run."""
     seed: int = 0
@@ -51,6 +53,12 @@ class Backend:
     """module:function of (capture, ReconstructOptions, progress)."""
     keeps_order: bool = False
     """Whether its input counts images in the capture's own order."""
+    package: str = ""
+    """That must be installed beside this one."""
+
+    def is_installed(self) -> bool:
+        """Whether the package it needs is there, without importing it."""
+        return not self.package or find_spec(self.package) is not None
 
     def reconstruct(
         self, capture: Capture, options: ReconstructOptions, progress: Progress | None
@@ -68,7 +76,11 @@ BACKENDS = {
         Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
         Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
         Backend(
-            "mapanything", CHECKPOINTS["mapanything"].licence, True, "jcr.reconstruct.backends:_mapanything"
+            "mapanything",
+            CHECKPOINTS["mapanything"].licence,
+            True,
+            "jcr.reconstruct.backends:_mapanything",
+            package="mapanything",
         ),
         Backend("marker", "Apache-2.0", True, "jcr.reconstruct.backends:_marker"),
         Backend("predictions", "your network's", False, "jcr.reconstruct.backends:_predictions", True),
@@ -84,7 +96,8 @@ def reconstruct(
     Raises InputError for a back end that is not there, NotTrustedError when it finds too little.
     """
     options = options or ReconstructOptions()
-    name = chosen(options)
+    name = candidates(options)[0]
+    options = replace(options, backend=name)
     if name not in BACKENDS:
         raise InputError(f"--backend {name}: no such back end; there are {', '.join(BACKENDS)}")
     # By name, so that the order of the frames changes nothing.
@@ -104,7 +117,12 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)
-    tracks = reconstruction.tracks
+    tracks, evidence = reconstruction.tracks, reconstruction.evidence
+    if evidence is not None:
+        numbers = (6 * rows[:, None] + np.arange(6)).ravel()
+        evidence = CameraEvidence(
+            evidence.recon_from_camera[rows], evidence.covariance[np.ix_(numbers, numbers)]
+        )
     return replace(
         reconstruction,
         image_index=image_index[rows],
@@ -113,18 +131,27 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         confidence=reconstruction.confidence[rows],
         colors=reconstruction.colors[rows],
         tracks=replace(tracks, image=row_of[tracks.image]),
+        evidence=evidence,
     )
 
 
-def chosen(options: ReconstructOptions) -> str:
-    """The name of the back end that `auto` stands for here, or the one that was asked for."""
+def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
+    """What `auto` stands for here, the best first, or the one back end that was asked for.
+
+    Networks whose uncertainty is known come before the one whose is not, metric ones before others; only those
+    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not.
+    """
     if options.backend != "auto":
-        return options.backend
+        return (options.backend,)
     if options.board is not None:
-        return "marker"
-    if options.weights is None:
-        return "colmap"
-    return "predictions" if options.weights.endswith(".npz") else "dust3r"
+        return ("marker",)
+    if options.weights is not None:
+        return ("predictions",) if options.weights.endswith(".npz") else ("dust3r", "colmap")
+    ranking: tuple[BackendName, ...] = ("mast3r", "dust3r", "mapanything")
+    return (
+        *(name for name in ranking if CHECKPOINTS[name].is_cached() and BACKENDS[name].is_installed()),
+        "colmap",
+    )
 
 
 def device_of(options: ReconstructOptions) -> str:

@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.lens import pinhole_inside, undistort_image, usable_lens
 from jcr.records import Capture, Intrinsics, Reconstruction
 
@@ -52,7 +52,7 @@ def reconstruct(
     from jcr.reconstruct.views import choose_neighbours, sweep_planes
 
     options = options or ColmapOptions()
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     images = [read_image(capture.folder / name) for name in capture.images]
     given, notes = usable_lens(capture.intrinsics)
     lenses = [given] if given else _guessed_lenses(capture)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.geometry import inverse, nearest_rotation, rotation_angle
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid, prepare_images
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
@@ -53,7 +53,7 @@ def reconstruct(
     views differ is among the notes. Raises InputError when the package or its weights are not there.
     """
     options = options or MapAnythingOptions()
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     model = model or _load(options)
     images = prepare_images(capture, lambda size: image_grid(size, LONG_EDGE, PATCH, keep_square=True))
     report("reconstruct", 0.0)

@@ -48,8 +48,10 @@ def reconstruct(
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
         height, width = predictions.conf.shape[1:]
         images = _images(capture, rows, arrays, (width, height), source)
+        rows = np.sort(rows)
+        poses = capture.base_from_gripper[rows]
         return reconstruction_from_pairs(
-            images, np.sort(rows), predictions, options.align, backend="predictions", progress=progress
+            images, rows, predictions, poses, options.align, backend="predictions", progress=progress
         )
     if "recon_from_camera" in arrays:
         return _from_pointmaps(capture, arrays, source)

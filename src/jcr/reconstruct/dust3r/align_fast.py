@@ -39,6 +39,8 @@ ITERATIONS = 30
 START_SPREAD = 0.01
 """Of the pairs' errors, relative to the depth and in radians, until it is measured."""
 LEAST_SPREAD = 1e-5
+GAUGE_WEIGHT = 1e3
+"""Of the held sum of the log pair scales, in units of what the pointmaps say of one: stiff beside it."""
 NORMAL_SQUARE_MEDIAN = 0.455
 """Median of the square of a unit normal."""
 DEPTH_CHUNK = 4096
@@ -64,12 +66,17 @@ class Cameras(Protocol):
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
         ...
 
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        ...
+
 
 class FreeCameras:
     """Cameras that may stand anywhere; the first one and the product of the pair scales are held (gauge)."""
 
     def __init__(self, recon_from_camera: Float[ndarray, "n 4 4"]) -> None:
         self.recon_from_camera = recon_from_camera
+        self.normal = np.zeros((0, 0))
 
     def step(
         self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
@@ -77,11 +84,19 @@ class FreeCameras:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
         scales = layout.scales
         held = hessian.copy()
-        held[np.ix_(scales, scales)] += hessian.diagonal()[scales].mean()
+        held[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+        self.normal = held[6:, 6:]
         step = np.zeros(layout.size)
-        step[6:] = -np.linalg.solve(held[6:, 6:], gradient[6:])
+        step[6:] = -np.linalg.solve(self.normal, gradient[6:])
         self.recon_from_camera = moved(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
         return step
+
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step; the first camera's is 0."""
+        size = 6 * len(self.recon_from_camera)
+        out = np.zeros((size, size))
+        out[6:, 6:] = np.linalg.inv(self.normal)[: size - 6, : size - 6]
+        return out
 
 
 def moved(
@@ -122,6 +137,7 @@ class Solution:
     """What Gauss-Newton came to."""
 
     state: State
+    cameras: Cameras
     images: list[ImageObservations]
     noise: list[Noise]
     """Per image, of its pointmaps."""
@@ -225,7 +241,7 @@ def gauss_newton(
         iteration += 1
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
-            return Solution(state, images, noise, pair_spread, settled)
+            return Solution(state, cameras, images, noise, pair_spread, settled)
 
 
 def _spread(

@@ -4,17 +4,17 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
-from jcr.reconstruct.dust3r.align import align
 from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.matches import tracks_from_pairs
 from jcr.reconstruct.dust3r.pairs import PairOptions, PairPredictions
 from jcr.reconstruct.dust3r.predict import predict_pairs
 from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid, prepare_images
+from jcr.reconstruct.dust3r.robot_align import align_with_robot
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.records import Capture, Intrinsics, Reconstruction
 
@@ -58,8 +58,9 @@ def reconstruct(
     options = options or Dust3rOptions()
     images, predictions, notes = predict(capture, options, progress)
     rows = np.arange(len(capture))
+    poses = capture.base_from_gripper
     return reconstruction_from_pairs(
-        images, rows, predictions, options.align, backend=options.model, notes=notes, progress=progress
+        images, rows, predictions, poses, options.align, backend=options.model, notes=notes, progress=progress
     )
 
 
@@ -67,6 +68,7 @@ def reconstruction_from_pairs(
     images: PreparedImages,
     image_index: Int[ndarray, " m"],
     predictions: PairPredictions,
+    base_from_gripper: Float[ndarray, "m 4 4"],
     options: AlignOptions,
     *,
     backend: str,
@@ -74,8 +76,11 @@ def reconstruction_from_pairs(
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Align pairwise pointmaps and match them; `images` says where their pixels lie in the capture."""
-    report = progress or (lambda stage, fraction: None)
-    alignment = align(replace(predictions, intrinsics=images.intrinsics), options, progress)
+    report = progress or silent
+    aligned = align_with_robot(
+        replace(predictions, intrinsics=images.intrinsics), base_from_gripper, options, progress
+    )
+    alignment = aligned.alignment
     height, width = predictions.conf.shape[1:]
     fx, fy = alignment.focal_px.mean(0).tolist()
     cx, cy = alignment.principal_point_px
@@ -96,4 +101,5 @@ def reconstruction_from_pairs(
         backend=backend,
         is_metric=predictions.is_metric,
         notes=(*images.notes, *notes, *alignment.notes),
+        evidence=aligned.evidence,
     )

@@ -13,18 +13,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, nearest_rotation, rotation_log, skew, transform
+from jcr.geometry import inverse, nearest_rotation, rotation_log, scale_translation, skew, transform
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.align_equations import Layout, adjoint
 from jcr.reconstruct.dust3r.align_fast import (
     FINE_TOLERANCE,
+    NORMAL_SQUARE_MEDIAN,
     Problem,
+    Solution,
     dense_alignment,
     gauss_newton,
     moved,
     solve_free,
 )
 from jcr.reconstruct.dust3r.align_observations import weight_is_log
+from jcr.reconstruct.dust3r.align_residuals import State
 from jcr.reconstruct.dust3r.alignment import (
     Alignment,
     AlignOptions,
@@ -33,22 +36,25 @@ from jcr.reconstruct.dust3r.alignment import (
     pinhole_of,
 )
 from jcr.reconstruct.dust3r.pairs import PairPredictions
+from jcr.records import REACH
 
 VAGUE = 10.0
 """One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
 
-STRAIN = 4.0
+STRAIN = 5.0
 """Standard deviations by which a gripper pose may move before the user is told."""
+START_NOISE = 0.001
+"""Of the robot (rad) until it is measured."""
+LEAST_NOISE = 1e-5
+"""rad: a tenth of what the best arm repeats."""
 
 
 @dataclass(frozen=True)
 class KinematicOptions:
     """How camera poses are tied to the gripper poses."""
 
-    robot_translation: float = 0.0005
-    """One-sigma noise of the gripper positions per axis, metres; 0 holds them."""
-    robot_rotation: float = 0.0017
-    """One-sigma noise of the gripper orientations per axis, radians; 0 holds them."""
+    robot_noise: tuple[float, float] | None = None
+    """One-sigma noise of the gripper poses per axis, metres and radians; 0 holds them, None estimates it."""
     align: AlignOptions = field(default_factory=AlignOptions)
 
 
@@ -79,15 +85,20 @@ class HandEyeCameras:
         self.measured = base_from_gripper
         self.base_from_gripper = base_from_gripper
         self.gripper_from_camera = gripper_from_camera
-        spread = np.repeat([options.robot_translation, options.robot_rotation], 3)
-        self.held = spread == 0
-        self.information = np.where(self.held, 0.0, 1.0 / np.where(self.held, 1.0, spread) ** 2)
-        self.normal = np.zeros((0, 0))
+        self.estimated = options.robot_noise is None
+        self.spread = np.repeat(options.robot_noise or (REACH * START_NOISE, START_NOISE), 3)
+        """One sigma of the gripper poses' errors: translation, rotation."""
+        self.normal = self.jacobian = np.zeros((0, 0))
 
     @property
     def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
         """In the base frame."""
         return self.base_from_gripper @ self.gripper_from_camera
+
+    @property
+    def information(self) -> Float[ndarray, "6"]:
+        """Inverse variance of the gripper poses' errors; 0 where they are held."""
+        return np.where(self.spread == 0, 0.0, 1.0 / np.where(self.spread == 0, 1.0, self.spread) ** 2)
 
     def step(
         self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
@@ -107,16 +118,43 @@ class HandEyeCameras:
             jacobian[rows, 6 + 6 * k : 12 + 6 * k] = to_base[k]
         jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
         prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
-        free = np.concatenate([np.ones(6, bool), np.tile(~self.held, images), np.ones(rest, bool)])
         pull = np.concatenate([np.zeros(6), (self.information * self.deviation()).ravel(), np.zeros(rest)])
+        free = np.concatenate([np.ones(6, bool), np.tile(self.spread > 0, images), np.ones(rest, bool)])
 
         self.normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
+        self.jacobian = jacobian[: 6 * images, free]
         full = np.zeros(6 + layout.size)
         full[free] = -np.linalg.solve(self.normal, (jacobian.T @ gradient + pull)[free])
         self.gripper_from_camera = moved(self.gripper_from_camera[None], full[None, :6])[0]
         correction = moved(np.tile(np.eye(4), (images, 1, 1)), full[6 : 6 + 6 * images].reshape(-1, 6))
         self.base_from_gripper = self.base_from_gripper @ correction
+        if self.estimated:
+            variance = np.linalg.inv(self.normal).diagonal()[6 : 6 + 6 * images].reshape(-1, 6)
+            self.spread = self._estimated_spread(variance)
         return jacobian @ full
+
+    def _estimated_spread(self, variance: Float[ndarray, "n 6"]) -> Float[ndarray, "6"]:
+        """The evidence fixed point, as for the pairs' errors: wrong gripper poses do not count."""
+        arm = np.repeat([REACH, 1.0], 3)
+        determined = 1.0 - np.median(variance / self.spread**2)
+        squared = np.median((self.deviation() / arm) ** 2) / NORMAL_SQUARE_MEDIAN
+        return arm * max(np.sqrt(squared / max(determined, 0.05)), LEAST_NOISE)
+
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        return self.jacobian @ np.linalg.solve(self.normal, self.jacobian.T)
+
+    def hand_eye_covariance(self, pairs: int) -> Float[ndarray, "7 7"]:
+        """Of gripper_from_camera and the mean log pair scale, in the order of COVARIANCE_ORDER."""
+        functional = np.zeros((7, len(self.normal)))
+        functional[:6, :6] = np.eye(6)
+        functional[:3, 3:6] = -skew(self.gripper_from_camera[:3, 3])
+        functional[6, -pairs:] = 1.0 / pairs
+        return functional @ np.linalg.solve(self.normal, functional.T)
+
+    def strain(self) -> Float[ndarray, " n"]:
+        """By how many standard deviations of the robot's noise each gripper pose had to move, at most."""
+        return np.abs(self.deviation() * np.sqrt(self.information)).max(axis=1)
 
     def deviation(self) -> Float[ndarray, "n 6"]:
         """How far the gripper poses have moved from the measured ones, in gripper axes."""
@@ -148,40 +186,60 @@ def align_kinematic(
         raise InputError(f"kinematic alignment needs 3 images or more, there are {count}; take more")
     problem = Problem(predictions, pinhole_of(predictions, options.align), weight_is_log(predictions))
     free = solve_free(problem, options.align)
-    start, scale = hand_eye_from_motions(base_from_gripper, free.state.recon_from_camera)
-    cameras = HandEyeCameras(
-        base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
-    )
-    to_metres = np.repeat([scale, 1.0], 3)
-    state = replace(
-        free.state,
-        recon_from_camera=cameras.recon_from_camera,
-        log_depth=[log_depth + np.log(scale) for log_depth in free.state.log_depth],
-        log_pair_scale=free.state.log_pair_scale + np.log(scale),
-        pair_error=free.state.pair_error * to_metres,
-    )
-    spread = free.pair_spread * to_metres
-    solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
+    solution, cameras = solve_kinematic(problem, free, base_from_gripper, options, gripper_from_camera)
     alignment = dense_alignment(problem, solution, begin, progress)
-    notes = (*alignment.notes, *_strained(cameras, predictions))
+    notes = (*alignment.notes, *contradictions(cameras, predictions))
     return KinematicAlignment(
         gripper_from_camera=cameras.gripper_from_camera,
         scale=float(np.exp(solution.state.log_pair_scale.mean())),
         base_from_gripper=cameras.base_from_gripper,
-        covariance=_hand_eye_covariance(cameras, len(predictions.edges)),
+        covariance=cameras.hand_eye_covariance(len(predictions.edges)),
         alignment=replace(alignment, method="kinematic", notes=notes),
     )
 
 
-def _strained(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
-    """A note that names the images whose gripper pose had to move further than the robot's noise explains."""
-    sigmas = np.abs(cameras.deviation()) * np.sqrt(cameras.information)
-    strained = np.flatnonzero(sigmas.max(axis=1) > STRAIN)
-    if not len(strained):
+def solve_kinematic(
+    problem: Problem,
+    free: Solution,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    options: KinematicOptions,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+) -> tuple[Solution, HandEyeCameras]:
+    """Kinematic alignment, base frame and metres, from a free one; raises as `gauss_newton` does."""
+    start, scale = hand_eye_from_motions(base_from_gripper, free.state.recon_from_camera)
+    cameras = HandEyeCameras(
+        base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
+    )
+    state = replace(rescaled(free.state, scale), recon_from_camera=cameras.recon_from_camera)
+    spread = free.pair_spread * np.repeat([scale, 1.0], 3)
+    solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
+    return solution, cameras
+
+
+def rescaled(state: State, factor: float) -> State:
+    """The same state with all lengths multiplied."""
+    return replace(
+        state,
+        recon_from_camera=scale_translation(state.recon_from_camera, factor),
+        log_depth=[log_depth + np.log(factor) for log_depth in state.log_depth],
+        log_pair_scale=state.log_pair_scale + np.log(factor),
+        pair_error=state.pair_error * np.repeat([factor, 1.0], 3),
+    )
+
+
+def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
+    """A note that names the images whose gripper pose had to move further than the robot's noise explains.
+
+    Where that noise is estimated, four images or fewer cannot tell a wrong pose from a bad robot.
+    """
+    strain = cameras.strain()
+    if strain.max() <= STRAIN or (cameras.estimated and len(strain) < 5):
         return ()
-    names = [predictions.images[k] if predictions.images else f"#{k}" for k in strained]
+    names = [
+        predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(strain > STRAIN)
+    ]
     return (
-        f"the pictures contradict the gripper poses of {', '.join(names)} by up to {sigmas.max():.0f} times the "
+        f"the pictures contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
         "robot's noise; these poses are wrong, or --robot-noise is too small",
     )
 
@@ -203,12 +261,3 @@ def hand_eye_from_motions(
         # Motions that do not show the scale: their lengths at least bound it.
         scale = float(np.linalg.norm(a[:, :3, 3]) / max(np.linalg.norm(moved_by), 1e-12))
     return transform(rotation, solution[:3]), scale
-
-
-def _hand_eye_covariance(cameras: HandEyeCameras, pairs: int) -> Float[ndarray, "7 7"]:
-    """From the twist of gripper_from_camera and the log pair scales to the order of COVARIANCE_ORDER."""
-    functional = np.zeros((7, len(cameras.normal)))
-    functional[:6, :6] = np.eye(6)
-    functional[:3, 3:6] = -skew(cameras.gripper_from_camera[:3, 3])
-    functional[6, -pairs:] = 1.0 / pairs
-    return functional @ np.linalg.solve(cameras.normal, functional.T)

@@ -127,6 +127,7 @@ def _tracks(
         x_px=original_px(np.concatenate([start_px.astype(np.float64), matched[image, other, which]])),
         point=np.concatenate([point[start_image, start_which], point[image, which]]),
         points_in_recon=points_in_recon[start_image, start_px[:, 1], start_px[:, 0]].astype(np.float64),
+        from_pointmaps=True,
     )
 
 

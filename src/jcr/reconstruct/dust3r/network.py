@@ -186,6 +186,11 @@ class Dust3r(nn.Module):
         layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
         return layers1, layers2
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.mask_token.device
+
     def _autocast(self, like: Tensor) -> torch.autocast:
         enabled = like.is_cuda if self.mixed_precision is None else self.mixed_precision
         return torch.autocast(like.device.type, torch.bfloat16, enabled=enabled)

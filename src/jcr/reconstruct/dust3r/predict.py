@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.dust3r.network import PATCH, DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
 from jcr.reconstruct.dust3r.pairs import (
@@ -84,7 +84,7 @@ def predict_pairs(
     options: PairOptions | None = None,
     progress: Progress | None = None,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
-    """Pointmaps of the pairs of a capture's images, and notes on what was left out.
+    """Pointmaps of the pairs of a capture's images, and notes on what was left out or did not fit.
 
     Pairs found in the cache are not computed again. On CUDA that runs out of memory the batch is halved, then
     the CPU takes over. Raises InputError for options out of range, and when one pair does not fit the budget.
@@ -96,17 +96,17 @@ def predict_pairs(
     if options.cache_gb < 0:
         raise InputError(f"--cache-gb {options.cache_gb}: give a size, or 0 for no cache")
     count = len(images.colors)
-    predictor = _Predictor(loaded, images, names, options, progress or (lambda stage, fraction: None))
+    predictor = _Predictor(loaded, images, names, options, progress or silent)
     graph = options.pair_graph
     if graph == "auto":
         graph = "complete" if count <= FEW_IMAGES else "robot"
     if graph == "complete":
-        return predictor.predict(complete_pairs(count)), ()
+        return predictor.predict(complete_pairs(count)), predictor.notes
     if graph == "window":
-        return predictor.predict(window_pairs(count, options.window)), ()
+        return predictor.predict(window_pairs(count, options.window)), predictor.notes
     neighbours = predictor.predict(window_pairs(count, 1))
     edges, note = overlapping_pairs(neighbours, base_from_gripper)
-    return predictor.predict(edges, neighbours), (note,)
+    return predictor.predict(edges, neighbours), (note, *predictor.notes)
 
 
 class _Predictor:
@@ -122,17 +122,17 @@ class _Predictor:
     ) -> None:
         self.loaded, self.images, self.names = loaded, images, names
         self.network = loaded.network
-        self.device = self.network.mask_token.device
+        self.device = self.network.device
         self.budget = options.memory_gb * GB
         self.progress = progress
         self.features: dict[int, Features] = {}
         self.batch = 0
+        self.notes: tuple[str, ...] = ()
         self.cache = (
             PairCache(options.cache or user_cache(), int(options.cache_gb * GB)) if options.cache_gb else None
         )
-        mixed = self.network.mixed_precision
         # The leading number changes with anything here that changes what is predicted.
-        self.key = f"1 {fingerprint(self.network)} {self.device.type} {mixed}".encode()
+        self.key = f"1 {fingerprint(self.network)} {self.network.mixed_precision}"
         self.image_keys = [blake2b(image.tobytes()).digest() for image in images.colors]
 
     def predict(self, edges: Int[ndarray, "e 2"], known: PairPredictions | None = None) -> PairPredictions:
@@ -175,9 +175,9 @@ class _Predictor:
         )
 
     def _pair_key(self, edge: list[int]) -> str:
-        return blake2b(
-            self.key + b"".join(self.image_keys[image] for image in edge), digest_size=20
-        ).hexdigest()
+        made_by = f"{self.key} {self.device.type}".encode()
+        images = b"".join(self.image_keys[image] for image in edge)
+        return blake2b(made_by + images, digest_size=20).hexdigest()
 
     @torch.inference_mode()
     def _encode(self, rows: Int[ndarray, " b"]) -> None:
@@ -220,11 +220,9 @@ class _Predictor:
     def _ask_less(self) -> None:
         if self.batch > 1:
             self.batch //= 2
-            logger.warning(
-                "out of memory on the %s: going on with %d pairs at a time", self.device, self.batch
-            )
+            self._say(f"out of memory on the {self.device}: going on with {self.batch} pairs at a time")
         elif self.device.type == "cuda":
-            logger.warning("one pair does not fit on the %s: going on, slowly, on the CPU", self.device)
+            self._say(f"one pair does not fit on the {self.device}: going on, slowly, on the CPU")
             self.device = torch.device("cpu")
             self.network.to(self.device)
             self.features = {row: _each(Tensor.cpu, features) for row, features in self.features.items()}
@@ -234,6 +232,11 @@ class _Predictor:
             )
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
+
+    def _say(self, note: str) -> None:
+        """At once, as what follows takes longer, and in the notes of the result."""
+        logger.warning(note)
+        self.notes += (note,)
 
 
 def _each(function: Callable[..., Tensor], *features: Features) -> Features:

@@ -1,0 +1,83 @@
+"""What `--backend auto` does: the best back end, and another one where that is not to be trusted."""
+
+from dataclasses import dataclass, replace
+
+from jcr.calibrate.calibrate import CalibrateOptions, calibrate
+from jcr.errors import InputError, NotTrustedError
+from jcr.progress import Progress
+from jcr.reconstruct.backends import ReconstructOptions, candidates, reconstruct
+from jcr.records import Capture, HandEye, Reconstruction
+
+
+def best_reconstruction(
+    capture: Capture,
+    options: ReconstructOptions,
+    calibrate_options: CalibrateOptions,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """The capture reconstructed; where `auto` had a choice, the notes say what it chose and why.
+
+    `auto` runs the best back end whose weights are on this machine, and the next one when that gives nothing or
+    its calibration is not to be trusted for another reason than the motion. Of two results a trusted one is kept,
+    else the one with the smaller held-out error. Raises as `reconstruct` does for the last one that was tried.
+    """
+    names = candidates(options)[:2]
+    if len(names) == 1:
+        return reconstruct(capture, replace(options, backend=names[0]), progress)
+    first = replace(options, backend=names[0])
+    # Weights that the user named are the first one's.
+    second = replace(options, backend=names[1], weights=None)
+    chose = f"back end {names[0]}, the best whose weights are on this machine"
+    try:
+        one = _attempt(capture, first, calibrate_options, progress)
+    except (NotTrustedError, InputError) as error:
+        if isinstance(error, InputError) and options.weights is not None:
+            raise
+        other = _attempt(capture, second, calibrate_options, progress)
+        return other.noted(f"{chose}, gave nothing ({error}); {other.told()} was used instead")
+    if one.hand_eye.converged or not one.hand_eye.observability.observable:
+        return one.noted(chose)
+    doubt = f"{chose}, is not to be trusted ({one.hand_eye.warnings[0]})"
+    try:
+        other = _attempt(capture, second, calibrate_options, progress)
+    except NotTrustedError as error:
+        return one.noted(f"{doubt}, and {names[1]} gave nothing ({error})")
+    if other.hand_eye.converged:
+        return other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
+    kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
+    return kept.noted(f"{doubt}, nor is {names[1]}; {kept.told()} was used and not {left.told()}")
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """What one back end came to."""
+
+    reconstruction: Reconstruction
+    hand_eye: HandEye
+
+    @property
+    def missed_m(self) -> float:
+        """Error on images left out; infinite where there were too few to leave one out."""
+        held_out = self.hand_eye.held_out
+        return float("inf") if held_out is None else held_out.missed_m
+
+    def told(self) -> str:
+        """The back end, and its error on images left out."""
+        held_out, name = self.hand_eye.held_out, self.reconstruction.backend
+        if held_out is None:
+            return f"{name} (too few images to leave one out)"
+        return f"{name} (held-out error {held_out.translation_mm:.2g} mm, {held_out.rotation_deg:.2g}°)"
+
+    def noted(self, note: str) -> Reconstruction:
+        """The reconstruction with one more note."""
+        return replace(self.reconstruction, notes=(note, *self.reconstruction.notes))
+
+
+def _attempt(
+    capture: Capture,
+    options: ReconstructOptions,
+    calibrate_options: CalibrateOptions,
+    progress: Progress | None,
+) -> _Attempt:
+    reconstruction = reconstruct(capture, options, progress)
+    return _Attempt(reconstruction, calibrate(capture, reconstruction, calibrate_options))
