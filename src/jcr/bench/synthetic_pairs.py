@@ -169,8 +169,8 @@ def pairs_of_capture(
     count = len(truth.images)
     middle = factor // 2
     depth = np.stack([true_depth(truth, k)[middle::factor, middle::factor] for k in range(count)])
-    center = [(c - middle) / factor for c in (lens.cx, lens.cy)]
-    k = Intrinsics(lens.fx / factor, lens.fy / factor, *center, width, height)
+    cx, cy = (lens.cx - middle) / factor, (lens.cy - middle) / factor
+    k = Intrinsics(lens.fx / factor, lens.fy / factor, cx, cy, width, height)
     edges, rng = complete_pairs(count), np.random.default_rng(seed)
     return predicted_pairs(
         edges, truth.base_from_camera, depth, k, errors or PairErrors(), rng, carries_lens=True
