@@ -40,6 +40,10 @@ _REFINEMENT = ((3, 0.5), (3, 0.15))
 _AGREEMENT = (0.01, 0.005, 0.003)
 """Per round: largest relative difference of two depths of one point that are averaged. On simulated views the
 three rounds bring the median error from 0.14 % to 0.05 % and the share beyond 2 % from 1.5 % to 0.8 %."""
+_SEEN_THROUGH = 0.01
+"""A neighbour whose depth is farther by this share sees through the point. Beside an object's outline the plain
+table often gets the object's depth; the neighbours that look past the object there know better. Measured on
+two scenes on plain tables: of the confident table points 0.7 and 1.2 % are too near by 2 %, before 1.4 and 3.2 %."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ def plane_sweep(
 
     Row i is compared with rows `neighbours[i]` along `planes[i]`, evenly spaced as `views.sweep_planes` does.
     Confidence is the correlation (0 to 1) times the number of neighbours that agree on the depth; 0 without
-    texture, and where fewer than two neighbours agree (one, if there are no more than two).
+    texture, where fewer than two neighbours agree (one, if there are no more than two), and where half as many
+    as agree see through the point.
     """
     options = options or PlaneSweepOptions()
     report = progress or (lambda fraction: None)
@@ -97,7 +102,7 @@ def plane_sweep(
             at_best = (hypotheses[0] + index * spacing * step[i]).clamp(min=step[i])
         return at_best, score
 
-    def agree(i: int, tolerance: float) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    def agree(i: int, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
         return _agreement(inverse_depth, i, neighbours[i], motions[i], pinhole, tolerance)
 
     with _threads_over_images(device) as pool:
@@ -109,12 +114,12 @@ def plane_sweep(
         surface = _on_planes(sweep[:, 0], pinhole) + step[:, None, None] * index
         refined = list(_told(pool.map(fine, range(m)), report, 0.5, 0.5 / m))
         inverse_depth, score = (torch.stack(maps) for maps in zip(*refined, strict=True))
-        count = torch.zeros_like(score)
+        count = through = torch.zeros_like(score)
         for tolerance in _AGREEMENT:
             agreed = list(pool.map(agree, range(m), repeat(tolerance)))
-            inverse_depth, count = (torch.stack(maps) for maps in zip(*agreed, strict=True))
+            inverse_depth, count, through = (torch.stack(maps) for maps in zip(*agreed, strict=True))
     needed = torch.tensor([1 if len(others) < 3 else 2 for others in neighbours], device=device)
-    believed = (count >= needed[:, None, None]) & (score >= _LEAST_CORRELATION)
+    believed = (count >= needed[:, None, None]) & (count > 2 * through) & (score >= _LEAST_CORRELATION)
     confidence = torch.where(believed, score.clamp(max=1) * count, 0.0)
     return (1 / inverse_depth).double().cpu().numpy(), confidence.double().cpu().numpy()
 
@@ -220,9 +225,10 @@ def _agreement(
     neighbour_from_camera: Float[Tensor, "k 4 4"],
     pinhole: Intrinsics,
     tolerance: float,
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Mean inverse depth of image i with the neighbours that agree at each pixel, and how many of them do."""
-    total, count = inverse_depth[i].clone(), torch.zeros_like(inverse_depth[i])
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Mean inverse depth of image i with the neighbours that agree at each pixel, how many do, how many see through."""
+    total = inverse_depth[i].clone()
+    count, through = torch.zeros_like(total), torch.zeros_like(total)
     for j, motion in zip(neighbours, neighbour_from_camera, strict=True):
         u, v, depth, inside = _project(inverse_depth[i], motion, pinhole)
         ratio = depth * _sample(inverse_depth[j], u[None], v[None])[0]
@@ -232,7 +238,8 @@ def _agreement(
         moved_z = centre_z + (1 / inverse_depth[i] - centre_z) / ratio
         total += torch.where(agrees, 1 / moved_z, 0.0)
         count += agrees
-    return total / (1 + count), count
+        through += inside & (ratio < 1 - _SEEN_THROUGH)
+    return total / (1 + count), count, through
 
 
 def _sample(image: Float[Tensor, "h w"], u: Float[Tensor, "d h w"], v: Float[Tensor, "d h w"]) -> Tensor:
