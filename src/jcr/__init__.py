@@ -14,7 +14,7 @@ from jcr.errors import InputError, NotTrustedError
 if TYPE_CHECKING:
     from jcr.calibrate.hand_eye import solve_hand_eye
     from jcr.capture.read import read_capture
-    from jcr.pipeline import build_map, calibrate, run
+    from jcr.pipeline import build_map, calibrate, measure, run
     from jcr.represent.scene import load_map
 
 __version__ = version("jcr")
@@ -25,6 +25,7 @@ _ROOMS = {
     "run": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
+    "measure": "jcr.pipeline",
     "load_map": "jcr.represent.scene",
 }
 
@@ -34,6 +35,7 @@ __all__ = [
     "build_map",
     "calibrate",
     "load_map",
+    "measure",
     "read_capture",
     "run",
     "solve_hand_eye",

@@ -17,11 +17,17 @@ from jcr import __version__
 from jcr.auto import best_reconstruction
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.calibrate.calibrate import calibrate as calibrate_stage
-from jcr.calibrate.file import CalibrationFile, calibration_file, failed_file, write_calibration
+from jcr.calibrate.file import (
+    CalibrationFile,
+    calibration_file,
+    failed_file,
+    read_calibration,
+    write_calibration,
+)
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
-from jcr.export.points import write_cloud
+from jcr.export.points import read_cloud, write_cloud
 from jcr.files import write_text
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
@@ -31,6 +37,10 @@ from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
 from jcr.represent.options import MapOptions
 from jcr.represent.scene import SceneMap
+from jcr.segment.measure import Measured
+from jcr.segment.measure import measure as measure_cloud
+from jcr.segment.options import SegmentOptions
+from jcr.segment.segments import image_labels, label_cloud
 
 STATE = "run.json"
 """In the run folder: the capture, and what each finished stage was made from."""
@@ -44,6 +54,7 @@ class RunOptions:
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 @dataclass(frozen=True)
@@ -56,6 +67,8 @@ class RunResult:
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
     scene: SceneMap | None = None
+    measured: Measured | None = None
+    """None without a map, and where no plane carries the scene."""
 
     @property
     def converged(self) -> bool:
@@ -103,6 +116,7 @@ def build_map(
     out: str | Path,
     cloud: CloudOptions | None = None,
     map: MapOptions | None = None,
+    segment: SegmentOptions | None = None,
     *,
     add: Sequence[tuple[Path, Path]] = (),
     progress: Progress | None = None,
@@ -120,6 +134,7 @@ def build_map(
             CalibrateOptions(**state["options"]["calibrate"]),
             cloud or CloudOptions(),
             map or MapOptions(),
+            segment or SegmentOptions(),
         )
         added = with_images(read_added(folder, capture), add)
         result = _calibrate(capture, folder, options, progress)
@@ -134,6 +149,15 @@ def read_capture_of(out: str | Path) -> Capture:
     if "capture" not in state:
         raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
     return read_capture(state["capture"])
+
+
+def measure(out: str | Path) -> Measured:
+    """The support plane of a run and what stands on it, from its cloud and its calibration.
+
+    Raises InputError where there is no map, and when no plane carries the scene.
+    """
+    cloud = read_cloud(Path(out) / "cloud.ply")
+    return _measured(cloud, read_calibration(Path(out)))
 
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
@@ -191,15 +215,39 @@ def _map(
 
         reconstruction = extend(reconstruction, result.hand_eye, added, device, progress or silent)
         write_added(added, capture)
-    cloud = point_cloud(capture, reconstruction, result.hand_eye, options=options.cloud)
+    cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
     write_cloud(folder / "cloud.ply", cloud)
     scene = build_scene(cloud, options.map, progress, device=device)
     scene.save(folder / "map.safetensors")
     timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
-    content = result.calibration.model_copy(update={"timings_s": timings})
+    warnings = [*result.calibration.warnings, *notes]
+    content = result.calibration.model_copy(update={"timings_s": timings, "warnings": warnings})
     write_calibration(folder / "calibration.json", content)
     _write_log(folder, content)
-    return replace(result, calibration=content, cloud=cloud, scene=scene)
+    try:
+        measured = _measured(cloud, content)
+    except InputError:  # no plane carries the scene
+        measured = None
+    return replace(result, calibration=content, cloud=cloud, scene=scene, measured=measured)
+
+
+def _cloud(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    hand_eye: HandEye,
+    options: RunOptions,
+    progress: Progress | None,
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """The labelled cloud, and what the user should know of its labels."""
+    given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
+    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
+    cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
+    return label_cloud(cloud, options.segment)
+
+
+def _measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
+    uncertainty = calibration.uncertainty
+    return measure_cloud(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
 
 
 def _report(capture: Capture, result: RunResult) -> None:

@@ -26,6 +26,7 @@ COMMANDS = {
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
     "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
+    "measure": "support plane and the objects on it: height, footprint, label",
     "compare": "difference of two calibrations in mm and degrees",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README",

@@ -22,6 +22,7 @@ BENCHES = {
     "predictions": "the whole job from pointmaps with a network's errors: error, honesty, map, time",
     "real": "real captures in DIR, against the references stored beside them",
     "run": "the whole job on the bundled capture: time and memory of each stage",
+    "table2": "heights of objects in simulated scenes, from 8 and 10 images",
 }
 
 
@@ -36,7 +37,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, calibrate, map, pairs, predictions, real or run."""
+    """align, calibrate, map, pairs, predictions, real, run or table2."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()

@@ -9,6 +9,7 @@ import tyro
 
 from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
+from jcr.segment.options import SegmentOptions
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,7 @@ class Arguments:
 
     examples:
       jcr map out/tabletop --preset paper
+      jcr map out/tabletop --segments labels
       jcr map out/tabletop --workspace 0.2 -0.4 -0.05 0.9 0.4 0.6
       jcr map out/tabletop --add left.png left.json --add right.png right.json
     """
@@ -29,6 +31,7 @@ class Arguments:
     was not there before needs two new images. This and every later map of the run has them (OUT/added)."""
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
     quiet: bool = False
     """No progress on stderr."""
 
@@ -40,7 +43,12 @@ def main(arguments: Arguments) -> int:
 
     with progress_bars(arguments.quiet) as progress:
         result = build_map(
-            arguments.out, arguments.cloud, arguments.map, add=arguments.add, progress=progress
+            arguments.out,
+            arguments.cloud,
+            arguments.map,
+            arguments.segment,
+            add=arguments.add,
+            progress=progress,
         )
     sys.stdout.write(f"map: {result.out / 'map.safetensors'}\nreport: {result.out / 'report.html'}\n")
     return 0

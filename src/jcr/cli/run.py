@@ -12,6 +12,7 @@ from jcr.cli.result import show
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
+from jcr.segment.options import SegmentOptions
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Arguments:
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
     json: bool = False
     """Print calibration.json on stdout."""
     quiet: bool = False
@@ -47,7 +49,9 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
 
     capture = read_capture(arguments.capture)
-    options = RunOptions(arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map)
+    options = RunOptions(
+        arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map, arguments.segment
+    )
     with progress_bars(arguments.quiet) as progress:
         result = run(capture, arguments.out, options, progress=progress)
     status = show(result, arguments.json)

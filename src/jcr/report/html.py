@@ -17,6 +17,7 @@ from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.images import images_section, lens_of, residuals_section
 from jcr.report.map import map_section
 from jcr.report.markup import PAGE, filled, significant
+from jcr.report.objects import objects_section
 from jcr.report.samples import sample_surface
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
@@ -52,6 +53,9 @@ def report_html(capture: Capture, result: "RunResult") -> str:
         ""
         if result.scene is None or surface is None
         else map_section(result, result.scene, surface, base_from_camera),
+        ""
+        if result.scene is None or result.measured is None
+        else objects_section(result.measured, result.scene.label_names),
         _details(result),
     ]
     return filled(

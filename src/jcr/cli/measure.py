@@ -1,0 +1,94 @@
+"""`jcr measure`: the sizes of what stands on the table."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from jcr.segment.measure import Measured
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """The plane that carries the scene, and height, footprint and box of each object on it, with one sigma.
+
+    OUT is the folder of a run. What the objects are is for `jcr map --segments` to say.
+
+    examples:
+      jcr measure out/tabletop
+      jcr measure out/tabletop --json > sizes.json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    json: bool = False
+    """Print the result as JSON: metres, base frame."""
+
+
+def main(arguments: Arguments) -> int:
+    """Print the sizes; 3 when the calibration they rest on is not to be trusted."""
+    from jcr.calibrate.file import read_calibration
+    from jcr.pipeline import measure
+
+    measured = measure(arguments.out)
+    sys.stdout.write(json.dumps(content(measured)) + "\n" if arguments.json else table(measured))
+    calibration = read_calibration(arguments.out)
+    if not calibration.converged:
+        sys.stderr.write(f"error: sizes not to be trusted: {calibration.warnings[0]}\n")
+        return 3
+    return 0
+
+
+def content(measured: "Measured") -> dict[str, object]:
+    """The result as JSON has it: metres, base frame, standard deviations of one sigma."""
+    support = measured.support
+    return {
+        "support": {
+            "base_from_support": support.base_from_support.tolist(),
+            "noise": support.noise,
+            "roughness": support.roughness,
+        },
+        "objects": [
+            {
+                "label": size.label,
+                "name": size.name,
+                "points": size.points,
+                "height": size.height,
+                "height_std": size.height_std,
+                "footprint_in_base": size.footprint_in_base.tolist(),
+                "base_from_box": size.base_from_box.tolist(),
+                "box_size": size.box_size.tolist(),
+                "box_std": size.box_std.tolist(),
+            }
+            for size in measured.objects
+        ],
+    }
+
+
+def table(measured: "Measured") -> str:
+    """A line for the plane and a line an object, in millimetres."""
+    support = measured.support
+    x, y, z = support.base_from_support[:3, 2]
+    lines = [
+        f"support plane through z = {support.base_from_support[2, 3]:.4f} m, normal {x:.4f} {y:.4f} {z:.4f}, "
+        f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
+    ]
+    if not measured.objects:
+        return lines[0] + "\nnothing stands on it\n"
+    width = max(6, *(len(size.name) for size in measured.objects))
+    head = (
+        f"{'object':<{width}}  {'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m)"
+    )
+    lines.append(head + ", ± 1 σ")
+    for size in measured.objects:
+        length, across, height = (
+            f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
+            for value, std in zip(size.box_size, size.box_std, strict=True)
+        )
+        x, y = size.base_from_box[:2, 3]
+        lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,86 @@
+"""Segments given by the user as label images, one PNG an image of the capture."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.records import Capture, Reconstruction
+
+MOST = 1024
+"""Labels that are believed to be labels; a picture given by mistake has more."""
+
+
+@dataclass(frozen=True)
+class LabelImages:
+    """Labels at the pointmaps' pixels."""
+
+    labels: Int[ndarray, "m h w"]
+    """0 = none."""
+    names: tuple[str, ...]
+    """Of each label, from 0 = none."""
+
+
+def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages | None:
+    """The capture's `labels/NAME.png` (8 or 16 bit, the image's size, 0 = none); None where there are none.
+
+    `labels/names.json` may name them: {"1": "mug", …}. Raises InputError when the labels of a registered image
+    are missing or unreadable, have another size than the image, or go beyond 1023.
+    """
+    folder = capture.folder / "labels"
+    if not any(folder.glob("*.png")):
+        return None
+    stack = []
+    for row in reconstruction.image_index:
+        label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
+        stack.append(_on_pointmap(label, reconstruction))
+    labels = np.stack(stack)
+    names = (
+        {0: "none"}
+        | {k: str(k) for k in range(1, int(labels.max()) + 1)}
+        | _read_names(folder / "names.json")
+    )
+    return LabelImages(labels, tuple(names[k] for k in range(int(labels.max()) + 1)))
+
+
+def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
+    if not path.is_file():
+        raise InputError(
+            f"{path}: not found; give labels for every image of the capture, or for none ({image})"
+        )
+    label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if label is None or label.ndim != 2:
+        raise InputError(f"{path}: no label image; save it as PNG with one channel of 8 or 16 bits")
+    if label.shape[::-1] != capture.image_size:
+        raise InputError(
+            f"{path}: is {label.shape[::-1]} pixels and {image} is {capture.image_size}; make them alike"
+        )
+    if label.max() >= MOST:
+        raise InputError(f"{path}: holds label {label.max()}; number the labels from 1, at most {MOST - 1}")
+    return label.astype(np.int64)
+
+
+def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
+    """The label nearest to where each pixel of the pointmap lies in the capture's image."""
+    camera, grid = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
+    x_px, y_px = cv2.initUndistortRectifyMap(
+        camera.matrix, np.array(camera.distortion), None, grid.matrix, (grid.width, grid.height), cv2.CV_32FC1
+    )  # pyright: ignore[reportCallIssue, reportArgumentType]
+    nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
+    return nearest.astype(np.int64)
+
+
+def _read_names(path: Path) -> dict[int, str]:
+    if not path.is_file():
+        return {}
+    try:
+        named = json.loads(path.read_text()).items()
+        # One line each: the header of cloud.ply names them.
+        return {int(label): " ".join(str(name).split()) or label for label, name in named}
+    except (ValueError, AttributeError):
+        raise InputError(f'{path}: expected {{"1": "mug", "2": "box"}}') from None

@@ -1,0 +1,205 @@
+"""What stands on the table, in metres: the paper's heights, and footprint, box and how sure they are."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.ndimage import binary_erosion, gaussian_filter, gaussian_filter1d
+
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.records import PointCloud
+from jcr.segment.tabletop import FEWEST, Support, support_plane
+
+SHARPEST = 0.0005
+"""Metres; heights are told apart no finer than this, nor than twice the roughness of the plane."""
+TOP_SHARE = 0.25
+"""Of an object's mean density along its height that its top has at least: stray points above it have less."""
+CELL = 0.003
+"""Side (m) of the cells in which the density of an object seen from above is counted."""
+EDGE_SHARE = 0.4
+"""Of the median density seen from above below which a cell holds the fringe of wrong depths beside an outline."""
+
+
+@dataclass(frozen=True)
+class ObjectSize:
+    """One object on the support plane; standard deviations are one sigma."""
+
+    label: int
+    name: str
+    points: int
+    height: float
+    """Of its top above the plane, metres."""
+    height_std: float
+    footprint_in_base: Float[ndarray, "k 3"]
+    """Convex outline on the plane, metres, in order around it."""
+    base_from_box: Float[ndarray, "4 4"]
+    """Centre and axes of the smallest box around it that stands on the plane; z up, x the longer side."""
+    box_size: Float[ndarray, "3"]
+    """Metres along the axes of that box."""
+    box_std: Float[ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The support plane and what stands on it."""
+
+    support: Support
+    objects: tuple[ObjectSize, ...]
+    """Largest footprint first."""
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """What the points of one object say in the support's frame."""
+
+    top: float
+    top_std: float
+    """How rough the top is, and how far below it a top may lie that is narrower than what depth resolves."""
+    turn: float
+    """Radians from the support's x axis to the longer side."""
+    center: Float[ndarray, "2"]
+    sides: Float[ndarray, "2"]
+    outline: Float[ndarray, "k 2"]
+
+
+def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None = None) -> Measured:
+    """Sizes of all labelled objects above the support plane.
+
+    The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
+    sigma) of the calibration's scale. Standard deviations are the jackknife's over images (Efron and Stein
+    1981): depth errors go together within an image, so the number of points says nothing. To it add the scale,
+    how rough or narrow the top is and how bent the table, and at the sides half a cell. Raises InputError when
+    no plane carries the scene.
+    """
+    support = support or support_plane(cloud)
+    x_in_support = apply(inverse(support.base_from_support), cloud.points_in_base)
+    plane_label = np.bincount(cloud.label[support.on_plane]).argmax()
+    # Seen from the others alone, the plane lies a little higher or lower.
+    plane_without = _without_each(x_in_support[support.on_plane, 2], cloud.image[support.on_plane])
+    sizes = []
+    for label in np.unique(cloud.label):
+        rows = cloud.label == label
+        if label in (0, plane_label) or rows.sum() < FEWEST:
+            continue
+        x, image = x_in_support[rows], cloud.image[rows]
+        whole = _shape(x, support.roughness)
+        if whole.top <= 0:
+            continue
+        parts = []
+        for k in np.unique(image):
+            if (image != k).sum() >= FEWEST:
+                part = _shape(x[image != k], support.roughness, whole.turn)
+                parts.append([part.top - plane_without.get(k, 0.0), *part.sides])
+        sizes.append(
+            _size(label, cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
+        )
+    return Measured(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
+
+
+def _size(
+    label: int,
+    name: str,
+    points: int,
+    shape: _Shape,
+    parts: Float[ndarray, "m 3"],
+    support: Support,
+    scale_std: float,
+) -> ObjectSize:
+    size = np.array([*shape.sides, shape.top])
+    bent = np.sqrt(max(support.noise**2 - support.roughness**2, 0.0))
+    own = np.array([CELL / 2, CELL / 2, np.hypot(shape.top_std, bent)])
+    jackknife = np.zeros(3)
+    if len(parts) > 1:
+        jackknife = np.sqrt((len(parts) - 1) * parts[:, [1, 2, 0]].var(0))
+    std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
+    support_from_box = transform(
+        rotation_exp(np.array([0.0, 0.0, shape.turn])), np.append(shape.center, shape.top / 2)
+    )
+    outline = np.column_stack([shape.outline, np.zeros(len(shape.outline))])
+    return ObjectSize(
+        label=int(label),
+        name=name,
+        points=points,
+        height=shape.top,
+        height_std=float(std[2]),
+        footprint_in_base=apply(support.base_from_support, outline),
+        base_from_box=support.base_from_support @ support_from_box,
+        box_size=size,
+        box_std=std,
+    )
+
+
+def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> dict[int, float]:
+    """Mean of the values of all images but one, for each image left out."""
+    total, count = np.bincount(image, values), np.bincount(image)
+    left = len(values) - count
+    return {int(k): float((values.sum() - total[k]) / left[k]) for k in np.flatnonzero(count) if left[k] > 0}
+
+
+def _shape(x_in_support: Float[ndarray, "n 3"], roughness: float, turn: float | None = None) -> _Shape:
+    top, top_std = _top(x_in_support, roughness)
+    xy = _dense(x_in_support[:, :2])
+    middle = xy.mean(0)
+    hull = cv2.convexHull((xy - middle).astype(np.float32))[:, 0]
+    turn = _turn(hull) if turn is None else turn
+    along = hull @ _axes(turn).T
+    low, high = along.min(0), along.max(0)
+    center = middle + (low + high) / 2 @ _axes(turn)
+    return _Shape(top, top_std, turn, center, high - low, hull + middle)
+
+
+def _turn(hull: Float[ndarray, "k 2"]) -> float:
+    """Radians to the longer side of the smallest rectangle around a convex outline."""
+    turn = float(np.radians(cv2.minAreaRect(hull)[2]))
+    length, width = np.ptp(hull @ _axes(turn).T, axis=0)
+    return turn + np.pi / 2 * (length < width)
+
+
+def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, float]:
+    """Height of the top, and its standard deviation within an image.
+
+    Over the heights a flat top is a peak of the density and a round one a step. The highest peak that is no
+    scatter is taken, and the median of the heights around it. (A high quantile instead is lifted by the points
+    that stray above narrow tops, by 2 % and more.)
+    """
+    height = x_in_support[:, 2]
+    width = max(2 * roughness, SHARPEST)
+    step = width / 4
+    low = height.min()
+    count = np.bincount(((height - low) / step).astype(int), minlength=9)
+    density = gaussian_filter1d(count.astype(float), width / step, mode="constant")
+    span = (np.quantile(height, 0.99) - low) / step + 1
+    peak = int(np.flatnonzero(density >= TOP_SHARE * len(height) / max(span, 8.0)).max())
+    while peak > 0 and density[peak - 1] >= density[peak]:
+        peak -= 1
+    around = np.abs(height - (low + (peak + 0.5) * step)) < 2.5 * width
+    middle = float(np.median(height[around]))
+    spread = 1.4826 * float(np.median(np.abs(height[around] - middle)))
+    # Where matching windows straddle a rim, depth is drawn down; the inside of a wider top does not suffer.
+    count = _counted(x_in_support[around, :2])
+    rim = 1 - binary_erosion(count > 0, np.ones((3, 3))).sum() / (count > 0).sum()
+    return middle, float(np.hypot(spread, rim * CELL / 2))
+
+
+def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
+    """Points in each cell of the map from above, with an empty cell all around."""
+    cell = np.floor((xy - xy.min(0)) / CELL).astype(int) + 1
+    count = np.zeros(cell.max(0) + 2)
+    np.add.at(count, tuple(cell.T), 1)
+    return count
+
+
+def _dense(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
+    """The points without the thin fringe around them."""
+    count = _counted(xy)
+    typical = np.median(count[count > 0])
+    smooth = gaussian_filter(count, 0.5, mode="constant")
+    cell = np.floor((xy - xy.min(0)) / CELL).astype(int) + 1
+    kept = xy[smooth[tuple(cell.T)] >= EDGE_SHARE * typical]
+    return kept if len(kept) >= 3 else xy
+
+
+def _axes(turn: float) -> Float[ndarray, "2 2"]:
+    return np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])

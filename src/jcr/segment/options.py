@@ -1,0 +1,30 @@
+"""What divides a scene into objects, apart from the code that does it so that the command line stays quick."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class TabletopOptions:
+    """What counts as an object on the table."""
+
+    object_lowest: float = 0.008
+    """Height (m) above the plane from which points found an object; lower ones may join it."""
+    object_highest: float = 0.6
+    """Height (m) above the plane beyond which nothing belongs to an object."""
+    object_gap: float = 0.01
+    """Objects with this much room (m) between them, seen from above, are told apart."""
+    object_smallest: float = 0.015
+    """Objects whose points span less (m) than this are taken for noise."""
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """How the scene is divided into objects."""
+
+    segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
+    """labels: labels/NAME.png beside the images' folder; tabletop: the plane that carries the scene and what stands
+    on it; sam: Segment Anything 2 (pip install 'jcr[sam]'); auto: labels where there are some, else tabletop."""
+    sam_weights: str = "facebook/sam2.1-hiera-tiny"
+    """Path or hub id of Segment Anything's weights."""
+    tabletop: TabletopOptions = field(default_factory=TabletopOptions)

@@ -1,0 +1,165 @@
+"""Segments from Segment Anything 2: masks of every image, made into objects where they overlap in space.
+
+The network is `transformers`' Sam2Model (Ravi et al., "SAM 2: Segment Anything in Images and Videos", 2024).
+Its image processor needs torchvision, so images are prepared here.
+"""
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+from torch.nn import functional as F
+
+from jcr.errors import InputError
+from jcr.geometry import apply_similarity
+from jcr.progress import Progress
+from jcr.records import HandEye, Reconstruction
+from jcr.segment.labels import LabelImages
+
+if TYPE_CHECKING:
+    from transformers import Sam2Model
+
+IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of RGB in [0, 1], as the network was trained with."""
+SIDE_POINTS, BATCH = 16, 64
+"""Prompts on a side of the image, and prompts a forward pass."""
+LEAST_QUALITY, LEAST_STABILITY = 0.7, 0.9
+"""The network's own estimate of a mask's overlap with the truth, and the mask's overlap with itself when the
+threshold moves by one up and down, as in the authors' automatic mask generator."""
+SAME = 0.7
+"""Intersection over union of two masks of one image that are one mask."""
+VOXEL = 0.01
+"""Side (m) of the cells in which masks of different images are compared."""
+OVERLAP = 0.5
+"""Intersection over union, in the cells that both images see, of two masks that show one object."""
+
+
+def load_sam(weights: str) -> "Sam2Model":
+    """Segment Anything 2 by hub id or path; raises InputError, with the cure, where it cannot be had."""
+    try:
+        from transformers import Sam2Model
+    except ImportError:
+        raise InputError("--segments sam: transformers is not installed; pip install 'jcr[sam]'") from None
+    try:
+        model = Sam2Model.from_pretrained(weights)
+    except (OSError, ValueError) as error:
+        reason = str(error).split("\n")[0]
+        hint = "the folder must hold config.json and model.safetensors" if os.path.isdir(weights) else ""
+        raise InputError(
+            f"--sam-weights {weights}: cannot be loaded ({reason}); {hint or 'check the name'}"
+        ) from None
+    torch.nn.Module.to(model.eval(), "cuda" if torch.cuda.is_available() else "cpu")
+    return model
+
+
+def sam_labels(
+    model: "Sam2Model", reconstruction: Reconstruction, hand_eye: HandEye, progress: Progress | None = None
+) -> LabelImages:
+    """Labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
+    masks = []
+    for k, image in enumerate(reconstruction.colors):
+        if progress:
+            progress("segment anything", k / len(reconstruction.colors))
+        masks.append(image_masks(model, image))
+    x_in_base = apply_similarity(
+        hand_eye.base_from_recon, hand_eye.scale, reconstruction.points_in_recon.astype(np.float64)
+    )
+    return merged(masks, x_in_base, reconstruction.confidence > 0)
+
+
+@torch.no_grad()
+def image_masks(model: "Sam2Model", image: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "k h w"]:
+    """Masks of everything that the network finds in one image, best first.
+
+    Prompts are points on a regular grid; of the three masks for each, the one of highest quality is taken.
+    """
+    device = next(model.parameters()).device
+    size = model.config.prompt_encoder_config.image_size  # pyright: ignore
+    height, width = (size, size) if isinstance(size, int) else size
+    pixels = torch.from_numpy(image).to(device).movedim(-1, 0)[None] / 255
+    pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True)
+    mean, std = (torch.tensor(values, device=device)[:, None, None] for values in (IMAGE_MEAN, IMAGE_STD))
+    embeddings = model.get_image_embeddings((pixels - mean) / std)
+    steps = (torch.arange(SIDE_POINTS, device=device) + 0.5) / SIDE_POINTS
+    points = torch.stack(torch.meshgrid(steps * width, steps * height, indexing="xy"), -1).reshape(-1, 1, 2)
+    found, quality = [], []
+    for batch in points.split(BATCH):
+        out = model(
+            input_points=batch[None],
+            input_labels=torch.ones(1, len(batch), 1, dtype=torch.int64, device=device),
+            image_embeddings=embeddings,
+        )
+        best = out.iou_scores[0].argmax(1)
+        row = torch.arange(len(best), device=device)
+        logits = F.interpolate(out.pred_masks[0][row, best][None], image.shape[:2], mode="bilinear")[0]
+        stable = (logits > 1).sum((1, 2)) / (logits > -1).sum((1, 2)).clamp(min=1)
+        good = (out.iou_scores[0][row, best] >= LEAST_QUALITY) & (stable >= LEAST_STABILITY)
+        found.append(logits[good] > 0)
+        quality.append(out.iou_scores[0][row, best][good])
+    order = torch.cat(quality).argsort(descending=True)
+    return _distinct(torch.cat(found)[order]).cpu().numpy()
+
+
+def _distinct(masks: Bool[Tensor, "k h w"]) -> Bool[Tensor, "j h w"]:
+    """The masks without those that repeat an earlier one."""
+    flat = masks.flatten(1).float()
+    area = flat.sum(1)
+    shared = flat @ flat.T
+    same = shared > SAME * (area[:, None] + area - shared)
+    kept: list[int] = []
+    for k in range(len(masks)):
+        if area[k] > 0 and not same[k, kept].any():
+            kept.append(k)
+    return masks[kept]
+
+
+def merged(
+    masks: list[Bool[ndarray, "_ h w"]], x_in_base: Float[ndarray, "m h w 3"], known: Bool[ndarray, "m h w"]
+) -> LabelImages:
+    """Labels (m,h,w) of the objects that the masks of m images show, 1 for the largest; 0 = none.
+
+    Two masks of different images are one object when they fill the same cells of space, of those that both
+    images see. What one image alone shows is no object, where there are several images.
+    """
+    low = x_in_base[known].min(0) if known.any() else np.zeros(3)
+    cell = np.floor((x_in_base - low) / VOXEL).astype(np.int64)
+    shape = cell[known].max(0, initial=0) + 1
+    cell = np.ravel_multi_index(tuple(np.moveaxis(cell, -1, 0)), tuple(shape), mode="clip")
+    numbers, cell = np.unique(np.where(known, cell, -1), return_inverse=True)
+    cell = cell.reshape(known.shape)
+    # Rows are masks or images, columns are cells of space.
+    image_of = np.repeat(np.arange(len(masks)), [len(of_image) for of_image in masks])
+    inside = np.zeros((len(image_of), len(numbers)), bool)
+    seen = np.zeros((len(masks), len(numbers)), bool)
+    for k in range(len(masks)):
+        seen[k, cell[k][known[k]]] = True
+        for row, mask in zip(np.flatnonzero(image_of == k), masks[k], strict=True):
+            inside[row, cell[k][mask & known[k]]] = True
+    holds = inside.astype(np.float32)
+    shared = holds @ holds.T
+    visible = holds @ seen.T.astype(np.float32)
+    in_other = visible[:, image_of]
+    union = in_other + in_other.T - shared
+    one = (shared > OVERLAP * union) & (image_of[:, None] != image_of)
+    _, group = connected_components(coo_array(one), directed=False)
+
+    several = np.array([len(np.unique(image_of[group == g])) for g in range(group.max(initial=-1) + 1)])
+    size = np.array([inside[group == g].any(0).sum() for g in range(len(several))])
+    size[several < min(2, len(masks))] = 0
+    rank = np.zeros(len(size), int)
+    rank[np.argsort(-size)[: (size > 0).sum()]] = np.arange(1, (size > 0).sum() + 1)
+    labels = np.zeros(known.shape, np.int64)
+    for row in np.argsort([-mask.sum() for of_image in masks for mask in of_image]):
+        # The smaller mask lies on the larger: a mug on the table.
+        k = image_of[row]
+        mask = masks[k][row - np.searchsorted(image_of, k)]
+        if rank[group[row]] > 0:
+            labels[k][mask] = rank[group[row]]
+    names = ("none", *(f"segment {n}" for n in range(1, int((size > 0).sum()) + 1)))
+    return LabelImages(labels, names)
