@@ -69,7 +69,7 @@ def run() -> str:
             "|---" * (len(SEEDS) + 2) + "|",
         ]
         for row in zip(*(scene.measurements for scene in chosen), strict=True):
-            cells = [f"{100 * m.error / m.true.height:+.2f}" for m in row]
+            cells = ["not seen" if m.found is None else f"{100 * m.error / m.true.height:+.2f}" for m in row]
             worst = 1e3 * np.nanmax([abs(m.error) for m in row])
             lines.append(f"| {row[0].true.name} | {' | '.join(cells)} | {worst:.2f} |")
         iou = " | ".join(f"{scene.mean_iou:.3f}" for scene in chosen)
@@ -120,7 +120,7 @@ def matched(
 ) -> tuple[dict[int, int], float]:
     """The true label of each found one, so that they overlap most, and the mean of their intersection over union.
 
-    The mean is over the true labels that any point has; those not found count 0, and so does label 0 nothing.
+    The mean is over the true labels from 1 that any point has; one that is not found counts 0.
     """
     count = np.zeros((found.max() + 1, true_labels))
     np.add.at(count, (found, true), 1)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.ndimage import binary_erosion, gaussian_filter, gaussian_filter1d
+from scipy.ndimage import binary_closing, binary_erosion, gaussian_filter, gaussian_filter1d
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import PointCloud
@@ -20,6 +20,8 @@ CELL = 0.003
 """Side (m) of the cells in which the density of an object seen from above is counted."""
 EDGE_SHARE = 0.4
 """Of the median density seen from above below which a cell holds the fringe of wrong depths beside an outline."""
+SIDE_SHARE = 0.005
+"""Of the area seen from above that lies beyond each side, where noise has put it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
                 part = _shape(x[image != k], support.roughness, whole.turn)
                 parts.append([part.top - plane_without.get(k, 0.0), *part.sides])
         sizes.append(
-            _size(label, cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
+            _size(int(label), cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
         )
     return Measured(support, tuple(sorted(sizes, key=lambda size: -size.box_size[0] * size.box_size[1])))
 
@@ -119,7 +121,7 @@ def _size(
     )
     outline = np.column_stack([shape.outline, np.zeros(len(shape.outline))])
     return ObjectSize(
-        label=int(label),
+        label=label,
         name=name,
         points=points,
         height=shape.top,
@@ -140,19 +142,25 @@ def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> di
 
 def _shape(x_in_support: Float[ndarray, "n 3"], roughness: float, turn: float | None = None) -> _Shape:
     top, top_std = _top(x_in_support, roughness)
-    xy = _dense(x_in_support[:, :2])
+    xy, area = _dense(x_in_support[:, :2])
     middle = xy.mean(0)
-    hull = cv2.convexHull((xy - middle).astype(np.float32))[:, 0]
-    turn = _turn(hull) if turn is None else turn
-    along = hull @ _axes(turn).T
-    low, high = along.min(0), along.max(0)
+    turn = _turn(_outline(xy - middle)) if turn is None else turn
+    along = (xy - middle) @ _axes(turn).T
+    ends = [SIDE_SHARE, 1 - SIDE_SHARE]
+    low, high = np.quantile(along, ends, axis=0, weights=area, method="inverted_cdf")
+    within = ((along >= low) & (along <= high)).all(1)
     center = middle + (low + high) / 2 @ _axes(turn)
-    return _Shape(top, top_std, turn, center, high - low, hull + middle)
+    return _Shape(top, top_std, turn, center, high - low, _outline(xy[within] - middle) + middle)
+
+
+def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
+    """Convex hull in single precision, which near the origin is exact enough."""
+    return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
 
 
 def _turn(hull: Float[ndarray, "k 2"]) -> float:
     """Radians to the longer side of the smallest rectangle around a convex outline."""
-    turn = float(np.radians(cv2.minAreaRect(hull)[2]))
+    turn = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
     length, width = np.ptp(hull @ _axes(turn).T, axis=0)
     return turn + np.pi / 2 * (length < width)
 
@@ -178,8 +186,8 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
     middle = float(np.median(height[around]))
     spread = 1.4826 * float(np.median(np.abs(height[around] - middle)))
     # Where matching windows straddle a rim, depth is drawn down; the inside of a wider top does not suffer.
-    count = _counted(x_in_support[around, :2])
-    rim = 1 - binary_erosion(count > 0, np.ones((3, 3))).sum() / (count > 0).sum()
+    top = binary_closing(_counted(x_in_support[around, :2]) > 0, np.ones((3, 3)))
+    rim = 1 - binary_erosion(top, np.ones((3, 3))).sum() / max(top.sum(), 1)
     return middle, float(np.hypot(spread, rim * CELL / 2))
 
 
@@ -191,14 +199,15 @@ def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:
     return count
 
 
-def _dense(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
-    """The points without the thin fringe around them."""
+def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndarray, " k"]]:
+    """The points without the thin fringe around them, and the share of a cell that each stands for."""
     count = _counted(xy)
-    typical = np.median(count[count > 0])
+    cell = tuple((np.floor((xy - xy.min(0)) / CELL).astype(int) + 1).T)
     smooth = gaussian_filter(count, 0.5, mode="constant")
-    cell = np.floor((xy - xy.min(0)) / CELL).astype(int) + 1
-    kept = xy[smooth[tuple(cell.T)] >= EDGE_SHARE * typical]
-    return kept if len(kept) >= 3 else xy
+    kept = smooth[cell] >= EDGE_SHARE * np.median(count[count > 0])
+    if kept.sum() < 3:
+        kept[:] = True
+    return xy[kept], 1 / count[cell][kept]
 
 
 def _axes(turn: float) -> Float[ndarray, "2 2"]:

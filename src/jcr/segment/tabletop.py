@@ -43,12 +43,14 @@ FEWEST_IN_CELL, STRAY_SHARE = 3, 0.05
 """Points, and share of the median cell's, below which a cell of the map from above holds only stray points."""
 PATCH = 0.02
 """Metres over which a table is taken for flat, however it is bent."""
+LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
+"""Cosine to the base frame's z axis from which a plane is level, and how many times its points then count."""
 PLANES, SAMPLE = 400, 20_000
 """Planes through three random points that are tried, and points each is tried on."""
 
 
 def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
-    """The plane with most points on it that has the cameras on one side (RANSAC, then least squares).
+    """The plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
     Raises InputError when no plane holds a tenth of the points.
     """
@@ -67,15 +69,17 @@ def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     # A table's points are spread about it by the noise of depth, which is larger the farther the cameras are.
     far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[cloud.image], axis=1))
     count = (np.abs(some @ normal.T - offset) < 0.005 * far).sum(0) * one_sided
-    best = int(count.argmax())
+    # A wall behind the table may be seen more; arms that stand upright are the rule.
+    level = np.abs(normal[:, 2]) > LEAST_LEVEL
+    best = int((count * np.where(level, LEVEL_WEIGHT, 1)).argmax())
     if count[best] < 0.1 * len(some):
         raise InputError(
             "no plane carries the scene: none holds a tenth of the points with all cameras on one side"
         )
-    up, level = normal[best] * side[0, best], offset[best] * side[0, best]
 
     # Geman and McClure's weights: a sheet of board or a tray that lies on the table does not lift the plane.
-    distance, noise, middle = x @ up - level, 0.002 * far, x.mean(0)
+    up, middle = normal[best] * side[0, best], a[best]
+    distance, noise = (x - middle) @ up, 0.002 * far
     for _ in range(10):
         near = np.abs(distance) < 3 * noise
         weight = 1 / (1 + (distance[near] / noise) ** 2) ** 2
@@ -118,30 +122,27 @@ def label_tabletop(
     object_of = np.zeros(len(height), int)
     if over.any():
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
-        low, high = cell[over].min(0), cell[over].max(0)
-        within = (
-            ((cell >= low) & (cell <= high)).all(1) & (height > noise) & (height < options.object_highest)
-        )
-        place = tuple((cell - low).T)
-        parts = _parts(place[0][over], place[1][over], tuple(high - low + 1))
+        # Two empty cells all around, the outermost of which stands for all that lies farther out.
+        low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
+        parts = _parts(cell[over] - low, tuple((high - low + 1).tolist()))
+        place = tuple((np.clip(cell, low, high) - low).T)
         # What is too low to found an object belongs to the one it lies under: its foot.
-        part = np.zeros(len(height), int)
-        part[within] = parts[place[0][within], place[1][within]]
+        part = np.where((height > noise) & (height < options.object_highest), parts[place], 0)
+        beneath = np.asarray(ndimage.binary_dilation(parts > 0, np.ones((3, 3))), bool)
+        bare = support.on_plane & ~beneath[place]
         reaching = np.bincount(part, height > CLEARLY * founding, minlength=part.max() + 1)
         part[reaching[part] < FEWEST] = 0
-        object_of = _objects(part, x_in_support, support.on_plane, options)
+        object_of = _objects(part, x_in_support, bare, options)
     table = (np.abs(height) <= noise) & (object_of == 0)
     label = np.where(object_of > 0, object_of + 1, np.where(table, 1, 0))
     names = ("none", "table", *(f"object {k}" for k in range(1, int(object_of.max(initial=0)) + 1)))
     return replace(cloud, label=label, label_names=names)
 
 
-def _parts(
-    column: Int[ndarray, " k"], row: Int[ndarray, " k"], shape: tuple[int, int]
-) -> Int[ndarray, "c r"]:
+def _parts(cell: Int[ndarray, "k 2"], shape: tuple[int, ...]) -> Int[ndarray, "c r"]:
     """Connected cells (from 1) of the map from above that hold more than a few stray points."""
     count = np.zeros(shape)
-    np.add.at(count, (column, row), 1)
+    np.add.at(count, tuple(cell.T), 1)
     enough = max(FEWEST_IN_CELL, STRAY_SHARE * float(np.median(count[count > 0])))
     labelled, _ = ndimage.label(count >= enough, np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     return labelled
@@ -150,14 +151,17 @@ def _parts(
 def _objects(
     part: Int[ndarray, " n"],
     x_in_support: Float[ndarray, "n 3"],
-    on_plane: Bool[ndarray, " n"],
+    bare: Bool[ndarray, " n"],
     options: TabletopOptions,
 ) -> Int[ndarray, " n"]:
-    """Number of the object of each point, from 1 for the one with most points; 0 = none."""
+    """Number of the object of each point, from 1 for the one with most points; 0 = none.
+
+    `bare` are the points of the plane that lie beneath nothing.
+    """
     part = _joined(part, x_in_support, options)
     count = np.bincount(part)
-    # What mostly stands beside the plane is background; what is too small is noise.
-    plane_xy = x_in_support[on_plane, :2]
+    # What mostly stands beside the bare plane is background, such as a wall; what is too small is noise.
+    plane_xy = x_in_support[bare, :2]
     outline = Delaunay(plane_xy[ConvexHull(plane_xy).vertices])
     beside = np.bincount(part, outline.find_simplex(x_in_support[:, :2]) < 0) / np.maximum(count, 1)
     span = np.array(
