@@ -104,6 +104,22 @@ def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     assert np.median(np.abs(answers["distance"][2:])) < 0.01
 
 
+def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
+    answered = run_jcr("measure", done, "--json")
+    assert answered.returncode == 0, answered.stderr
+    found = json.loads(answered.stdout)["objects"]
+    true = json.loads((tabletop / "truth" / "scene.json").read_text())["objects"]
+    places = np.array([thing["base_from_box"] for thing in true])[:, :2, 3]
+    near = [np.linalg.norm(places - np.array(size["base_from_box"])[:2, 3], axis=1) for size in found]
+    heights = {int(d.argmin()): size["height"] for d, size in zip(near, found, strict=True) if d.min() < 0.02}
+    assert len(heights) >= 5
+    # The stalk of the apple, 3 mm thick, is beyond what depth resolves.
+    off = {true[k]["name"]: height / true[k]["height"] - 1 for k, height in heights.items()}
+    assert all(abs(share) < 0.031 for name, share in off.items() if name != "apple"), off
+    lines = run_jcr("measure", done).stdout.splitlines()
+    assert len(lines) == 2 + len(found) and "±" in lines[2]
+
+
 def test_scale_is_metric_to_half_a_percent(done: Path, tabletop: Path):
     from jcr.geometry import fit_similarity
     from jcr.reconstruct.file import read_reconstruction
@@ -137,6 +153,11 @@ def test_every_command_has_help_with_examples():
         helped = run_jcr(name, "--help")
         assert helped.returncode == 0, helped.stderr
         assert "examples:" in helped.stdout, name
+
+
+def test_sizes_of_nothing_are_refused(tmp_path: Path):
+    finished = run_jcr("measure", tmp_path)
+    assert finished.returncode == 2 and "make one with jcr map" in finished.stderr
 
 
 @pytest.mark.parametrize(
