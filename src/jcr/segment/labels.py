@@ -37,6 +37,9 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
         return None
     stack = []
     for row in reconstruction.image_index:
+        if row >= len(capture):  # added to the run later
+            stack.append(np.zeros(reconstruction.confidence.shape[1:], np.int64))
+            continue
         label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
         stack.append(_on_pointmap(label, reconstruction))
     labels = np.stack(stack)
