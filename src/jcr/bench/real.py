@@ -11,9 +11,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.bench.peers import opencv
-from jcr.calibrate.file import HeldOutError
+from jcr.calibrate.file import HeldOutError, read_hand_eye
 from jcr.capture.read import read_capture
-from jcr.cli.compare import read_hand_eye
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_between_deg, rotation_log
 from jcr.pipeline import RunOptions, calibrate

@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.calibrate.next_poses import NextPose, next_poses
+from jcr.capture.read import read_json
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
@@ -286,6 +289,29 @@ def read_calibration(path: Path) -> CalibrationFile:
     if parsed.gripper_from_camera is not None:
         require_rigid(np.array(parsed.gripper_from_camera), f"{file}: gripper_from_camera")
     return parsed
+
+
+def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 7"] | None]:
+    """gripper_from_camera, and its covariance where the file has one; InputError where there is neither."""
+    file = path
+    if path.is_dir():
+        names = ("calibration.json", "reference.json")
+        file = next((path / name for name in names if (path / name).is_file()), path / names[0])
+    if not file.is_file():
+        raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
+    content = read_json(file)
+    matrix = content.get("gripper_from_camera") if isinstance(content, dict) else None
+    if matrix is None:
+        raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
+    try:
+        transform = require_rigid(
+            np.array(matrix, dtype=np.float64).reshape(4, 4), f"{file}: gripper_from_camera"
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(str(error) if isinstance(error, InputError) else f"{file}: no 4x4 matrix") from None
+    uncertainty = content.get("uncertainty")
+    covariance = None if not uncertainty else np.array(uncertainty["covariance"], dtype=np.float64)
+    return transform, covariance
 
 
 def _lens(intrinsics: Intrinsics | None) -> Lens | None:

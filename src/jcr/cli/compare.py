@@ -8,8 +8,6 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from jaxtyping import Float
-from numpy import ndarray
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the difference, and how many of the calibration's own sigmas it is where they are known."""
+    from jcr.calibrate.file import read_hand_eye
     from jcr.geometry import rotation_between_deg, rotation_log
 
     ours, covariance = read_hand_eye(arguments.out)
@@ -52,30 +51,3 @@ def main(arguments: Arguments) -> int:
         text += f"; at most {max(sigmas):.1f} of its reported standard deviations on any axis"
     sys.stdout.write((json.dumps(result) if arguments.json else text) + "\n")
     return 0
-
-
-def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 7"] | None]:
-    """gripper_from_camera, and its covariance where the file has one; InputError where there is neither."""
-    from jcr.capture.read import read_json
-    from jcr.errors import InputError
-    from jcr.geometry import require_rigid
-
-    file = path
-    if path.is_dir():
-        names = ("calibration.json", "reference.json")
-        file = next((path / name for name in names if (path / name).is_file()), path / names[0])
-    if not file.is_file():
-        raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
-    content = read_json(file)
-    matrix = content.get("gripper_from_camera") if isinstance(content, dict) else None
-    if matrix is None:
-        raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
-    try:
-        transform = require_rigid(
-            np.array(matrix, dtype=np.float64).reshape(4, 4), f"{file}: gripper_from_camera"
-        )
-    except (TypeError, ValueError) as error:
-        raise InputError(str(error) if isinstance(error, InputError) else f"{file}: no 4x4 matrix") from None
-    uncertainty = content.get("uncertainty")
-    covariance = None if not uncertainty else np.array(uncertainty["covariance"], dtype=np.float64)
-    return transform, covariance
