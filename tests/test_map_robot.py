@@ -1,5 +1,7 @@
 """A robot of boxes, cylinders, balls and meshes, asked against a map of known distances."""
 
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import trimesh
 import analytic_scene
 from analytic_scene import BALL_CENTER, WORKSPACE
 from jcr.errors import InputError
+from jcr.export.points import write_cloud
 from jcr.geometry import apply, transform
 from jcr.represent.build import build_scene
 from jcr.represent.options import MapOptions
@@ -160,3 +163,21 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: SceneMap, urdf:
     broken.write_text('<robot name="a"><link name="b"/></robot>')
     with pytest.raises(InputError, match="no link has a <collision>"):
         load_robot(broken)
+
+
+def test_the_page_on_the_map_runs_as_printed(
+    scene: SceneMap, urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    page = (Path(__file__).parents[1] / "docs" / "map.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len(blocks) == 4
+    scene.save(tmp_path / "out" / "table" / "map.safetensors")
+    write_cloud(tmp_path / "out" / "table" / "cloud.ply", analytic_scene.cloud())
+    for file in urdf.parent.iterdir():
+        shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert names["sample"].unknown.tolist() == [False, True, True]
+    assert "warmth" in names["warm"].properties

@@ -35,7 +35,7 @@ class Recipe:
 
 RECIPES = {
     "default": Recipe(
-        32, 0, ((0, 4), (1, 2)), ((1, 4), (2, 4)), rays=True, layer_rate=3e-2, grid_rate=0.3, look=10
+        32, 0, ((0, 4), (1, 2)), ((0, 4), (2, 4)), rays=True, layer_rate=3e-2, grid_rate=0.3, look=10
     ),
     "paper": Recipe(256, 10, (), (), rays=False, layer_rate=5e-3, grid_rate=0.0, look=100),
 }
