@@ -7,6 +7,7 @@ SOURCE = Path(__file__).parent.parent / "src" / "jcr"
 LAYERS = [
     {"errors"},
     {"geometry", "records", "files", "progress"},
+    {"information"},
     {"capture"},
     {"reconstruct"},
     {"calibrate"},

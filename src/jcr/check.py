@@ -8,15 +8,16 @@ from numpy import ndarray
 
 from jcr.calibrate.conventions import better_reading, explained
 from jcr.calibrate.hand_eye import solve_hand_eye
-from jcr.calibrate.next_poses import ASSUMED_NOISE, NextPose, next_poses
+from jcr.calibrate.next_poses import NextPose, next_poses
 from jcr.calibrate.observability import observability
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
+from jcr.information import ASSUMED_NOISE
 from jcr.progress import Progress
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.reconstruct.lens import fold_distance_px
-from jcr.records import Capture, HandEye, Observability
+from jcr.records import Capture, HandEye, Observability, PosePairs, Reconstruction
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Examination:
     """What is known of a capture before it is calibrated."""
 
     sharpness: Float[ndarray, " n"]
-    """Variance of the Laplacian, relative to the median image's."""
+    """Variance of the Laplacian, relative to the median image's; empty where there are no images."""
     largest_move_m: float
     largest_turn_rad: float
     """Between any two gripper poses."""
@@ -40,7 +41,7 @@ class Examination:
 
 
 def check(
-    capture: Capture,
+    capture: Capture | PosePairs,
     suggest: int = 0,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
@@ -50,36 +51,41 @@ def check(
 ) -> Examination:
     """Examine a capture; with `look` its pictures are registered sparsely to hold the poses against them.
 
+    Where the cameras' poses were given instead, the gripper's are held against those.
+
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis.
     """
     gripper = capture.base_from_gripper
     motion = inverse(gripper)[:, None] @ gripper[None]
     move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
     turn = float(rotation_angle(motion[..., :3, :3]).max())
-    brightness, sharpness = _looks(capture)
-    remarks = list(_picture_remarks(capture, brightness, sharpness))
-    if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
-        remarks.append(
-            f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
-        )
+    sharp, remarks = np.zeros(0), [*capture.notes]
+    if isinstance(capture, Capture):
+        brightness, sharp = _looks(capture)
+        remarks += _picture_remarks(capture, brightness, sharp)
+        if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
+            remarks.append(
+                f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
+            )
     if move < 5e-3 and turn > np.radians(5):
         remarks.append(
             f"the gripper moves by at most {1e3 * move:.2g} mm while it turns by {np.degrees(turn):.0f}°: "
             "positions that were divided by 1000 look so"
         )
     hand_eye, faults = None, []
-    if look:
+    found: Reconstruction | PosePairs | None = capture if isinstance(capture, PosePairs) else None
+    if look and isinstance(capture, Capture):
         try:
             found = reconstruct(capture, ColmapOptions(seed=seed, dense=False), progress)
+            remarks += found.notes
         except NotTrustedError as error:
             remarks.append(str(error))
-        else:
-            used = gripper[found.image_index]
-            hand_eye = solve_hand_eye(used, found.recon_from_camera, robot_noise=robot_noise)
-            if (reading := better_reading(used, found.recon_from_camera)) is not None:
-                faults.append(explained(reading))
-            faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
-            remarks += [*found.notes]
+    if found is not None:
+        used = gripper[found.image_index]
+        hand_eye = solve_hand_eye(used, found.recon_from_camera, robot_noise=robot_noise)
+        if (reading := better_reading(used, found.recon_from_camera)) is not None:
+            faults.append(explained(reading))
+        faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
     trusted = hand_eye is not None and hand_eye.converged
     x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
     seen = hand_eye.observability if hand_eye is not None else observability(gripper)
@@ -90,7 +96,7 @@ def check(
         noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
     expected, suggestions = next_poses(gripper, suggest, x, noise, reach, seed)
     return Examination(
-        sharpness, move, turn, seen, expected, tuple(suggestions), hand_eye, tuple(faults), tuple(remarks)
+        sharp, move, turn, seen, expected, tuple(suggestions), hand_eye, tuple(faults), tuple(remarks)
     )
 
 

@@ -19,6 +19,7 @@ from jcr import __version__
 from jcr.auto import best_reconstruction
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.calibrate.calibrate import calibrate as calibrate_stage
+from jcr.calibrate.calibrate import calibrate_poses as calibrate_poses_stage
 from jcr.calibrate.file import (
     CalibrationFile,
     calibration_file,
@@ -27,6 +28,7 @@ from jcr.calibrate.file import (
     write_calibration,
 )
 from jcr.capture.added import read_added, with_images, write_added
+from jcr.capture.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import read_cloud, write_cloud
@@ -34,7 +36,7 @@ from jcr.files import write_text
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
 from jcr.reconstruct.file import read_reconstruction, write_reconstruction
-from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
 from jcr.represent.options import MapOptions
@@ -44,6 +46,8 @@ from jcr.segment.measure import measure as measure_cloud
 from jcr.segment.options import SegmentOptions
 from jcr.segment.segments import image_labels, label_cloud
 
+CAPTURE = "capture"
+"""In the run folder: images and poses that were read from another format than capture.json."""
 STATE = "run.json"
 """In the run folder: the capture, and what each finished stage was made from."""
 
@@ -78,6 +82,20 @@ class RunResult:
         return self.hand_eye.converged
 
 
+@dataclass(frozen=True)
+class PosesResult:
+    """What camera poses that were given say, without images."""
+
+    out: Path
+    calibration: CalibrationFile
+    hand_eye: HandEye
+
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration may be trusted."""
+        return self.hand_eye.converged
+
+
 def run(
     capture: Capture,
     out: str | Path,
@@ -91,8 +109,9 @@ def run(
     Finished stages are taken from `out` when capture and options are unchanged. Raises InputError on input
     that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
     """
-    options = _with_backend(options, backend)
+    options = _with_backend(options, backend, capture)
     with _run_folder(Path(out)) as folder:
+        capture = kept(capture, folder / CAPTURE)
         added = read_added(folder, capture)
         result = _calibrate(capture, folder, options, progress)
         result = _map(capture, added, folder, options, result, progress)
@@ -109,9 +128,23 @@ def calibrate(
     progress: Progress | None = None,
 ) -> RunResult:
     """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
-    options = _with_backend(options, backend)
+    options = _with_backend(options, backend, capture)
     with _run_folder(Path(out)) as folder:
-        return _calibrate(capture, folder, options, progress)
+        return _calibrate(kept(capture, folder / CAPTURE), folder, options, progress)
+
+
+def calibrate_poses(
+    pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
+) -> PosesResult:
+    """calibration.json in the folder `out` from camera poses that were given, without images."""
+    start = time.perf_counter()
+    with _run_folder(Path(out)) as folder:
+        hand_eye = calibrate_poses_stage(pairs, options)
+        timings = {"calibrate": round(time.perf_counter() - start, 3)}
+        content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
+        write_calibration(folder / "calibration.json", content)
+        _write_log(folder, content)
+        return PosesResult(folder, content, hand_eye)
 
 
 def build_map(
@@ -267,11 +300,18 @@ def _report(capture: Capture, result: RunResult) -> None:
     write_text(result.out / "report.html", report_html(capture, result))
 
 
-def _with_backend(options: RunOptions | None, backend: str | None) -> RunOptions:
+def _with_backend(options: RunOptions | None, backend: str | None, capture: Capture) -> RunOptions:
+    """The options with the back end of the call, or the one that takes the capture's own camera poses."""
     options = options or RunOptions()
-    if backend is None:
-        return options
-    return replace(options, reconstruct=replace(options.reconstruct, backend=backend))
+    if backend is not None:
+        return replace(options, reconstruct=replace(options.reconstruct, backend=backend))
+    if capture.cameras is not None and (options.reconstruct.backend, options.reconstruct.weights) == (
+        "auto",
+        None,
+    ):
+        given = replace(options.reconstruct, backend="given", weights=str(capture.cameras.resolve()))
+        return replace(options, reconstruct=given)
+    return options
 
 
 @contextmanager
@@ -301,9 +341,13 @@ def _fingerprint(capture: Capture, options: dict[str, Any]) -> str:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
     digest.update(capture.base_from_gripper.tobytes())
     lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
-    weights = Path(options["weights"] or "")
-    if weights.is_file():  # gigabytes at times: size and date tell one file of that name from another
-        options = options | {"weights": [str(weights), weights.stat().st_size, weights.stat().st_mtime_ns]}
+    if (
+        options["weights"] is not None
+    ):  # gigabytes at times: size and date tell one file of that name from another
+        weights = Path(options["weights"])
+        files = sorted(weights.iterdir()) if weights.is_dir() else [weights] if weights.is_file() else []
+        states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+        options = options | {"weights": states or options["weights"]}
     digest.update(json.dumps([lens, options, __version__], sort_keys=True).encode())
     return digest.hexdigest()
 

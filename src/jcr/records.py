@@ -43,9 +43,38 @@ class Capture:
     """Width, height in pixels after EXIF rotation; the same for all images."""
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
+    source: Path | None = None
+    """What it was read from, where that is not a capture.json in `folder`."""
+    cameras: Path | None = None
+    """A COLMAP model or transforms.json that holds the cameras' poses already."""
+    notes: tuple[str, ...] = ()
+    """What reading found that the user should know: how files were paired, frames left out."""
 
     def __len__(self) -> int:
         return len(self.images)
+
+
+@dataclass(frozen=True)
+class PosePairs:
+    """Gripper and camera poses of the same instants, the cameras found by somebody else: no image is needed."""
+
+    source: Path
+    images: tuple[str, ...]
+    """Names of the samples."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    recon_from_camera: Float[ndarray, "n 4 4"]
+    is_metric: bool
+    """The cameras' unit is the metre, as with a marker of known size."""
+    notes: tuple[str, ...] = ()
+    backend: str = "poses given"
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def image_index(self) -> Int[ndarray, " n"]:
+        """Rows of the samples with a camera pose: all, as in a Reconstruction that registered every image."""
+        return np.arange(len(self))
 
 
 @dataclass(frozen=True)

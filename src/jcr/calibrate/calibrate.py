@@ -12,14 +12,16 @@ from jcr.calibrate.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibrate.hand_eye import judged, solve_hand_eye
 from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
 from jcr.calibrate.residuals import paper_residuals
-from jcr.errors import NotTrustedError
+from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
-from jcr.records import Capture, HandEye, HeldOut, Reconstruction, RobotNoise, ScaleCheck, Tracks
+from jcr.records import Capture, HandEye, HeldOut, PosePairs, Reconstruction, RobotNoise, ScaleCheck, Tracks
 
 FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+METRIC_STD = 0.005
+"""Relative; a printed marker has the size that its maker says to half a percent."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,7 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
     if len(camera) < 2:
         raise NotTrustedError(f"{len(camera)} of {len(capture)} images registered; overlap the views more")
-    noise = None
-    if options.robot_noise is not None:
-        noise = (options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1])))
+    noise = _noise(options)
     cues = _cues(capture, reconstruction, options)
     camera_covariance = None if evidence is None else evidence.covariance
     contradiction = None
@@ -128,6 +128,45 @@ def in_words(check: ScaleCheck) -> str:
         return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
     direction = "long" if off > 0 else "short"
     return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} by the robot's"
+
+
+def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
+    """Hand-eye calibration from camera poses that were given, without images.
+
+    Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
+    that do not show a scale are helped by taking it as 1.
+    """
+    options = options or CalibrateOptions()
+    gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, _noise(options)
+    if options.known_length is not None:
+        raise InputError("--known-length: there are no images in which it could be seen; leave it out")
+    offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
+    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
+    if pairs.is_metric and not hand_eye.observability.observable:
+        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues((1.0, METRIC_STD), offset))
+        remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
+        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    if not hand_eye.converged:
+        return _investigated(hand_eye, gripper, camera)
+    if pairs.is_metric and not is_one(hand_eye):
+        remark = (
+            f"the scale is {hand_eye.scale:.4f} where a marker of known size gives 1: its size was given "
+            f"{100 * abs(1 - hand_eye.scale):.1f} % too {'large' if hand_eye.scale < 1 else 'small'}, or the camera's "
+            "focal length is off"
+        )
+        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    return hand_eye
+
+
+def is_one(hand_eye: HandEye) -> bool:
+    """Whether the scale is 1 within what is known of it."""
+    return abs(np.log(hand_eye.scale)) < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+
+
+def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
+    if options.robot_noise is None:
+        return None
+    return options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
 
 
 def _cues(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:

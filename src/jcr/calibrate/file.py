@@ -10,11 +10,19 @@ from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.calibrate.next_poses import NextPose, next_poses
-from jcr.capture.read import read_json
+from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
-from jcr.records import COVARIANCE_ORDER, Capture, HandEye, ImageVerdict, Intrinsics, Reconstruction
+from jcr.records import (
+    COVARIANCE_ORDER,
+    Capture,
+    HandEye,
+    ImageVerdict,
+    Intrinsics,
+    PosePairs,
+    Reconstruction,
+)
 
 FORMAT = "jcr.calibration/1"
 PROPOSED = 2
@@ -123,13 +131,13 @@ class CalibrationFile(_Part):
 
 
 def calibration_file(
-    capture: Capture,
-    reconstruction: Reconstruction,
+    capture: Capture | PosePairs,
+    reconstruction: Reconstruction | PosePairs,
     hand_eye: HandEye,
     timings_s: dict[str, float],
     version: str,
 ) -> CalibrationFile:
-    """The file of a calibration of `capture`."""
+    """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     std = np.sqrt(np.diag(hand_eye.covariance))
     held_out, check = hand_eye.held_out, hand_eye.scale_check
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
@@ -179,7 +187,9 @@ def calibration_file(
     )
 
 
-def _proposals(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> list[NextPose]:
+def _proposals(
+    capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs, hand_eye: HandEye
+) -> list[NextPose]:
     """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used."""
     used = capture.base_from_gripper[reconstruction.image_index[hand_eye.inliers]]
     noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
@@ -223,7 +233,7 @@ def failed_file(
 
 
 def image_verdicts(
-    capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye
+    capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs, hand_eye: HandEye
 ) -> list[tuple[ImageVerdict, float | None]]:
     """What became of every image of the capture, with its median reprojection error."""
     row_of = {int(row): k for k, row in enumerate(reconstruction.image_index)}

@@ -10,14 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibrate.pose_fit import PRIOR_STD, Poses, pose_information
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.information import ASSUMED_NOISE, Poses, expected_std, most_informative, pose_information
 
 CANDIDATES = 600
-UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
-"""What counts alike: 1 mm, 0.1°, 0.2 % of scale."""
-ASSUMED_NOISE = (5e-4, np.radians(0.1))
-"""m, rad; of a robot that has not been measured yet."""
 
 
 @dataclass(frozen=True)
@@ -48,21 +44,10 @@ def next_poses(
     """
     x = np.eye(4) if gripper_from_camera is None else gripper_from_camera
     candidates = _candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
-    hessian = pose_information(base_from_gripper, x, noise).sum(0)
-    hessian[range(7), range(7)] += PRIOR_STD**-2.0
-    gain = pose_information(candidates, x, noise)
-    now = _std(hessian[None])[0]
-    chosen: list[NextPose] = []
-    for _ in range(count):
-        std = _std(hessian + gain)
-        best = int(((std / UNIT) ** 2).sum(1).argmin())
-        hessian = hessian + gain[best]
-        chosen.append(_described(candidates[best], std[best], base_from_gripper))
-    return now, chosen
-
-
-def _std(hessian: Float[ndarray, "k 13 13"]) -> Float[ndarray, "k 7"]:
-    return np.sqrt(np.diagonal(np.linalg.inv(hessian), axis1=1, axis2=2)[:, :7])
+    known = pose_information(base_from_gripper, x, noise).sum(0)
+    rows, stds = most_informative(known, pose_information(candidates, x, noise), count)
+    described = zip(candidates[rows], stds, strict=True)
+    return expected_std(known), [_described(pose, std, base_from_gripper) for pose, std in described]
 
 
 def _candidates(

@@ -17,21 +17,19 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.stats import chi2, f
 
-from jcr.geometry import inverse, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import rotation_exp, skew, transform
+from jcr.information import (
+    BASE_ROTATION,
+    BASE_TRANSLATION,
+    PRIOR_STD,
+    ROTATION,
+    TRANSLATION,
+    Poses,
+    predict,
+    residuals,
+)
 from jcr.records import REACH
 
-Poses = Float[ndarray, "n 4 4"]
-TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
-    slice(0, 3),
-    slice(3, 6),
-    slice(6, 7),
-    slice(7, 10),
-    slice(10, 13),
-)
-"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
-
-PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
-"""So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
 NOISE_FLOOR = (2e-5, np.radians(0.002))
 """m, rad; so that a perfect fit does not claim a perfect robot."""
 REACH_WEIGHT = 5.0
@@ -98,7 +96,7 @@ def robot_noise(
     return max(float(sigma_t), NOISE_FLOOR[0]), max(float(sigma_r), NOISE_FLOOR[1])
 
 
-def deleted_residuals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
+def deletedresiduals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
     """Residuals of each pose from the fit without it, from those of the fit with it: (I − H)⁻¹ r."""
     return np.linalg.solve(np.eye(6) - hat + 1e-9 * np.eye(6), residual[..., None])[..., 0]
 
@@ -189,7 +187,7 @@ def _system(
     camera_covariance: Float[ndarray, "r r"] | None,
     cues: Cues,
 ) -> _System:
-    residual, jacobian = _residuals(*unknowns, base_from_gripper, recon_from_camera)
+    residual, jacobian = residuals(*unknowns, base_from_gripper, recon_from_camera)
     variance = np.tile(np.repeat(np.square(robot), 3), used.sum())
     spread, weight = None, 1.0 / variance
     if camera_covariance is not None:
@@ -247,53 +245,6 @@ def _missed(
         missed[i] = residual
         covariance[i] = own_spread + jacobian @ inverse_hessian @ jacobian.T
     return missed, covariance
-
-
-def pose_information(
-    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"], noise: tuple[float, float]
-) -> Float[ndarray, "n 13 13"]:
-    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its picture shows."""
-    # Any frame and unit of the reconstruction will do: the base's, in metres.
-    camera = base_from_gripper @ gripper_from_camera
-    _, j = _residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
-    j /= np.repeat(noise, 3)[:, None]
-    return np.swapaxes(j, 1, 2) @ j
-
-
-def predict(
-    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
-) -> Poses:
-    """Gripper poses in base (n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹."""
-    scaled = recon_from_camera.copy()
-    scaled[:, :3, 3] *= scale
-    return z @ scaled @ inverse(x)
-
-
-def _residuals(
-    x: Float[ndarray, "4 4"],
-    scale: float,
-    z: Float[ndarray, "4 4"],
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Residuals of position (base axes) and orientation (gripper axes) and their Jacobian.
-
-    Perturbations: R_X ← exp(ω) R_X, t_X + dt, λ·exp(s), R_Z ← exp(ζ) R_Z, t_Z + dz.
-    """
-    predicted = predict(x, scale, z, recon_from_camera)
-    rotation = predicted[:, :3, :3]
-    turned = rotation_log(np.swapaxes(base_from_gripper[:, :3, :3], 1, 2) @ rotation)
-    residual = np.concatenate([predicted[:, :3, 3] - base_from_gripper[:, :3, 3], turned], axis=1)
-    arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
-    j = np.zeros((len(predicted), 6, 13))
-    j[:, :3, TRANSLATION] = -rotation
-    j[:, :3, ROTATION] = -rotation @ skew(x[:3, 3])
-    j[:, :3, 6] = arm
-    j[:, :3, BASE_TRANSLATION] = np.eye(3)
-    j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
-    j[:, 3:, ROTATION] = -np.eye(3)
-    j[:, 3:, BASE_ROTATION] = np.swapaxes(rotation, 1, 2)
-    return residual, j
 
 
 def _by_camera(

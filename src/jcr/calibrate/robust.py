@@ -14,8 +14,9 @@ from numpy import ndarray
 from scipy.stats import f as f_distribution
 
 from jcr.calibrate.closed_form import closed_form, motions, sine_axis
-from jcr.calibrate.pose_fit import Cues, PoseFit, Poses, fit_poses, predict
+from jcr.calibrate.pose_fit import Cues, PoseFit, Poses, fit_poses
 from jcr.geometry import nearest_rotation, rotation_angle
+from jcr.information import predict
 from jcr.records import ARM
 
 SHARE_RIGHT = 0.65

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.checks import check_metres, read_rigid
 from jcr.capture.images import read_image
-from jcr.capture.read import check_metres, contained, read_json, read_rigid
+from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture

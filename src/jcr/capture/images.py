@@ -1,5 +1,6 @@
-"""Reading one image file, whatever a camera or a phone wrote."""
+"""One image: read from whatever a camera or a phone wrote, written without loss, judged for sharpness."""
 
+import io
 import warnings
 from pathlib import Path
 
@@ -66,3 +67,18 @@ def exposure_fault(brightness: float) -> str | None:
     if DARK < brightness < BRIGHT:
         return None
     return "nearly black" if brightness <= DARK else "nearly white"
+
+
+def encode_png(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
+    """The picture as a PNG file, lossless."""
+    stream = io.BytesIO()
+    Image.fromarray(rgb).save(stream, format="PNG", compress_level=3)
+    return stream.getvalue()
+
+
+def sharpness(picture: bytes | UInt8[ndarray, "h w 3"]) -> float:
+    """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
+    if not isinstance(picture, bytes):
+        return brightness_and_sharpness(picture)[1]
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
+    return 0.0 if pixels is None else brightness_and_sharpness(np.asarray(pixels, dtype=np.uint8))[1]

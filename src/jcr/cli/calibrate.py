@@ -7,7 +7,9 @@ from typing import Annotated
 import tyro
 
 from jcr.calibrate.calibrate import CalibrateOptions
-from jcr.cli.result import show
+from jcr.capture.options import ReadOptions
+from jcr.cli.result import show, show_poses
+from jcr.cli.source import source
 from jcr.reconstruct.backends import ReconstructOptions
 
 
@@ -15,15 +17,19 @@ from jcr.reconstruct.backends import ReconstructOptions
 class Arguments:
     """Reconstruct and calibrate a capture, without the map.
 
+    CAPTURE may also be the samples of easy_handeye2 or MoveIt Calibration: their marker's poses need no images.
+
     examples:
       jcr calibrate examples/tabletop out/tabletop
       jcr calibrate captures/table out/table --backend colmap --seed 1 --json
+      jcr calibrate samples.yaml out/marker
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture."""
+    """Folder of the capture, or another format (docs/captures.md)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     json: bool = False
@@ -34,12 +40,14 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
-    from jcr.capture.read import read_capture
-    from jcr.pipeline import RunOptions, calibrate
+    from jcr.pipeline import RunOptions, calibrate, calibrate_poses
     from jcr.progress import progress_bars
+    from jcr.records import PosePairs
 
-    capture = read_capture(arguments.capture)
     options = RunOptions(arguments.reconstruct, arguments.calibrate)
     with progress_bars(arguments.quiet) as progress:
+        capture = source(arguments.capture, arguments.read, arguments.out, progress)
+        if isinstance(capture, PosePairs):
+            return show_poses(calibrate_poses(capture, arguments.out, arguments.calibrate), arguments.json)
         result = calibrate(capture, arguments.out, options, progress=progress)
     return show(result, arguments.json)

@@ -110,7 +110,7 @@ def _address(text: str, port: int, option: str) -> tuple[str, int]:
 
 
 def _lens(file: Path | None) -> dict[str, Any] | None:
-    from jcr.capture.read import read_json
+    from jcr.capture.plain_files import read_json
     from jcr.errors import InputError
 
     if file is None:

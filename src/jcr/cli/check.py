@@ -2,16 +2,19 @@
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
+from jcr.capture.options import ReadOptions
+from jcr.cli.source import looked_at
+
 if TYPE_CHECKING:
     from jcr.check import Examination
-    from jcr.records import Capture
+    from jcr.records import Capture, PosePairs
 
 
 @dataclass(frozen=True)
@@ -24,10 +27,13 @@ class Arguments:
       jcr check captures/table
       jcr check captures/table --suggest 3 --robot-noise 0.1 0.05
       jcr check captures/table --poses-only --json
+      jcr check samples.yaml
+      jcr check scan.mcap --base-frame base_link --gripper-frame tool0
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture."""
+    """Folder of the capture, or another format (docs/captures.md)."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     suggest: int = 0
     """Propose so many gripper poses that would shrink the uncertainty most."""
     poses_only: bool = False
@@ -46,7 +52,6 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
-    from jcr.capture.read import read_capture
     from jcr.check import check
     from jcr.errors import InputError
     from jcr.progress import progress_bars
@@ -56,8 +61,10 @@ def main(arguments: Arguments) -> int:
     noise = arguments.robot_noise
     if noise is not None and min(noise) <= 0:
         raise InputError(f"--robot-noise {noise[0]} {noise[1]}: give two positive numbers, mm and degrees")
-    capture = read_capture(arguments.capture)
-    with progress_bars(arguments.quiet) as progress:
+    with (
+        progress_bars(arguments.quiet) as progress,
+        looked_at(arguments.capture, arguments.read, progress) as capture,
+    ):
         found = check(
             capture,
             arguments.suggest,
@@ -77,12 +84,10 @@ def main(arguments: Arguments) -> int:
     return 0
 
 
-def _as_text(capture: "Capture", found: "Examination") -> str:
-    width, height = capture.image_size
-    lens = "given" if capture.intrinsics is not None else "unknown, to be estimated"
+def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     turn = np.degrees(found.largest_turn_rad)
     lines = [
-        f"{len(capture)} images of {width}x{height}, intrinsics {lens}",
+        _as_read(capture),
         f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and turns by up to {turn:.0f}°",
         f"expected uncertainty: {_std(found.expected_std)}",
     ]
@@ -107,18 +112,28 @@ def _as_text(capture: "Capture", found: "Examination") -> str:
     return "\n".join(lines) + "\n"
 
 
+def _as_read(capture: "Capture | PosePairs") -> str:
+    from jcr.records import PosePairs
+
+    if isinstance(capture, PosePairs):
+        return f"{len(capture)} samples with the poses of gripper and camera, no images"
+    width, height = capture.image_size
+    lens = "given" if capture.intrinsics is not None else "unknown, to be estimated"
+    return f"{len(capture)} images of {width}x{height}, intrinsics {lens}"
+
+
 def _std(std: np.ndarray) -> str:
     offset = " ".join(f"{1e3 * value:.2g}" for value in std[:3])
     turn = " ".join(f"{np.degrees(value):.2g}" for value in std[3:6])
     return f"± {offset} mm, {turn} °, scale {100 * std[6]:.2g} %"
 
 
-def _as_json(capture: "Capture", found: "Examination") -> dict[str, Any]:
+def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     return {
         "images": [
-            {"image": name, "sharpness": float(sharp)}
-            for name, sharp in zip(capture.images, found.sharpness, strict=True)
+            {"image": name, "sharpness": float(found.sharpness[k]) if len(found.sharpness) else None}
+            for k, name in enumerate(capture.images)
         ],
         "largest_move_mm": 1e3 * found.largest_move_m,
         "largest_turn_deg": float(np.degrees(found.largest_turn_rad)),

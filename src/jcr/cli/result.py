@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
+    from jcr.pipeline import PosesResult, RunResult
 
 
-def show(result: "RunResult", as_json: bool) -> int:
+def show(result: "RunResult | PosesResult", as_json: bool) -> int:
     """Print the calibration on stdout and its doubts on stderr; the exit status, 0 or 3."""
     content = result.calibration
     if as_json:
@@ -25,7 +25,16 @@ def show(result: "RunResult", as_json: bool) -> int:
     return 0
 
 
-def summary(result: "RunResult") -> str:
+def show_poses(result: "PosesResult", as_json: bool) -> int:
+    """The same for camera poses that were given; what their scale says of the marker goes with it."""
+    from jcr.calibrate.calibrate import is_one
+
+    if not as_json and result.converged and is_one(result.hand_eye):
+        sys.stdout.write("the scale is 1, as the marker's size says\n")
+    return show(result, as_json)
+
+
+def summary(result: "RunResult | PosesResult") -> str:
     """A few lines a person reads: the transform, how sure it is, what was left out."""
     hand_eye, content = result.hand_eye, result.calibration
     uncertainty = content.uncertainty

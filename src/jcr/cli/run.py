@@ -8,7 +8,9 @@ from typing import Annotated
 import tyro
 
 from jcr.calibrate.calibrate import CalibrateOptions
+from jcr.capture.options import ReadOptions
 from jcr.cli.result import show
+from jcr.cli.source import source
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
@@ -19,18 +21,22 @@ from jcr.segment.options import SegmentOptions
 class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
-    CAPTURE is a folder with capture.json and images; OUT gets calibration.json, reconstruction.npz,
+    CAPTURE is a folder with capture.json and images, or any of docs/captures.md: images and a table of poses,
+    bags, LeRobot data sets, COLMAP models … OUT gets calibration.json, reconstruction.npz,
     cloud.ply, map.safetensors, report.html and log.txt. The same command resumes an interrupted run.
 
     examples:
       jcr run examples/tabletop out/tabletop
       jcr run captures/table out/table --robot-noise 0.1 0.05 --json
+      jcr run captures/ur5 out/ur5 --pose-convention ur
+      jcr run scan.mcap out/scan --base-frame base_link --gripper-frame tool0 --frames 12
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture."""
+    """Folder of the capture, or another format (docs/captures.md)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
@@ -44,15 +50,20 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
-    from jcr.capture.read import read_capture
+    from jcr.errors import InputError
     from jcr.pipeline import RunOptions, run
     from jcr.progress import progress_bars
+    from jcr.records import PosePairs
 
-    capture = read_capture(arguments.capture)
     options = RunOptions(
         arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map, arguments.segment
     )
     with progress_bars(arguments.quiet) as progress:
+        capture = source(arguments.capture, arguments.read, arguments.out, progress)
+        if isinstance(capture, PosePairs):
+            raise InputError(
+                f"{arguments.capture}: gives poses and no images, nothing to map; use `jcr calibrate`"
+            )
         result = run(capture, arguments.out, options, progress=progress)
     status = show(result, arguments.json)
     if not arguments.json:

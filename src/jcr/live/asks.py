@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.capture.read import check_metres, read_rigid
+from jcr.capture.checks import check_metres, read_rigid
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform
 

@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.capture.capture_json import FILE, read_lens
+from jcr.capture.checks import read_rigid
 from jcr.capture.images import read_image
-from jcr.capture.read import FILE, contained, read_json, read_lens, read_rigid
+from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 

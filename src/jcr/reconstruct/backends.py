@@ -16,7 +16,7 @@ from jcr.progress import Progress
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
-BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "marker", "predictions"]
+BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class ReconstructOptions:
     seed: int = 0
     """Same seed, same result on the same machine."""
     weights: str | None = None
-    """Path or hub id of a network's weights, unset: the published ones; for predictions the npz file."""
+    """Path or hub id of a network's weights, unset: the published ones; for predictions the npz file, for given
+    the COLMAP model or transforms.json."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
     """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
     board: str | None = None
@@ -84,6 +85,7 @@ BACKENDS = {
         ),
         Backend("marker", "Apache-2.0", True, "jcr.reconstruct.backends:_marker"),
         Backend("predictions", "your network's", False, "jcr.reconstruct.backends:_predictions", True),
+        Backend("given", "your reconstruction's", False, "jcr.reconstruct.backends:_given"),
     )
 }
 
@@ -201,3 +203,11 @@ def _predictions(capture: Capture, options: ReconstructOptions, progress: Progre
     if options.weights is None:
         raise InputError("--backend predictions: name the npz file with --weights FILE (docs/predictions.md)")
     return reconstruct(capture, PredictionsOptions(Path(options.weights)), progress)
+
+
+def _given(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.given import reconstruct
+
+    if options.weights is None:
+        raise InputError("--backend given: name the COLMAP model or transforms.json with --weights PATH")
+    return reconstruct(capture, Path(options.weights), options.seed, device_of(options), progress)

@@ -24,7 +24,7 @@ from jcr.progress import Progress
 from jcr.reconstruct.lens import fold_distance_px, resized
 from jcr.records import Intrinsics, Tracks
 
-_HALF_PIXEL = 0.5
+HALF_PIXEL = 0.5
 _MIN_REGISTERED = 3
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
@@ -58,12 +58,12 @@ def structure_from_motion(
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
     than three images register.
     """
-    with _log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+    with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         report("features", 0.0)
-        cameras = _extract(database, images, lenses, known, working_size_px)
+        cameras = extract(database, images, lenses, known, working_size_px)
         report("matching", 0.0)
-        _match(database, seed)
+        match(database, seed)
         report("mapping", 0.0)
         model = _map_incrementally(database, len(images), cameras, known, seed)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
@@ -79,11 +79,11 @@ def structure_from_motion(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     motions = [model.image(row + 1).cam_from_world() for row in rows]
     camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
-    tracks = _tracks(model, rows, lens)
+    tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
     return SparseModel(np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes))
 
 
-def _extract(
+def extract(
     database: Path,
     images: Sequence[UInt8[ndarray, "h w 3"]],
     lenses: Sequence[Intrinsics],
@@ -115,7 +115,7 @@ def _extract(
     return cameras
 
 
-def _match(database: Path, seed: int) -> None:
+def match(database: Path, seed: int) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     # With COLMAP's 15, a view of a board was registered by the wrong squares, 30 cm from its place.
@@ -195,32 +195,34 @@ def _why_not_registered(database: Path, n_images: int, model: pycolmap.Reconstru
     )
 
 
-def _tracks(model: pycolmap.Reconstruction, rows: list[int], lens: Intrinsics) -> Tracks:
-    """Every observation of every triangulated point, in pixels of the original images."""
-    camera = model.camera(1)
-    original_from_working = np.array([lens.width / camera.width, lens.height / camera.height])
+def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
+    """Every observation of every triangulated point by images `image_ids`, in pixels of images of `size`."""
+    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
+    camera = model.camera(model.image(image_ids[0]).camera_id)
+    original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
     point_ids = sorted(model.point3D_ids())
     seen = [
         (
-            rows.index(element.image_id - 1),
+            row_of[element.image_id],
             model.image(element.image_id).point2D(element.point2D_idx).xy,
             point,
         )
         for point, point_id in enumerate(point_ids)
         for element in model.point3D(point_id).track.elements
+        if element.image_id in row_of
     ]
-    image, x_px, point = zip(*seen, strict=True)
+    image, x_px, point = zip(*seen, strict=True) if seen else ((), (), ())
     return Tracks(
-        image=np.array(image),
-        x_px=np.array(x_px) * original_from_working - _HALF_PIXEL,
-        point=np.array(point),
-        points_in_recon=np.array([model.point3D(point_id).xyz for point_id in point_ids]),
+        image=np.array(image, dtype=int),
+        x_px=np.reshape(x_px, (-1, 2)) * original_from_working - HALF_PIXEL,
+        point=np.array(point, dtype=int),
+        points_in_recon=np.reshape([model.point3D(point_id).xyz for point_id in point_ids], (-1, 3)),
     )
 
 
 def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     """COLMAP's one camera: the given lens, or a focal length and two radial coefficients to refine."""
-    centre = [lens.cx + _HALF_PIXEL, lens.cy + _HALF_PIXEL]
+    centre = [lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL]
     if not known:
         name, params = "RADIAL", [lens.fx, *centre, 0.0, 0.0]
     elif any(lens.distortion):
@@ -236,13 +238,13 @@ def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
     """Of a camera that `camera_of` made for an unknown lens; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
-    centre = cx - _HALF_PIXEL, cy - _HALF_PIXEL
+    centre = cx - HALF_PIXEL, cy - HALF_PIXEL
     lens = Intrinsics(focal, focal, *centre, camera.width, camera.height, distortion)
     return resized(lens, like.width, like.height)
 
 
 @contextmanager
-def _log_level(verbose: bool) -> Iterator[None]:
+def log_level(verbose: bool) -> Iterator[None]:
     """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = (pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL).value

@@ -1,0 +1,167 @@
+"""ROS 1 bags, ROS 2 sqlite3 and MCAP: the images of one topic, with poses from tf or from joint states."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from jcr.capture.camera_info import lens_of_ros, read_camera_info
+from jcr.capture.extras import extra
+from jcr.capture.joints import JointTrack, read_arm
+from jcr.capture.options import ReadOptions
+from jcr.capture.pose_track import PosesAt, speed
+from jcr.capture.recording import capture_of_recording
+from jcr.capture.ros_image import picture_of
+from jcr.capture.tf_tree import TfTree
+from jcr.errors import InputError
+from jcr.progress import Progress
+from jcr.records import Capture, Intrinsics
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
+    """The best frames of a bag in the folder `into`; the bag is streamed, never held.
+
+    Raises InputError with the topics or frames that there are where those of the options are not, and for images
+    whose poses are stale.
+    """
+    with _opened(path) as reader:
+        topic = _camera_topic(reader, options, path)
+        info_topics = (f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2))
+        infos = [
+            c for name in info_topics for c in reader.connections if c.topic == name and c.msgtype == INFO
+        ]
+        cameras = [c for c in reader.connections if c.topic == topic]
+        pose_connections = _pose_connections(reader, options, path)
+        log_ns, stamp_ns, info = [], [], None
+        tree, joint_states = TfTree(), []
+        span = max(reader.end_time - reader.start_time, 1)
+        for connection, at, raw in reader.messages([*cameras, *infos[:1], *pose_connections]):
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            if connection.msgtype in TF:
+                tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
+            elif connection.msgtype == JOINTS:
+                joint_states.append((_stamp(message, at), message.name, message.position))
+            elif connection.msgtype == INFO:
+                info = info or message
+            else:
+                log_ns.append(at)
+                stamp_ns.append(_stamp(message, at))
+                report("frames", 0.1 * (at - reader.start_time) / span)
+        if not stamp_ns:
+            raise InputError(f"{path}: topic {topic} has no images")
+        order = np.unique(stamp_ns, return_index=True)[1]
+        stamps, logs = np.array(stamp_ns)[order], np.array(log_ns)[order]
+        poses_at = _poses_at(tree, joint_states, options, path)
+        poses, gap_ns = poses_at(stamps)
+
+        def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
+            for row in rows.tolist():
+                at = int(logs[row])
+                for connection, _, raw in reader.messages(cameras, start=at, stop=at + 1):
+                    message: Any = reader.deserialize(raw, connection.msgtype)
+                    if _stamp(message, at) == stamps[row]:
+                        yield row, *picture_of(message, f"{path}: {topic}")
+                        break
+
+        def lens(size: tuple[int, int]) -> Intrinsics | None:
+            if options.camera_info is not None:
+                return read_camera_info(options.camera_info, size)
+            return None if info is None else _lens(info, topic, size, f"{path}: {infos[0].topic}")
+
+        names = [str(stamp) for stamp in stamps]
+        motion = speed(poses_at, stamps)
+        return capture_of_recording(path, names, poses, motion, gap_ns, pictures, lens, options, into, report)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    highlevel = extra("rosbags.highlevel", "ros", "a bag")
+    typesys = extra("rosbags.typesys", "ros", "a bag")
+    try:
+        # Older sqlite3 bags hold no message definitions; those of the standard messages never changed since.
+        standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        reader = highlevel.AnyReader([path], default_typestore=standard)
+        reader.open()
+    except Exception as error:  # each storage raises its own errors, SQLite and struct among them
+        raise InputError(
+            f"{path}: not a readable bag ({error}); check that it was closed and is whole"
+        ) from None
+    try:
+        yield reader
+    except (highlevel.AnyReaderError, EOFError, AssertionError) as error:
+        raise InputError(f"{path}: damaged ({error}); repair it with the tool that recorded it") from None
+    finally:
+        reader.close()
+
+
+def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
+    """The topic that was asked for, or the only one with colour images."""
+    topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
+    if options.camera_topic is not None:
+        if options.camera_topic not in topics:
+            raise InputError(
+                f"{path}: no images on {options.camera_topic}; topics with images: {', '.join(topics) or 'none'}"
+            )
+        return options.camera_topic
+    colour = [topic for topic in topics if "depth" not in topic.lower()]
+    if len(colour) != 1:
+        raise InputError(
+            f"{path}: {len(colour)} topics with images; choose one with --camera-topic: {', '.join(topics) or 'none'}"
+        )
+    return colour[0]
+
+
+def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:
+    """The connections that carry the robot: tf, or joint states where a URDF is given."""
+    if options.urdf is None:
+        found = [c for c in reader.connections if c.msgtype in TF]
+        if not found:
+            raise InputError(f"{path}: no /tf; give --urdf for joint states, or record tf as well")
+        return found
+    topics = sorted({c.topic for c in reader.connections if c.msgtype == JOINTS})
+    wanted = options.joint_topic or (topics[0] if len(topics) == 1 else None)
+    if wanted not in topics:
+        raise InputError(
+            f"{path}: choose the joint states with --joint-topic: {', '.join(topics) or 'there are none'}"
+        )
+    return [c for c in reader.connections if c.topic == wanted]
+
+
+def _poses_at(tree: TfTree, joint_states: list[Any], options: ReadOptions, path: Path) -> PosesAt:
+    if options.urdf is None:
+        return tree.poses_at(options.base_frame, options.gripper_frame, path)
+    arm = read_arm(options)
+    stamps: dict[str, list[int]] = {}
+    positions: dict[str, list[float]] = {}
+    for stamp, names, values in joint_states:
+        for name, value in zip(names, values, strict=False):
+            stamps.setdefault(name, []).append(stamp)
+            positions.setdefault(name, []).append(float(value))
+    arm.columns(list(stamps), str(path))
+    rows = [np.unique(stamps[joint], return_index=True) for joint in arm.joints]
+    sampled = tuple(
+        np.array(positions[joint])[order] for joint, (_, order) in zip(arm.joints, rows, strict=True)
+    )
+    return JointTrack(arm, tuple(stamp for stamp, _ in rows), sampled).at
+
+
+def _stamp(message: Any, log_ns: int) -> int:
+    """When the message was true (ns); the time of its recording for drivers that leave the stamp empty."""
+    stamp = message.header.stamp
+    return stamp.sec * 10**9 + stamp.nanosec or log_ns
+
+
+def _lens(info: Any, topic: str, size: tuple[int, int], where: str) -> Intrinsics | None:
+    """Intrinsics of the topic's images: K and D, or P of rectified ones. ROS 1 writes these in capitals."""
+    k, d, p = (list(getattr(info, name if hasattr(info, name) else name.upper())) for name in "kdp")
+    calibrated = (info.width, info.height)
+    if "image_rect" in topic:
+        return lens_of_ros([*p[:3], *p[4:7], *p[8:11]], "", (), calibrated, size, where)
+    return lens_of_ros(k, info.distortion_model, d, calibrated, size, where)

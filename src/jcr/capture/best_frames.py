@@ -1,0 +1,99 @@
+"""Which frames of a recording to keep: taken while the arm stands still, sharp, and spread to show most."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.capture.checks import MIN_FRAMES
+from jcr.capture.images import BLURRED
+
+from jcr.errors import InputError
+from jcr.geometry import inverse, rotation_angle
+from jcr.information import ASSUMED_NOISE, most_informative, pose_information
+from jcr.records import ARM
+
+STILL = 0.005
+"""m/s, turning counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""
+LOOKS = 5
+"""Frames of one moment that are compared for sharpness."""
+SAME_VIEW = 0.005
+"""m, turning counted at ARM: of frames nearer to each other the sharpest is kept."""
+
+Rows = Int[ndarray, " k"]
+Poses = Float[ndarray, "n 4 4"]
+
+
+def best_frames(
+    base_from_gripper: Poses,
+    speed: Float[ndarray, " n"],
+    usable: Bool[ndarray, " n"],
+    sharpness_of: Callable[[Rows], Float[ndarray, " k"]],
+    count: int,
+) -> tuple[Rows, tuple[str, ...]]:
+    """Rows of the best `count` frames in order of time, and remarks on the choice.
+
+    `speed` is m/s with turning counted at ARM. `sharpness_of` is asked once, about ascending rows. A moment of
+    standing still gives one frame at most; where there are too few, the slowest frames in between fill up. Raises
+    InputError when fewer than three frames are left.
+    """
+    still = _runs(usable & (speed < STILL))
+    moving = _slowest(_runs(usable & (speed >= STILL)), speed, count) if len(still) < count else []
+    looked_at = [moment[np.linspace(0, len(moment) - 1, LOOKS + 2).astype(int)[1:-1]] for moment in still]
+    rows = np.unique(np.concatenate([*looked_at, *moving, np.zeros(0, int)]))
+    sharpness = np.zeros(len(speed))
+    sharpness[rows] = sharpness_of(rows)
+    sharpest = np.array([moment[sharpness[moment].argmax()] for moment in looked_at + moving], dtype=int)
+    sharp = (
+        sharpest[sharpness[sharpest] >= BLURRED * np.median(sharpness[sharpest])]
+        if len(sharpest)
+        else sharpest
+    )
+    views = _different(base_from_gripper, sharp[np.argsort(-sharpness[sharp], kind="stable")])
+    if len(views) < MIN_FRAMES:
+        raise InputError(
+            f"{len(views)} different views are still and sharp among {len(speed)} frames; at least {MIN_FRAMES} are "
+            "needed: record again with a pause at each of a dozen views"
+        )
+    information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
+    at_rest = speed[views] < STILL
+    chosen, _ = most_informative(np.zeros((13, 13)), information[at_rest], count)
+    known = information[at_rest].sum(0) if at_rest.any() else np.zeros((13, 13))
+    more, _ = most_informative(known, information[~at_rest], count - len(chosen))
+    frames = np.sort(np.concatenate([views[at_rest][chosen], views[~at_rest][more]]))
+    return frames, tuple(_remarks(frames, speed, len(sharpest) - len(sharp), int(at_rest.sum()), count))
+
+
+def _remarks(frames: Rows, speed: Float[ndarray, " n"], blurred: int, at_rest: int, count: int):
+    if blurred:
+        yield f"{blurred} moments of the recording are blurred and were left out"
+    if at_rest < count and (fastest := float(speed[frames].max())) >= STILL:
+        yield (
+            f"the arm stands still at {at_rest} different views where {count} frames are wanted; the others were "
+            f"taken at up to {1e3 * fastest:.0f} mm/s: pause for half a second at each view"
+        )
+
+
+def _runs(mask: Bool[ndarray, " n"]) -> list[Rows]:
+    """The unbroken runs of rows where `mask` holds."""
+    rows = np.flatnonzero(mask)
+    return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(run)]
+
+
+def _slowest(runs: list[Rows], speed: Float[ndarray, " n"], count: int) -> list[Rows]:
+    """The slowest frame of each of some `4 · count` equal pieces of the rows, as moments of one frame."""
+    piece = max(sum(map(len, runs)) // (4 * count), 1)
+    pieces = [part for run in runs for part in np.array_split(run, max(len(run) // piece, 1))]
+    return [part[[speed[part].argmin()]] for part in pieces]
+
+
+def _different(base_from_gripper: Poses, rows: Rows) -> Rows:
+    """Of `rows`, best first, those that no better one shows the same view as."""
+    kept = rows[:0]
+    for row in rows:
+        motion = inverse(base_from_gripper[kept]) @ base_from_gripper[row]
+        far = np.linalg.norm(motion[:, :3, 3], axis=1) + ARM * rotation_angle(motion[:, :3, :3])
+        if (far > SAME_VIEW).all():
+            kept = np.append(kept, row)
+    return kept

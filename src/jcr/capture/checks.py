@@ -1,0 +1,109 @@
+"""What every reader of captures demands, whatever the format: sound files, rigid metres, one camera."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.images import read_image
+from jcr.capture.plain_files import contained
+from jcr.errors import InputError
+from jcr.geometry import require_rigid
+from jcr.records import Capture, Intrinsics
+
+MIN_FRAMES = 3
+MAX_REACH = 10.0
+"""Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
+
+
+def checked_capture(
+    folder: Path, images: Sequence[str], base_from_gripper: Float[ndarray, "n 4 4"], where: str
+) -> Capture:
+    """A capture of `images` in `folder`, without intrinsics; InputError as `jcr.read_capture` has it.
+
+    `where` begins the messages: the file that names the images.
+    """
+    if len(images) < MIN_FRAMES:
+        raise InputError(f"{where}: {len(images)} frames; at least {MIN_FRAMES} are needed, 8 to 12 are good")
+    for name in images:
+        contained(folder, name, where)
+    twice = {name for name in images if images.count(name) > 1}
+    if twice:
+        raise InputError(
+            f"{where}: names {', '.join(sorted(twice))} more than once; keep one frame per image"
+        )
+    check_metres(base_from_gripper, where)
+    return Capture(folder, tuple(images), base_from_gripper, _common_size(folder, images))
+
+
+def checked_lens(
+    focal_and_centre: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int], where: str
+) -> Intrinsics:
+    """Intrinsics of images of `size` from fx, fy, cx, cy and k1, k2, p1, p2, k3; InputError if they cannot be."""
+    try:
+        fx, fy, cx, cy = (float(value) for value in focal_and_centre)
+        coefficients = [float(k) for k in distortion]
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null"
+        ) from None
+    if len(coefficients) != 5:
+        raise InputError(f"{where}: distortion has {len(coefficients)} numbers, not the five k1,k2,p1,p2,k3")
+    if not np.isfinite([fx, fy, cx, cy, *coefficients]).all() or fx <= 0 or fy <= 0:
+        raise InputError(
+            f"{where}: fx and fy must be positive and all numbers finite; or give null to estimate them"
+        )
+    width, height = size
+    if not (0 < cx < width and 0 < cy < height):
+        raise InputError(
+            f"{where}: the principal point ({cx:.4g}, {cy:.4g}) lies outside the {width}x{height} images; "
+            "scale the intrinsics to this resolution"
+        )
+    k1, k2, p1, p2, k3 = coefficients
+    return Intrinsics(fx, fy, cx, cy, width, height, (k1, k2, p1, p2, k3))
+
+
+def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
+    """A rigid 4x4 from nested lists; InputError saying how far from rigid it is and what it looks like."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: not a 4x4 matrix of numbers; write four rows of four") from None
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where}: shape {matrix.shape}, not 4x4; write four rows of four numbers")
+    return require_rigid(matrix, where)
+
+
+def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
+    """InputError when positions are too far from the base to be metres."""
+    farthest = float(np.abs(base_from_gripper[:, :3, 3]).max())
+    if farthest > MAX_REACH:
+        raise InputError(
+            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like millimetres: "
+            "divide the translations by 1000 (a pose table: --pose-units mm-rad or mm-deg)"
+        )
+
+
+def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
+    """Decode every image once: a truncated one is found now, not after minutes of matching."""
+    sizes, digests = {}, {}
+    for name in images:
+        pixels = read_image(folder / name)
+        sizes[name] = (pixels.shape[1], pixels.shape[0])
+        same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), name)
+        if same != name:
+            raise InputError(
+                f"{folder / name}: the same picture as {same}; drop one of the frames or take it again"
+            )
+    first = sizes[images[0]]
+    for name, size in sizes.items():
+        if size != first:
+            raise InputError(
+                f"{folder / name}: {size[0]}x{size[1]} pixels, but {images[0]} has {first[0]}x{first[1]}; "
+                "all images must come from one camera at one resolution"
+            )
+    return first

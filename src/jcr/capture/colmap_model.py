@@ -1,0 +1,121 @@
+"""A COLMAP model with its images, beside a table of gripper poses.
+
+COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from world.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.checks import checked_capture, checked_lens
+from jcr.capture.options import ReadOptions
+from jcr.capture.table import gripper_poses
+from jcr.errors import InputError
+from jcr.geometry import inverse, transform
+from jcr.records import Capture, Intrinsics
+
+if TYPE_CHECKING:
+    import pycolmap
+
+HALF_PIXEL = 0.5
+_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
+_COEFFICIENTS = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+}
+"""COLMAP's camera models that OpenCV's five coefficients can say, and which of them follow in its parameters."""
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder of a COLMAP model in or at a folder."""
+    places = [path / place for place in _PLACES]
+    return next(
+        (place for place in places if any((place / f"cameras.{end}").is_file() for end in ("bin", "txt"))),
+        None,
+    )
+
+
+def read(path: Path, options: ReadOptions) -> Capture:
+    """The images that a COLMAP model and a table of gripper poses both know."""
+    folder = find_model(path)
+    if folder is None:
+        raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
+    root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
+    names, _ = read_cameras(folder)
+    located = [f"images/{name}" if (root / "images" / name).is_file() else name for name in names]
+    known, poses, table = gripper_poses(root, located, options)
+    notes = ()
+    if len(known) < len(names):
+        notes = (
+            f"{len(names) - len(known)} of {len(names)} images have no gripper pose in {table.name}: left out",
+        )
+    capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
+    lens = read_lens(folder, capture.image_size)
+    return replace(capture, intrinsics=lens, source=folder, cameras=folder, notes=notes)
+
+
+def read_model(folder: Path) -> "pycolmap.Reconstruction":
+    """The model; InputError when it cannot be read."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        return pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises whatever its C++ threw
+        reason = str(error).strip().splitlines()[-1:] or ["damaged"]
+        raise InputError(f"{folder}: not a readable COLMAP model ({reason[0]}); export it again") from None
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
+    """Names of the registered images, in order, and their recon_from_camera (n,4,4)."""
+    model = read_model(folder)
+    images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
+    if not images:
+        raise InputError(f"{folder}: the COLMAP model has no registered image")
+    motions = [image.cam_from_world() for image in images]
+    camera_from_recon = [transform(motion.rotation.matrix(), motion.translation) for motion in motions]
+    return [image.name for image in images], inverse(np.stack(camera_from_recon))
+
+
+def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
+    """The one lens of all images, of the given size; InputError when there are several, or a strange one."""
+    model = read_model(folder)
+    cameras = {
+        (camera.model.name, camera.width, camera.height, *map(float, camera.params))
+        for camera in (model.camera(model.image(k).camera_id) for k in model.reg_image_ids())
+    }
+    if len(cameras) > 1:
+        raise InputError(
+            f"{folder}: {len(cameras)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
+        )
+    name, width, height, *params = cameras.pop()
+    if name not in _COEFFICIENTS:
+        raise InputError(
+            f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"
+        )
+    if (width, height) != size:
+        raise InputError(
+            f"{folder}: cameras of {width}x{height}, images of {size[0]}x{size[1]}; use the same images"
+        )
+    two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV")
+    focals, rest = (params[:2], params[2:]) if two_focals else (params[:1] * 2, params[1:])
+    centre, rest = [value - HALF_PIXEL for value in rest[:2]], rest[2:]
+    wanted = _COEFFICIENTS[name]
+    if any(rest[len(wanted) :]):
+        raise InputError(
+            f"{folder}: a distortion with k4 to k6, which jcr does not know; run colmap image_undistorter"
+        )
+    value = dict(zip(wanted, rest, strict=False))
+    distortion = [value.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    return checked_lens([*focals, *centre], distortion, size, str(folder))

@@ -1,0 +1,118 @@
+"""LeRobot data sets v2.1 and v3.0: videos of a wrist camera, with poses or joint angles frame by frame."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.capture.camera_info import read_camera_info
+from jcr.capture.joints import read_arm
+from jcr.capture.lerobot_files import INFO, Episode, read_episode
+from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import read_json
+from jcr.capture.pose_table import poses_of_columns
+from jcr.capture.pose_track import pose_track, speed
+from jcr.capture.recording import capture_of_recording
+from jcr.capture.robot_poses import CONVENTIONS
+from jcr.capture.video import frames_at
+from jcr.errors import InputError
+from jcr.progress import Progress
+from jcr.records import Capture, Intrinsics
+
+CARTESIAN = "observation.state.cartesian_position"
+"""DROID's: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
+STATE = "observation.state"
+
+
+def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
+    """The best frames of the chosen episodes in the folder `into`.
+
+    Raises InputError listing the cameras, states or episodes that there are where those of the options are not.
+    """
+    info = read_json(path / INFO)
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict) or "fps" not in info:
+        raise InputError(f"{path / INFO}: no LeRobot data set; it has no features or fps")
+    camera, key = _camera(info["features"], options, path), _state_key(info["features"], options, path)
+    episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
+    state = np.concatenate([episode.state for episode in episodes])
+    poses = _poses(state, key, info["features"][key], options, path)
+    ends = np.cumsum([len(episode.time_s) for episode in episodes])
+    parts = np.split(np.arange(len(state)), ends[:-1])
+    motion = np.concatenate(
+        [_speed(episode, poses[part]) for episode, part in zip(episodes, parts, strict=True)]
+    )
+    tolerance_s = 0.5 / float(info["fps"])
+
+    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, UInt8[ndarray, "h w 3"], str]]:
+        for episode, part in zip(episodes, parts, strict=True):
+            mine = rows[np.isin(rows, part)]
+            if len(mine):
+                times = episode.video_start_s + episode.time_s[mine - part[0]]
+                for row, rgb in zip(mine.tolist(), frames_at(episode.video, times, tolerance_s), strict=True):
+                    yield row, rgb, ".png"
+
+    def lens(size: tuple[int, int]) -> Intrinsics | None:
+        return None if options.camera_info is None else read_camera_info(options.camera_info, size)
+
+    names = [
+        f"episode_{episode.index:06d}_frame_{k:06d}"
+        for episode in episodes
+        for k in range(len(episode.time_s))
+    ]
+    gap_ns = np.zeros(len(state), np.int64)  # a row is one instant: nothing is interpolated
+    return capture_of_recording(path, names, poses, motion, gap_ns, pictures, lens, options, into, report)
+
+
+def _camera(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
+    cameras = [key for key, feature in features.items() if feature.get("dtype") == "video"]
+    if options.camera_topic in cameras:
+        return str(options.camera_topic)
+    if options.camera_topic is not None or len(cameras) != 1:
+        raise InputError(
+            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos'}"
+        )
+    return cameras[0]
+
+
+def _state_key(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
+    key = options.joint_topic or (CARTESIAN if CARTESIAN in features and options.urdf is None else STATE)
+    if key not in features:
+        states = [name for name, feature in features.items() if str(feature.get("dtype")).startswith("float")]
+        raise InputError(
+            f"{path}: no {key}; choose the robot's state with --joint-topic: {', '.join(states)}"
+        )
+    return key
+
+
+def _poses(
+    state: Float[ndarray, "n k"], key: str, feature: dict[str, Any], options: ReadOptions, path: Path
+) -> Float[ndarray, "n 4 4"]:
+    """Gripper poses from the state: a pose by the names of its numbers or the convention asked for, or joints."""
+    where = f"{path}: {key}"
+    names = feature.get("names") or []
+    while isinstance(names, dict):  # {"motors": [...]} or {"axes": [...]}
+        names = next(iter(names.values()), [])
+    names = [str(name).removesuffix(".pos").lower() for name in names]
+    if options.urdf is not None:
+        arm = read_arm(options)
+        return arm.poses(state[:, arm.columns(names, where)])
+    wanted = CONVENTIONS["rpy" if options.pose_convention == "auto" else options.pose_convention].columns
+    if key == CARTESIAN or options.pose_convention != "auto":
+        names = list(wanted)
+    elif not set(wanted) <= set(names):
+        raise InputError(
+            f"{where}: {', '.join(names) or 'its numbers'} are no pose; give --urdf and --gripper-frame for joint "
+            "angles (--pose-units m-deg for degrees), or --pose-convention"
+        )
+    if state.shape[1] < len(names):
+        raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
+    columns = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
+    return poses_of_columns(columns, frozenset(), options, where)
+
+
+def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:
+    stamps = np.round(1e9 * episode.time_s).astype(np.int64)
+    return speed(pose_track(stamps, poses).at, stamps)

@@ -1,0 +1,96 @@
+"""Where a LeRobot data set keeps an episode: v2.1 in files of its own, v3.0 among others in one file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.extras import extra
+from jcr.capture.plain_files import contained
+from jcr.errors import InputError
+
+INFO = "meta/info.json"
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recording of the set: its rows, and where its pictures are."""
+
+    index: int
+    time_s: Float[ndarray, " n"]
+    state: Float[ndarray, "n k"]
+    video: Path
+    video_start_s: float
+
+
+def read_episode(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+    """Episode `index` with the state and the camera of those keys; InputError when it is not there or damaged."""
+    version = str(info.get("codebase_version", ""))
+    return (_episode_v3 if version.startswith("v3") else _episode_v2)(path, info, camera, key, index)
+
+
+def _episode_v2(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+    """v2.1: a table and a video per episode."""
+    total = int(info.get("total_episodes", index + 1))
+    if not 0 <= index < total:
+        raise InputError(f"{path}: no episode {index}; there are {total}, counted from 0")
+    chunk = index // int(info.get("chunks_size", 1000))
+    fields = {"episode_chunk": chunk, "episode_index": index, "video_key": camera}
+    rows = _rows(_file(path, info, "data_path", fields), key)
+    return Episode(index, rows[0], rows[1], _file(path, info, "video_path", fields), 0.0)
+
+
+def _episode_v3(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+    """v3.0: many episodes in one table and one video; meta/episodes says where."""
+    parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
+    columns = ["episode_index", "data/chunk_index", "data/file_index"]
+    columns += [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    found = 0
+    for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
+        table = _table(parquet, file, columns)
+        found += len(table["episode_index"])
+        if index in table["episode_index"]:
+            chunk, number, video_chunk, video_number, start = (
+                table[name][table["episode_index"].index(index)] for name in columns[1:]
+            )
+            data = _file(path, info, "data_path", {"chunk_index": chunk, "file_index": number})
+            fields = {"video_key": camera, "chunk_index": video_chunk, "file_index": video_number}
+            return Episode(
+                index, *_rows(data, key, index), _file(path, info, "video_path", fields), float(start)
+            )
+    raise InputError(f"{path}: no episode {index}; meta/episodes knows {found}, counted from 0")
+
+
+def _rows(
+    file: Path, key: str, episode: int | None = None
+) -> tuple[Float[ndarray, " n"], Float[ndarray, "n k"]]:
+    """Times (s, from the episode's start) and states of one episode."""
+    parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
+    table = _table(parquet, file, ["timestamp", "episode_index", key])
+    mine = np.array([episode is None or value == episode for value in table["episode_index"]], dtype=bool)
+    time_s, state = np.array(table["timestamp"], np.float64)[mine], np.array(table[key], np.float64)[mine]
+    if len(time_s) == 0 or state.ndim != 2 or not np.isfinite(state).all():
+        raise InputError(f"{file}: {key} of the episode is empty or not finite; choose another episode")
+    return time_s, state
+
+
+def _table(parquet: Any, file: Path, columns: list[str]) -> dict[str, list[Any]]:
+    try:
+        return parquet.read_table(file, columns=columns, partitioning=None).to_pydict()
+    except Exception as error:  # Arrow's own errors have no common base
+        raise InputError(
+            f"{file}: not a readable table of the data set ({error}); download it again"
+        ) from None
+
+
+def _file(path: Path, info: dict[str, Any], key: str, fields: dict[str, Any]) -> Path:
+    try:
+        name = str(info[key]).format(**fields)
+    except (KeyError, IndexError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path / INFO}: {key} cannot be filled in ({error}); of which version is it?"
+        ) from None
+    return contained(path, name, str(path / INFO))

@@ -1,0 +1,73 @@
+"""Text, YAML and JSON that others wrote: plain data alone, from inside of the folder, or one line of what is wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from jcr.errors import InputError
+
+
+def read_text(file: Path) -> str:
+    """The text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); name a file that is there") from None
+    if data[:2] == b"\x1f\x8b":
+        raise InputError(f"{file}: compressed by gzip; unpack it first (gunzip)")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
+    if "\0" in text:
+        raise InputError(f"{file}: a binary file, not text; name another, or say what it is with --format")
+    return text
+
+
+def read_yaml(file: Path) -> Any:
+    """The content of a YAML file, plain data alone; InputError when it is none."""
+    import yaml
+
+    try:
+        return yaml.safe_load(read_text(file))
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f" at line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "cannot be parsed"
+        raise InputError(f"{file}: not YAML{place}: {problem}; correct it there") from None
+    except RecursionError:
+        raise InputError(f"{file}: nested too deeply; write it plainly") from None
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file; InputError on bytes that are not UTF-8 JSON or keys that appear twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise InputError(f"{file}: the key {key!r} appears twice in one object; keep one")
+        return dict(pairs)
+
+    try:
+        return json.loads(file.read_bytes().decode("utf-8"), object_pairs_hook=unique)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: not UTF-8 text (byte {error.start}); save it as UTF-8 JSON") from None
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from None
+    except RecursionError:
+        raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+def contained(folder: Path, name: str, where: str) -> Path:
+    """`folder/name`, or InputError when the name is absolute, has a NUL, or leads out of the folder."""
+    if "\0" in name or not name or Path(name).is_absolute():
+        raise InputError(f"{where}: {name!r} is no path inside the capture; use one relative to {folder}")
+    target = folder / name
+    if not target.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")
+    return target

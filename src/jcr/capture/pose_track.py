@@ -1,0 +1,65 @@
+"""A moving frame sampled in time, asked at the stamps of images: interpolated, and never stale."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial.transform import Rotation, Slerp
+
+from jcr.geometry import inverse, rotation_angle, transform
+from jcr.records import ARM
+
+Stamps = Int[ndarray, " n"]
+PosesAt = Callable[[Stamps], tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]]
+"""Poses at stamps (ns), and between how distant samples (ns) each lies; NEVER outside of the recording."""
+
+NEVER = np.iinfo(np.int64).max
+SPEED_OVER_NS = 50_000_000
+"""To either side: long enough that an encoder's last digit is no speed, short beside a stop of the arm."""
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """Samples of a_from_b in ascending time."""
+
+    stamp_ns: Stamps
+    a_from_b: Float[ndarray, "n 4 4"]
+
+    def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
+        """Position linear and orientation by slerp between the samples around each stamp."""
+        before, share, gap = bracket(self.stamp_ns, stamp_ns)
+        if len(self.stamp_ns) == 1:
+            return np.repeat(self.a_from_b, len(stamp_ns), axis=0), gap
+        # Slerp on the row number: seconds since 1970 in float64 would round to 0.2 µs.
+        rows = np.arange(len(self.stamp_ns))
+        rotation = Slerp(rows, Rotation.from_matrix(self.a_from_b[:, :3, :3]))(before + share).as_matrix()
+        low, high = self.a_from_b[before, :3, 3], self.a_from_b[np.minimum(before + 1, rows[-1]), :3, 3]
+        return transform(rotation, low + share[:, None] * (high - low)), gap
+
+
+def pose_track(stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> PoseTrack:
+    """Samples put in order of time; of those with the same stamp the first stays."""
+    stamps, rows = np.unique(stamp_ns, return_index=True)
+    return PoseTrack(stamps, a_from_b[rows])
+
+
+def bracket(sample_ns: Stamps, stamp_ns: Stamps) -> tuple[Stamps, Float[ndarray, " n"], Stamps]:
+    """Row of the sample before each stamp, the share of the way to the next, and their distance in ns."""
+    last = len(sample_ns) - 1
+    before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))
+    width = sample_ns[np.minimum(before + 1, last)] - sample_ns[before]
+    share = np.clip((stamp_ns - sample_ns[before]) / np.maximum(width, 1), 0.0, 1.0)
+    exact = (share == 0) | (share == 1)
+    gap = np.where(exact, 0, width)
+    outside = (stamp_ns < sample_ns[0]) | (stamp_ns > sample_ns[last])
+    return before, share, np.where(outside, NEVER, gap)
+
+
+def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
+    """How fast the frame moves (m/s), turning counted at ARM; ends of the recording count one side."""
+    start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
+    motion = inverse(start[0]) @ end[0]
+    way = np.linalg.norm(motion[:, :3, 3], axis=1) + ARM * rotation_angle(motion[:, :3, :3])
+    return way / (2e-9 * SPEED_OVER_NS)

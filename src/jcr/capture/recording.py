@@ -1,0 +1,77 @@
+"""From a recording to a capture: the best frames are chosen, and put in a folder with a capture.json."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.capture.best_frames import best_frames
+from jcr.capture.checks import checked_capture
+from jcr.capture.images import encode_png, sharpness
+from jcr.capture.options import ReadOptions
+from jcr.errors import InputError
+from jcr.files import write_bytes
+from jcr.progress import Progress
+from jcr.records import Capture, Intrinsics
+
+Pictures = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
+"""Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
+
+
+def capture_of_recording(
+    source: Path,
+    names: list[str],
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    speed: Float[ndarray, " n"],
+    gap_ns: Int[ndarray, " n"],
+    pictures: Pictures,
+    lens_of_size: Callable[[tuple[int, int]], Intrinsics | None],
+    options: ReadOptions,
+    into: Path,
+    report: Progress,
+) -> Capture:
+    """The best frames of a recording in the folder `into`; `names` are those of the frames, without ending.
+
+    Frames whose pose is interpolated over more than `options.max_gap_ms` are stale. Raises InputError when all
+    are, or when too few are still and sharp.
+    """
+    fresh = gap_ns <= 1e6 * options.max_gap_ms
+    if not fresh.any():
+        gap = gap_ns.min()
+        far = (
+            "no image lies between two poses"
+            if gap > 1e15
+            else f"those around an image are {gap / 1e6:.0f} ms apart"
+        )
+        raise InputError(
+            f"{source}: every pose is stale (over {options.max_gap_ms:.0f} ms): {far}; check the clocks, or raise "
+            "--max-gap-ms"
+        )
+    notes = []
+    if not fresh.all():
+        worst = gap_ns[gap_ns < 1e15].max(initial=0) / 1e6
+        notes.append(
+            f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {options.max_gap_ms:.0f} ms (gaps up to "
+            f"{worst:.0f} ms): left out"
+        )
+
+    def sharpness_of(rows: Int[ndarray, " k"]) -> Float[ndarray, " k"]:
+        values = []
+        for k, (_, picture, _) in enumerate(pictures(rows)):
+            values.append(sharpness(picture))
+            report("frames", 0.1 + 0.7 * k / len(rows))
+        return np.array(values)
+
+    rows, remarks = best_frames(base_from_gripper, speed, fresh, sharpness_of, options.frames)
+    images = []
+    for k, (row, picture, ending) in enumerate(pictures(rows)):
+        images.append(f"images/{names[row]}{ending}")
+        data = picture if isinstance(picture, bytes) else encode_png(picture)
+        write_bytes(into / images[-1], data)
+        report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
+    capture = checked_capture(into, images, base_from_gripper[rows], str(source))
+    notes = (f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks)
+    return replace(capture, intrinsics=lens_of_size(capture.image_size), notes=notes)

@@ -1,0 +1,59 @@
+"""sensor_msgs/Image and CompressedImage to pictures."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from jcr.errors import InputError
+
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "mono8": 1, "8UC1": 1}
+_TO_RGB = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8UC3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "mono8": cv2.COLOR_GRAY2RGB,
+    "8UC1": cv2.COLOR_GRAY2RGB,
+    # OpenCV names a Bayer pattern by its second row, ROS by its first: rggb is OpenCV's BG.
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+}
+
+
+def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
+    """An encoded file's bytes as they are, or RGB pixels; and the file's ending.
+
+    Raises InputError for encodings that are no picture (depth) or that jcr does not know.
+    """
+    if hasattr(message, "format"):
+        data = message.data.tobytes()
+        for magic, ending in ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n", ".png")):
+            if data.startswith(magic):
+                return data, ending
+        raise InputError(f"{where}: compressed as {message.format!r}; jcr reads JPEG and PNG of colours")
+    encoding = message.encoding
+    if encoding != "rgb8" and encoding not in _TO_RGB:
+        raise InputError(
+            f"{where}: encoding {encoding!r} is no colour picture that jcr knows; choose another topic"
+        )
+    channels = _CHANNELS.get(encoding, 2 if "yu" in encoding else 1)
+    used = message.width * channels
+    if message.step < used or message.data.size < message.height * message.step:
+        raise InputError(
+            f"{where}: an image of {message.width}x{message.height} {encoding} is cut short; record again"
+        )
+    # Rows may be padded to `step` bytes.
+    rows = message.data[: message.height * message.step].reshape(message.height, message.step)[:, :used]
+    pixels = np.ascontiguousarray(rows).reshape(message.height, message.width, channels)
+    if encoding == "rgb8":
+        return pixels, ".png"
+    return np.asarray(cv2.cvtColor(pixels, _TO_RGB[encoding]), dtype=np.uint8), ".png"

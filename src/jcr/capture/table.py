@@ -1,0 +1,135 @@
+"""Images and a table of gripper poses: which image belongs to which row."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.camera_info import FILE, read_camera_info
+from jcr.capture.checks import checked_capture
+from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import contained
+from jcr.capture.pose_table import PoseTable, read_pose_table, stamp_ns
+from jcr.capture.pose_track import pose_track
+from jcr.capture.table_cells import SUFFIXES, is_number
+from jcr.errors import InputError
+from jcr.records import Capture
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+TABLES = tuple(f"{stem}{suffix}" for stem in ("poses", "gripper_poses", "robot_poses") for suffix in SUFFIXES)
+
+
+def read(path: Path, options: ReadOptions) -> Capture:
+    """The capture of a table, or of a folder that holds one; images in the same folder or in images/."""
+    file = options.poses or find_table(path)
+    if file is None:
+        raise InputError(f"{path}: holds no table of poses ({', '.join(TABLES[:4])}); name it with --poses")
+    folder = path if path.is_dir() else path.parent
+    table = read_pose_table(file, options)
+    images, poses, notes = _paired(folder, file, table, options)
+    capture = checked_capture(folder, images, poses, str(file))
+    return replace(with_camera_info(capture, options), source=file, notes=notes)
+
+
+def find_table(path: Path) -> Path | None:
+    """The table of poses that a path is or holds, if there is one."""
+    if path.is_file():
+        return path
+    return next((path / name for name in TABLES if (path / name).is_file()), None)
+
+
+def with_camera_info(capture: Capture, options: ReadOptions) -> Capture:
+    """The capture with the intrinsics of a camera_info YAML, where there is one and it has none yet."""
+    file = options.camera_info or capture.folder / FILE
+    if options.camera_info is None and (capture.intrinsics is not None or not file.is_file()):
+        return capture
+    return replace(capture, intrinsics=read_camera_info(file, capture.image_size))
+
+
+def gripper_poses(
+    folder: Path, images: Sequence[str], options: ReadOptions
+) -> tuple[list[int], Float[ndarray, "m 4 4"], Path]:
+    """Rows of `images` that a table of gripper poses knows, their poses, and the table.
+
+    Raises InputError when there is no table or it does not belong to these images.
+    """
+    file = options.poses or find_table(folder)
+    if file is None:
+        raise InputError(f"{folder}: the cameras' poses are here, but no gripper poses; give --poses TABLE")
+    table = read_pose_table(file, options)
+    if table.images is None:
+        if len(table.base_from_gripper) != len(images):
+            raise InputError(
+                f"{file}: {len(table.base_from_gripper)} poses for {len(images)} images; add a column with the "
+                "images' names"
+            )
+        return list(range(len(images))), table.base_from_gripper, file
+    row_of = {_plain(name): row for row, name in enumerate(table.images)}
+    if len(row_of) < len(table.images):
+        raise InputError(f"{file}: names an image more than once; keep one row per image")
+    known = [k for k, name in enumerate(images) if _plain(name) in row_of]
+    if not known:
+        raise InputError(f"{file}: knows none of the images; it has {table.images[0]}, they have {images[0]}")
+    rows = [row_of[_plain(images[k])] for k in known]
+    return known, table.base_from_gripper[rows], file
+
+
+def _plain(name: str) -> str:
+    """A picture's name without folder and ending: tools differ in both."""
+    return Path(name).stem
+
+
+def _paired(
+    folder: Path, file: Path, table: PoseTable, options: ReadOptions
+) -> tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]:
+    if table.images is not None:
+        return [_located(folder, name, file) for name in table.images], table.base_from_gripper, ()
+    pictures = _pictures(folder)
+    if not pictures:
+        raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
+    stems = [Path(name).stem for name in pictures]
+    if table.stamp_ns is not None and all(map(is_number, stems)):
+        stamps = np.array(
+            [stamp_ns(stem, str(folder / name)) for stem, name in zip(stems, pictures, strict=True)]
+        )
+        if (stamps >= table.stamp_ns.min()).any() and (stamps <= table.stamp_ns.max()).any():
+            poses, gap_ns = pose_track(table.stamp_ns, table.base_from_gripper).at(stamps)
+            fresh = gap_ns <= 1e6 * options.max_gap_ms
+            if not fresh.all():
+                stale = int(gap_ns.argmax())
+                raise InputError(
+                    f"{file}: no pose within {options.max_gap_ms:.0f} ms around {pictures[stale]}; drop that image "
+                    "or raise --max-gap-ms"
+                )
+            return pictures, poses, (f"poses interpolated at the {len(pictures)} images' time stamps",)
+    if len(pictures) != len(table.base_from_gripper):
+        raise InputError(
+            f"{file}: {len(table.base_from_gripper)} poses for {len(pictures)} images in {folder}; make them "
+            "equal, or add a column with the images' names"
+        )
+    how = f"rows paired with images in order of their names: {pictures[0]} … {pictures[-1]}"
+    return pictures, table.base_from_gripper, (how,)
+
+
+def _located(folder: Path, name: str, file: Path) -> str:
+    """The image's path in the folder: as written, or in images/."""
+    beside = contained(folder, name, str(file))
+    if not beside.is_file() and (folder / "images" / name).is_file():
+        return f"images/{name}"
+    return name
+
+
+def _pictures(folder: Path) -> list[str]:
+    """Images of a folder, or of its images/, as people count: img2 before img10."""
+    inside = folder / "images" if (folder / "images").is_dir() else folder
+    files = [file for file in inside.iterdir() if file.suffix.lower() in PICTURES]
+    names = [str(file.relative_to(folder)) for file in files]
+    return sorted(names, key=_natural)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,0 +1,94 @@
+"""transforms.json of nerfstudio and instant-ngp: images with camera poses, beside a table of gripper poses.
+
+Its cameras have OpenGL's axes (y up, z backward) and pixels counted from the corner of the image, as COLMAP's.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.checks import checked_capture, checked_lens, read_rigid
+from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import contained, read_json
+from jcr.capture.table import PICTURES, gripper_poses
+from jcr.errors import InputError
+from jcr.records import Capture, Intrinsics
+
+FILE = "transforms.json"
+HALF_PIXEL = 0.5
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x")
+
+
+def read(path: Path, options: ReadOptions) -> Capture:
+    """The images that a transforms.json and a table of gripper poses both know."""
+    folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
+    names, _ = read_cameras(file)
+    known, poses, table = gripper_poses(folder, names, options)
+    notes = ()
+    if len(known) < len(names):
+        notes = (
+            f"{len(names) - len(known)} of {len(names)} images have no gripper pose in {table.name}: left out",
+        )
+    capture = checked_capture(folder, [names[k] for k in known], poses, str(file))
+    lens = read_lens(file, capture.image_size)
+    return replace(capture, intrinsics=lens, source=file, cameras=file, notes=notes)
+
+
+def read_cameras(file: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
+    """Images by their paths beside the file, and recon_from_camera (n,4,4) with OpenCV's axes."""
+    content = read_json(file)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f'{file}: has no list "frames" of file_path and transform_matrix')
+    names, cameras = [], []
+    for k, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{file}: frame {k} has no file_path")
+        names.append(_located(file, frame["file_path"], k))
+        where = f"{file}: transform_matrix of frame {k} ({names[-1]})"
+        cameras.append(read_rigid(frame.get("transform_matrix"), where) @ OPENGL_FROM_OPENCV)
+    return names, np.stack(cameras)
+
+
+def _located(file: Path, name: str, k: int) -> str:
+    """The image's path, with the ending that some writers leave out."""
+    name = str(Path(name))
+    for candidate in (name, *(f"{name}{suffix}" for suffix in PICTURES)):
+        if contained(file.parent, candidate, f"{file}: frame {k}").is_file():
+            return candidate
+    return name
+
+
+def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
+    """The one lens of all frames, of the given size; InputError when there are several, or a strange one."""
+    content: dict[str, Any] = read_json(file)
+    lenses = [
+        {key: source[key] for key in _LENS_KEYS if key in source}
+        for source in (content | frame for frame in content["frames"])
+    ]
+    first = lenses[0]
+    if any(lens != first for lens in lenses):
+        raise InputError(f"{file}: its frames have different lenses; jcr needs images of one camera")
+    model = content.get("camera_model", "OPENCV")
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
+        raise InputError(f"{file}: camera_model {model}; undistort the images to a pinhole or OPENCV camera")
+    if first.get("k4"):
+        raise InputError(f"{file}: a distortion with k4, which jcr does not know; undistort the images")
+    width, height = size
+    if (first.get("w", width), first.get("h", height)) != size:
+        raise InputError(
+            f"{file}: w, h are {first['w']}x{first['h']}, the images are {width}x{height}; make it fit"
+        )
+    if "fl_x" not in first and "camera_angle_x" not in first:
+        raise InputError(f"{file}: no fl_x, fl_y, cx, cy (or camera_angle_x); add the intrinsics")
+    focal = first.get("fl_x") or width / 2 / math.tan(float(first["camera_angle_x"]) / 2)
+    centre = (first.get("cx", width / 2), first.get("cy", height / 2))
+    numbers = [focal, first.get("fl_y", focal), *(float(value) - HALF_PIXEL for value in centre)]
+    distortion = [first.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    return checked_lens(numbers, distortion, size, str(file))

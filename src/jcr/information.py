@@ -1,0 +1,102 @@
+"""The hand-eye equation of one image as residuals with Jacobians, and what its pose tells of the unknowns.
+
+`base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`: the information of a pose depends on where it
+is and not on what its picture shows, so poses can be chosen before any picture is looked at.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.geometry import inverse, rotation_log, skew
+
+Poses = Float[ndarray, "n 4 4"]
+TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 7),
+    slice(7, 10),
+    slice(10, 13),
+)
+"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
+
+PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
+"""So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
+UNIT = np.array([1e-3] * 3 + [np.radians(0.1)] * 3 + [2e-3])
+"""What counts alike: 1 mm, 0.1°, 0.2 % of scale."""
+ASSUMED_NOISE = (5e-4, np.radians(0.1))
+"""m, rad; of a robot that has not been measured yet."""
+
+
+def predict(
+    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
+) -> Poses:
+    """Gripper poses in base (n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹."""
+    scaled = recon_from_camera.copy()
+    scaled[:, :3, 3] *= scale
+    return z @ scaled @ inverse(x)
+
+
+def residuals(
+    x: Float[ndarray, "4 4"],
+    scale: float,
+    z: Float[ndarray, "4 4"],
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
+    """Residuals of position (base axes) and orientation (gripper axes) and their Jacobian.
+
+    Perturbations: R_X ← exp(ω) R_X, t_X + dt, λ·exp(s), R_Z ← exp(ζ) R_Z, t_Z + dz.
+    """
+    predicted = predict(x, scale, z, recon_from_camera)
+    rotation = predicted[:, :3, :3]
+    turned = rotation_log(np.swapaxes(base_from_gripper[:, :3, :3], 1, 2) @ rotation)
+    residual = np.concatenate([predicted[:, :3, 3] - base_from_gripper[:, :3, 3], turned], axis=1)
+    arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
+    j = np.zeros((len(predicted), 6, 13))
+    j[:, :3, TRANSLATION] = -rotation
+    j[:, :3, ROTATION] = -rotation @ skew(x[:3, 3])
+    j[:, :3, 6] = arm
+    j[:, :3, BASE_TRANSLATION] = np.eye(3)
+    j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
+    j[:, 3:, ROTATION] = -np.eye(3)
+    j[:, 3:, BASE_ROTATION] = np.swapaxes(rotation, 1, 2)
+    return residual, j
+
+
+def pose_information(
+    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"], noise: tuple[float, float]
+) -> Float[ndarray, "n 13 13"]:
+    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its picture shows."""
+    # Any frame and unit of the reconstruction will do: the base's, in metres.
+    camera = base_from_gripper @ gripper_from_camera
+    _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)
+    j /= np.repeat(noise, 3)[:, None]
+    return np.swapaxes(j, 1, 2) @ j
+
+
+def expected_std(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7"]:
+    """Standard deviations that information leaves, in records.COVARIANCE_ORDER; the prior is added here."""
+    with_prior = hessian.copy()
+    with_prior[..., range(7), range(7)] += PRIOR_STD**-2.0
+    return np.sqrt(np.diagonal(np.linalg.inv(with_prior), axis1=-2, axis2=-1)[..., :7])
+
+
+def most_informative(
+    known: Float[ndarray, "13 13"], gain: Float[ndarray, "k 13 13"], count: int
+) -> tuple[Int[ndarray, " c"], Float[ndarray, "c 7"]]:
+    """The `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
+
+    Returns their rows, and the standard deviations expected with each and those before it.
+    """
+    rows: list[int] = []
+    left = np.arange(len(gain))
+    stds = np.zeros((min(count, len(gain)), 7))
+    for k in range(len(stds)):
+        std = expected_std(known + gain[left])
+        best = int(((std / UNIT) ** 2).sum(1).argmin())
+        stds[k] = std[best]
+        known = known + gain[left[best]]
+        rows.append(int(left[best]))
+        left = np.delete(left, best)
+    return np.array(rows, dtype=int), stds

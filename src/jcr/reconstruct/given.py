@@ -1,0 +1,123 @@
+"""The `given` back end: camera poses that somebody else found, a COLMAP model or a transforms.json.
+
+The model's own points are its tracks; where it has none (transforms.json), features are matched and triangulated
+with the cameras held. Dense pointmaps then come from the plane sweep, as for the COLMAP back end.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.capture import colmap_model, transforms_json
+from jcr.capture.images import read_image
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import inverse
+from jcr.progress import Progress
+from jcr.reconstruct.colmap import ColmapOptions
+from jcr.reconstruct.dense import dense_pointmaps
+from jcr.reconstruct.lens import pinhole_inside, undistort_image
+from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
+from jcr.reconstruct.views import choose_neighbours, sweep_planes
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+
+MIN_POINTS = 50
+
+
+def reconstruct(
+    capture: Capture, cameras: Path, seed: int, device: str, progress: Progress | None = None
+) -> Reconstruction:
+    """The capture's images that the model at `cameras` knows, with its poses held, and pointmaps.
+
+    Raises InputError when the model knows fewer than three, NotTrustedError when nothing can be triangulated.
+    """
+    report = progress or (lambda stage, fraction: None)
+    reader = colmap_model if cameras.is_dir() else transforms_json
+    names, recon_from_camera = reader.read_cameras(cameras)
+    row_of = {Path(name).name: row for row, name in enumerate(names)}
+    known = [k for k, name in enumerate(capture.images) if Path(name).name in row_of]
+    if len(known) < 3:
+        raise InputError(
+            f"{cameras}: knows {len(known)} of the capture's images by name; at least 3 are needed"
+        )
+    recon_from_camera = recon_from_camera[[row_of[Path(capture.images[k]).name] for k in known]]
+    lens = capture.intrinsics or reader.read_lens(cameras, capture.image_size)
+    images = [read_image(capture.folder / capture.images[k]) for k in known]
+    options = ColmapOptions(seed=seed, device=device)
+    tracks = _own_tracks(
+        cameras, [names[row_of[Path(capture.images[k]).name]] for k in known], capture.image_size
+    )
+    if len(tracks.points_in_recon) < MIN_POINTS:
+        tracks = _triangulated(images, lens, recon_from_camera, options, report)
+    if len(tracks.points_in_recon) < MIN_POINTS:
+        raise NotTrustedError(
+            f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated; check "
+            "that it belongs to these images, or leave it out (--backend colmap)"
+        )
+    pinhole = pinhole_inside(lens, options.pointmap_size_px)
+    colors = np.stack([undistort_image(image, lens, pinhole) for image in images])
+    points, confidence = dense_pointmaps(
+        colors,
+        recon_from_camera,
+        pinhole,
+        choose_neighbours(tracks, recon_from_camera, options.neighbours),
+        sweep_planes(tracks, recon_from_camera),
+        device,
+        report,
+    )
+    missing = [name for k, name in enumerate(capture.images) if k not in known]
+    notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()
+    return Reconstruction(
+        image_index=np.array(known),
+        recon_from_camera=recon_from_camera,
+        intrinsics=lens,
+        pointmap_intrinsics=pinhole,
+        points_in_recon=points,
+        confidence=confidence,
+        colors=colors,
+        tracks=tracks,
+        backend="given",
+        notes=notes,
+    )
+
+
+def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:
+    """The observations that a COLMAP model holds; none for a transforms.json."""
+    if not cameras.is_dir():
+        return Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    model = colmap_model.read_model(cameras)
+    id_of = {model.image(image_id).name: image_id for image_id in model.reg_image_ids()}
+    return tracks_of(model, [id_of[name] for name in names], size)
+
+
+def _triangulated(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    lens: Intrinsics,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    options: ColmapOptions,
+    report: Progress,
+) -> Tracks:
+    """Points of matched features, with lens and cameras held."""
+    with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+        database = Path(folder) / "database.db"
+        report("features", 0.0)
+        cameras = extract(database, images, [lens], True, options.working_size_px)
+        report("matching", 0.0)
+        match(database, options.seed)
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(cameras[0])
+        with closing(pycolmap.Database.open(database)) as db:
+            for image, camera_from_recon in zip(
+                db.read_all_images(), inverse(recon_from_camera), strict=True
+            ):
+                image.points2D = pycolmap.Point2DList(
+                    [pycolmap.Point2D(xy) for xy in db.read_keypoints(image.image_id)[:, :2]]
+                )
+                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_recon[:3]))
+        model = pycolmap.triangulate_points(model, database, folder, Path(folder))
+        return tracks_of(model, range(1, len(images) + 1), (lens.width, lens.height))
