@@ -149,10 +149,10 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     if pairs.is_metric and not is_one(hand_eye):
+        size = f"{100 * abs(1 / hand_eye.scale - 1):.1f} % too {'large' if hand_eye.scale < 1 else 'small'}"
         remark = (
-            f"the scale is {hand_eye.scale:.4f} where a marker of known size gives 1: its size was given "
-            f"{100 * abs(1 - hand_eye.scale):.1f} % too {'large' if hand_eye.scale < 1 else 'small'}, or the camera's "
-            "focal length is off"
+            f"the scale is {hand_eye.scale:.4f} where a marker of known size gives 1: its size was given {size}, or "
+            "the camera's focal length is off"
         )
         return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     return hand_eye
@@ -160,7 +160,8 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
 
 def is_one(hand_eye: HandEye) -> bool:
     """Whether the scale is 1 within what is known of it."""
-    return abs(np.log(hand_eye.scale)) < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+    off = abs(float(np.log(hand_eye.scale)))
+    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
 
 
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:

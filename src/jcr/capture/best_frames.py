@@ -21,7 +21,7 @@ LOOKS = 5
 SAME_VIEW = 0.005
 """m, turning counted at ARM: of frames nearer to each other the sharpest is kept."""
 
-Rows = Int[ndarray, " k"]
+Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
 
 
@@ -88,7 +88,7 @@ def _slowest(runs: list[Rows], speed: Float[ndarray, " n"], count: int) -> list[
     return [part[[speed[part].argmin()]] for part in pieces]
 
 
-def _different(base_from_gripper: Poses, rows: Rows) -> Rows:
+def _different(base_from_gripper: Poses, rows: Int[ndarray, " r"]) -> Rows:
     """Of `rows`, best first, those that no better one shows the same view as."""
     kept = rows[:0]
     for row in rows:

@@ -77,7 +77,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
     for name in capture.images:
         write_bytes(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, source=str(capture.source))
-    return replace(capture, folder=folder, source=None)
+    return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
 
 
 def _image_name(frame: Any, index: int, file: Path) -> str:

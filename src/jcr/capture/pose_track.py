@@ -45,7 +45,9 @@ def pose_track(stamp_ns: Stamps, a_from_b: Float[ndarray, "n 4 4"]) -> PoseTrack
     return PoseTrack(stamps, a_from_b[rows])
 
 
-def bracket(sample_ns: Stamps, stamp_ns: Stamps) -> tuple[Stamps, Float[ndarray, " n"], Stamps]:
+def bracket(
+    sample_ns: Int[ndarray, " k"], stamp_ns: Stamps
+) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Int[ndarray, " n"]]:
     """Row of the sample before each stamp, the share of the way to the next, and their distance in ns."""
     last = len(sample_ns) - 1
     before = np.clip(np.searchsorted(sample_ns, stamp_ns, side="right") - 1, 0, max(last - 1, 0))

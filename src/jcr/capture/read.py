@@ -104,13 +104,15 @@ def _extracted(path: Path, options: ReadOptions, into: Path, reader: Any, progre
         state.st_mtime_ns,
         json.loads(json.dumps(asdict(options), default=str)),
     ]
-    if (into / capture_json.FILE).is_file():
-        content = read_json(into / capture_json.FILE)
-        if isinstance(content, dict) and content.get("made_from") == made_from:
-            return replace(capture_json.read(into), notes=tuple(content["notes"]))
-    capture = reader(path, options, into, progress)
-    capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
-    return capture
+    if not (into / capture_json.FILE).is_file() or _content(into).get("made_from") != made_from:
+        capture = reader(path, options, into, progress)
+        capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
+    return replace(capture_json.read(into), notes=tuple(_content(into)["notes"]))
+
+
+def _content(folder: Path) -> dict[str, Any]:
+    content = read_json(folder / capture_json.FILE)
+    return content if isinstance(content, dict) else {}
 
 
 def format_of(path: Path) -> str:

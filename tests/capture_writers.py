@@ -1,0 +1,327 @@
+"""One capture written in every format that jcr reads: the mirror of src/jcr/capture."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import yaml
+from scipy.spatial.transform import Rotation
+
+from jcr.capture.options import ReadOptions
+from jcr.capture.transforms_json import OPENGL_FROM_OPENCV
+from jcr.geometry import inverse
+from jcr.records import Capture
+
+HALF_PIXEL = 0.5
+
+
+def rows_as(convention: str, poses: np.ndarray) -> np.ndarray:
+    """Poses (n,4,4) as the rows of numbers that a controller writes; written apart from the reader's table."""
+    position, rotation = poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])
+    mm = 1e3 * position
+    x, y, z, w = rotation.as_quat().T
+    yaw, pitch, roll = rotation.as_euler("ZYX").T
+    rpy, vector = np.stack([roll, pitch, yaw], 1), rotation.as_rotvec()
+    return {
+        "matrix": lambda: poses.reshape(-1, 16),
+        "franka": lambda: np.swapaxes(poses, 1, 2).reshape(-1, 16),
+        "quat-xyzw": lambda: np.column_stack([position, x, y, z, w]),
+        "quat-wxyz": lambda: np.column_stack([position, w, x, y, z]),
+        "realman": lambda: np.column_stack([position, w, x, y, z]),
+        "abb": lambda: np.column_stack([mm, w, x, y, z]),
+        "rotation-vector": lambda: np.column_stack([position, vector]),
+        "ur": lambda: np.column_stack([position, vector]),
+        "xarm-axis-angle": lambda: np.column_stack([mm, np.degrees(vector)]),
+        "rpy": lambda: np.column_stack([position, rpy]),
+        "unitree": lambda: np.column_stack([position, rpy]),
+        "xarm": lambda: np.column_stack([mm, np.degrees(rpy)]),
+        "fanuc": lambda: np.column_stack([mm, np.degrees(rpy)]),
+        "yaskawa": lambda: np.column_stack([mm, np.degrees(rpy)]),
+        "kuka": lambda: np.column_stack([mm, np.degrees(np.stack([yaw, pitch, roll], 1))]),
+    }[convention]()
+
+
+def copy_images(capture: Capture, folder: Path) -> None:
+    for name in capture.images:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(capture.folder / name, folder / name)
+
+
+def write_camera_info(capture: Capture, folder: Path) -> None:
+    lens = capture.intrinsics
+    content = {
+        "image_width": lens.width,
+        "image_height": lens.height,
+        "camera_name": "wrist",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": lens.matrix.ravel().tolist()},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(lens.distortion)},
+    }
+    (folder / "camera_info.yaml").write_text(yaml.safe_dump(content))
+
+
+def write_table(
+    folder: Path,
+    capture: Capture,
+    convention: str = "quat-xyzw",
+    header: str | None = "image,x,y,z,qx,qy,qz,qw",
+    separator: str = ",",
+) -> Path:
+    """poses.csv with the images' names in front, or, without a header, in the order of the images."""
+    copy_images(capture, folder)
+    write_camera_info(capture, folder)
+    numbers = [
+        [repr(float(value)) for value in row] for row in rows_as(convention, capture.base_from_gripper)
+    ]
+    if header is not None and header.startswith("image"):
+        numbers = [[name, *row] for name, row in zip(capture.images, numbers, strict=True)]
+    lines = [header.replace(",", separator)] if header else []
+    lines += [separator.join(row) for row in numbers]
+    file = folder / {",": "poses.csv", "\t": "poses.tsv", " ": "poses.txt"}[separator]
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def write_npy(folder: Path, capture: Capture) -> Path:
+    copy_images(capture, folder)
+    write_camera_info(capture, folder)
+    np.save(folder / "poses.npy", capture.base_from_gripper)
+    return folder
+
+
+def write_tum(
+    folder: Path, capture: Capture, header: str = "", start: int = 1_700_000_000_123_456_789
+) -> Path:
+    """A trajectory beside images that are named by their time stamps, in nanoseconds, half-way between samples.
+
+    The gripper stands at each image's pose from one sample to the next.
+    """
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    write_camera_info(capture, folder)
+    lines = [header] if header else []
+    separator = ", " if "," in header else " "
+    for k, (name, row) in enumerate(
+        zip(capture.images, rows_as("quat-xyzw", capture.base_from_gripper), strict=True)
+    ):
+        stamp = start + k * 10**9
+        shutil.copy(capture.folder / name, folder / "images" / f"{stamp}{Path(name).suffix}")
+        for at in (stamp - 10**7, stamp + 10**7):
+            seconds = f"{at // 10**9}.{at % 10**9:09d}"
+            lines.append(separator.join([seconds, *(repr(float(value)) for value in row)]))
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def write_industrial(folder: Path, capture: Capture) -> Path:
+    copy_images(capture, folder)
+    write_camera_info(capture, folder)
+    data = []
+    rows = rows_as("quat-xyzw", capture.base_from_gripper).tolist()
+    for k, (name, row) in enumerate(zip(capture.images, rows, strict=True)):
+        pose = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), row, strict=True))
+        (folder / f"pose_{k}.yaml").write_text(yaml.safe_dump(pose))
+        data.append({"image": name, "pose": f"pose_{k}.yaml"})
+    (folder / "cal_data.yaml").write_text(yaml.safe_dump({"data": data}))
+    return folder
+
+
+def write_transforms(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
+    copy_images(capture, folder)
+    lens = capture.intrinsics
+    k1, k2, p1, p2, k3 = lens.distortion
+    frames = [
+        {"file_path": f"./{name}", "transform_matrix": (pose @ OPENGL_FROM_OPENCV).tolist()}
+        for name, pose in zip(capture.images, recon_from_camera, strict=True)
+    ]
+    numbers = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx + HALF_PIXEL, "cy": lens.cy + HALF_PIXEL}
+    numbers |= {"w": lens.width, "h": lens.height, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+    content = {"camera_model": "OPENCV", **numbers, "aabb_scale": 4, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    np.save(folder / "poses.npy", capture.base_from_gripper)
+    return folder
+
+
+def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
+    """A model without points in sparse/0, its images in images/, and a table with their names."""
+    write_table(folder, capture)
+    (folder / "camera_info.yaml").unlink()
+    lens = capture.intrinsics
+    params = [lens.fx, lens.fy, lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL, *lens.distortion, 0, 0, 0]
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="FULL_OPENCV", width=lens.width, height=lens.height, params=params, camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for k, pose in enumerate(inverse(recon_from_camera), start=1):
+        image = pycolmap.Image(name=Path(capture.images[k - 1]).name, camera_id=1, image_id=k)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write(folder / "sparse" / "0")
+    return folder
+
+
+def write_moveit(folder: Path, base_from_gripper: np.ndarray, recon_from_camera: np.ndarray) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    samples = [
+        {"effector_wrt_world": gripper.ravel().tolist(), "object_wrt_sensor": marker.ravel().tolist()}
+        for gripper, marker in zip(base_from_gripper, inverse(recon_from_camera), strict=True)
+    ]
+    (folder / "samples.yaml").write_text(yaml.safe_dump(samples))
+    return folder / "samples.yaml"
+
+
+def write_easy_handeye2(
+    folder: Path, base_from_gripper: np.ndarray, recon_from_camera: np.ndarray, kind: str = "eye_in_hand"
+) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def parts(pose: np.ndarray) -> dict:
+        row = rows_as("quat-xyzw", pose[None])[0].tolist()
+        return {
+            "translation": dict(zip("xyz", row[:3], strict=True)),
+            "rotation": dict(zip("xyzw", row[3:], strict=True)),
+        }
+
+    samples = [
+        {"robot": parts(gripper), "tracking": parts(marker)}
+        for gripper, marker in zip(base_from_gripper, inverse(recon_from_camera), strict=True)
+    ]
+    content = {"parameters": {"name": "", "calibration_type": kind}, "samples": samples}
+    (folder / "wrist.samples").write_text(yaml.safe_dump(content))
+    return folder / "wrist.samples"
+
+
+IMAGE_FORMATS: dict[str, tuple[Callable[[Path, Capture], Path], ReadOptions]] = {
+    "csv": (write_table, ReadOptions()),
+    "tsv": (
+        lambda folder, capture: write_table(folder, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"),
+        ReadOptions(),
+    ),
+    "npy": (write_npy, ReadOptions()),
+    "tum": (lambda folder, capture: write_tum(folder, capture), ReadOptions()),
+    "ethz-asl": (
+        lambda folder, capture: write_tum(folder, capture, "# t, x, y, z, q_x, q_y, q_z, q_w"),
+        ReadOptions(),
+    ),
+    "industrial": (write_industrial, ReadOptions()),
+}
+
+
+LIMIT = '<limit lower="-3" upper="3" effort="1" velocity="1"/>'
+URDF = f"""<robot name="arm">
+  <link name="base_link"/><link name="upper"/><link name="fore"/><link name="hand"/><link name="tool0"/>
+  <link name="finger"/>
+  <joint name="pan" type="revolute"><parent link="base_link"/><child link="upper"/>
+    <origin xyz="0 0 0.2"/><axis xyz="0 0 1"/>{LIMIT}</joint>
+  <joint name="lift" type="revolute"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0.1 0 0.1" rpy="0.1 0 0"/><axis xyz="0 1 0"/>{LIMIT}</joint>
+  <joint name="roll" type="revolute"><parent link="fore"/><child link="hand"/>
+    <origin xyz="0.3 0 0"/><axis xyz="1 0 0"/>{LIMIT}</joint>
+  <joint name="flange" type="fixed"><parent link="hand"/><child link="tool0"/><origin xyz="0.1 0 0"/></joint>
+  <joint name="grip" type="prismatic"><parent link="hand"/><child link="finger"/><axis xyz="0 1 0"/>{LIMIT}</joint>
+</robot>
+"""
+
+
+def arm_poses(angles: np.ndarray) -> np.ndarray:
+    """base_link from tool0 of that URDF for (pan, lift, roll) in radians, by hand."""
+
+    def about(axis: str, angle: np.ndarray, offset: tuple[float, float, float]) -> np.ndarray:
+        poses = np.tile(np.eye(4), (len(angle), 1, 1))
+        poses[:, :3, :3] = Rotation.from_euler(axis, angle[:, None]).as_matrix()
+        poses[:, :3, 3] = offset
+        return poses
+
+    tilt = about("x", np.full(len(angles), 0.1), (0.1, 0, 0.1))
+    tool = about("x", np.zeros(len(angles)), (0.1, 0, 0))
+    lift = tilt @ about("y", angles[:, 1], (0, 0, 0))
+    return about("z", angles[:, 0], (0, 0, 0.2)) @ lift @ about("x", angles[:, 2], (0.3, 0, 0)) @ tool
+
+
+def write_video(file: Path, pictures: list[np.ndarray], fps: int, codec: str) -> None:
+    import av
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "20", "g": "10"} | ({"preset": "12"} if "av1" in codec else {"bf": "2"})
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def write_lerobot(
+    folder: Path,
+    episodes: list[tuple[list[np.ndarray], np.ndarray]],
+    version: str,
+    key: str,
+    names: list[str],
+    fps: int = 10,
+    codec: str = "libsvtav1",
+) -> Path:
+    """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    camera = "observation.images.wrist"
+    features = {
+        camera: {
+            "dtype": "video",
+            "shape": [*episodes[0][0][0].shape],
+            "names": ["height", "width", "channels"],
+        },
+        key: {"dtype": "float32", "shape": [len(names)], "names": {"axes": names}},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }
+    info = {"codebase_version": version, "robot_type": "arm", "fps": fps, "features": features}
+    info |= {"total_episodes": len(episodes), "chunks_size": 1000}
+    v3 = version.startswith("v3")
+    info["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+    if not v3:
+        info["data_path"] = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+        info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+    def table(rows: list[tuple[int, np.ndarray]]) -> pa.Table:
+        states = np.concatenate([states for _, states in rows]).tolist()
+        return pa.table(
+            {
+                key: pa.array(states, pa.list_(pa.float64())),
+                "timestamp": np.concatenate([np.arange(len(states)) / fps for _, states in rows]),
+                "episode_index": np.concatenate([np.full(len(states), index) for index, states in rows]),
+            }
+        )
+
+    def save(content: pa.Table, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(content, file)
+
+    if not v3:
+        for index, (pictures, states) in enumerate(episodes):
+            save(table([(index, states)]), folder / f"data/chunk-000/episode_{index:06d}.parquet")
+            write_video(folder / f"videos/chunk-000/{camera}/episode_{index:06d}.mp4", pictures, fps, codec)
+        return folder
+    save(
+        table([(k, states) for k, (_, states) in enumerate(episodes)]),
+        folder / "data/chunk-000/file-000.parquet",
+    )
+    everything = [picture for pictures, _ in episodes for picture in pictures]
+    write_video(folder / f"videos/{camera}/chunk-000/file-000.mp4", everything, fps, codec)
+    starts = np.cumsum([0, *(len(pictures) for pictures, _ in episodes)])[:-1] / fps
+    zeros = [0] * len(episodes)
+    columns = {
+        "episode_index": list(range(len(episodes))),
+        "data/chunk_index": zeros,
+        "data/file_index": zeros,
+    }
+    columns |= {f"videos/{camera}/{name}": zeros for name in ("chunk_index", "file_index")}
+    columns[f"videos/{camera}/from_timestamp"] = starts
+    save(pa.table(columns), folder / "meta/episodes/chunk-000/file-000.parquet")
+    return folder

@@ -1,0 +1,188 @@
+"""LeRobot data sets, v2.1 and v3.0: the right pictures with the right poses, out of AV1 videos."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import capture_writers as writers
+import jcr
+from jcr.capture.images import read_image
+from jcr.capture.joints import read_arm
+from jcr.capture.options import ReadOptions
+from jcr.records import Capture
+from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
+
+pytest.importorskip("av", reason="av is not installed (extra lerobot)")
+pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
+
+HOLD, MOVE = 5, 5
+"""Frames at rest, and on the way to the next view."""
+DROID = "observation.state.cartesian_position"
+XYZRPY = ["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+@pytest.fixture(scope="module")
+def problem() -> HandEyeProblem:
+    return hand_eye_problem(np.random.default_rng(7), 12)
+
+
+def walked(states: np.ndarray) -> np.ndarray:
+    """Each state held for HOLD frames, then MOVE frames of its way to the next."""
+    after = np.roll(states, -1, axis=0)
+    share = np.concatenate([np.zeros(HOLD), np.arange(1, MOVE + 1) / (MOVE + 1)])
+    return (states[:, None] + share[:, None] * (after - states)[:, None]).reshape(-1, states.shape[1])
+
+
+def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
+    """The bundled pictures, small, each as often as its view lasts; row and view are told by grey bars."""
+    capture = jcr.read_capture(tabletop)
+    pictures = []
+    for k in range(count):
+        small = cv2.resize(
+            read_image(capture.folder / capture.images[k]), (160, 120), interpolation=cv2.INTER_AREA
+        )
+        for step in range(HOLD + MOVE):
+            shown = small if step < HOLD else cv2.blur(small, (25, 1))
+            shown = shown.copy()
+            shown[:16, :80] = 15 * (k + first)  # which view
+            pictures.append(shown)
+    return pictures
+
+
+def view_of(capture: Capture) -> np.ndarray:
+    """Which view each picture shows, read from its bar."""
+    bars = [read_image(capture.folder / name)[4:12, 8:72].mean() for name in capture.images]
+    return np.round(np.array(bars) / 15).astype(int)
+
+
+def assert_paired(capture: Capture, poses: np.ndarray) -> None:
+    """Every picture has the pose of the view that it shows."""
+    assert len(capture) == len(poses)
+    assert sorted(view_of(capture)) == list(range(len(poses)))
+    assert np.allclose(capture.base_from_gripper, poses[view_of(capture)], atol=1e-6)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_cartesian_states_give_still_frames_with_their_poses(
+    version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem
+):
+    states = writers.rows_as("rpy", problem.base_from_gripper)
+    other = pictured(tabletop, 3), walked(states[:3])
+    episode = pictured(tabletop, 12), walked(states)
+    path = writers.write_lerobot(tmp_path / "set", [other, episode], version, DROID, XYZRPY)
+    got = jcr.read_capture(path, ReadOptions(episode=(1,), frames=12), into=tmp_path / "frames")
+    assert_paired(got, problem.base_from_gripper)
+    view = view_of(got)
+    solved = jcr.solve_hand_eye(got.base_from_gripper, problem.recon_from_camera[view])
+    assert np.abs(solved.gripper_from_camera - problem.gripper_from_camera).max() < 1e-6
+    assert not solved.warnings
+
+
+def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: Path):
+    """As SO-101 records them: names that end in .pos, degrees, the gripper's opening among them."""
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-1, 1, (8, 3))
+    states = np.column_stack([np.degrees(angles), np.full(8, 30.0)])
+    (tmp_path / "arm.urdf").write_text(writers.URDF)
+    names = ["pan.pos", "lift.pos", "roll.pos", "grip.pos"]
+    episode = pictured(tabletop, 8), walked(states)
+    path = writers.write_lerobot(
+        tmp_path / "set", [episode], "v3.0", "observation.state", names, codec="libx264"
+    )
+    options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0", pose_units="m-deg", frames=8)
+    got = jcr.read_capture(path, options, into=tmp_path / "frames")
+    assert_paired(got, writers.arm_poses(angles))
+    with pytest.raises(jcr.InputError, match="if they are degrees, add --pose-units m-deg"):
+        options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0")
+        jcr.read_capture(path, options, into=tmp_path / "more")
+    with pytest.raises(jcr.InputError, match="pan, lift, roll, grip are no pose; give --urdf"):
+        jcr.read_capture(path, into=tmp_path / "more")
+
+
+def test_frames_of_several_episodes_are_joined(tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
+    states = writers.rows_as("rpy", problem.base_from_gripper)
+    episodes = [
+        (pictured(tabletop, 6), walked(states[:6])),
+        (pictured(tabletop, 6, first=6), walked(states[6:])),
+    ]
+    path = writers.write_lerobot(tmp_path / "set", episodes, "v3.0", DROID, XYZRPY, codec="libx264")
+    got = jcr.read_capture(path, ReadOptions(episode=(0, 1), frames=12), into=tmp_path / "frames")
+    assert_paired(got, problem.base_from_gripper)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: HandEyeProblem) -> Path:
+    states = writers.rows_as("rpy", problem.base_from_gripper)[:4]
+    folder = tmp_path_factory.mktemp("lerobot") / "set"
+    episode = pictured(tabletop, 4), walked(states)
+    return writers.write_lerobot(folder, [episode], "v2.1", DROID, XYZRPY, codec="libx264")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"episode": (3,)}, "no episode 3; there are 1, counted from 0"),
+        (
+            {"camera_topic": "front"},
+            "choose the wrist's camera with --camera-topic: observation.images.wrist",
+        ),
+        (
+            {"joint_topic": "state"},
+            "no state; choose the robot's state with --joint-topic: .*cartesian_position",
+        ),
+        ({"urdf": Path("nowhere.urdf")}, "no observation.state; choose"),
+        ({"pose_convention": "matrix"}, "6 numbers, a pose of this convention has 16"),
+    ],
+)
+def test_what_is_not_in_the_set_is_listed(tmp_path: Path, small: Path, options: dict, words: str):
+    with pytest.raises(jcr.InputError, match=words):
+        jcr.read_capture(small, ReadOptions(**options), into=tmp_path / "frames")
+    assert not (tmp_path / "frames").exists()
+
+
+def test_damaged_sets_are_one_line(tmp_path: Path, small: Path, tabletop: Path):
+    import shutil
+
+    video, data = (
+        "videos/chunk-000/observation.images.wrist/episode_000000.mp4",
+        "data/chunk-000/episode_000000.parquet",
+    )
+    for name, content, words in (
+        (video, b"nonsense", "not a readable video"),
+        (video, (small / video).read_bytes()[:3000], "not a readable video"),
+        (data, b"nonsense", "not a readable table"),
+        ("meta/info.json", b"{}", "no LeRobot data set"),
+    ):
+        copy = tmp_path / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(small, copy)
+        (copy / name).write_bytes(content)
+        with pytest.raises(jcr.InputError, match=words) as caught:
+            jcr.read_capture(copy, into=tmp_path / "frames")
+        assert "\n" not in str(caught.value)
+    shutil.copytree(small, tmp_path / "escaped")
+    info = json.loads((small / "meta/info.json").read_text()) | {"video_path": "../{video_key}.mp4"}
+    (tmp_path / "escaped" / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(jcr.InputError, match="leads out of"):
+        jcr.read_capture(tmp_path / "escaped", into=tmp_path / "frames")
+
+
+def test_an_arm_is_followed_from_base_to_gripper(tmp_path: Path):
+    (tmp_path / "arm.urdf").write_text(writers.URDF)
+    arm = read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0"))
+    assert arm.joints == ("pan", "lift", "roll")
+    angles = np.random.default_rng(2).uniform(-2, 2, (5, 3))
+    assert np.allclose(arm.poses(angles), writers.arm_poses(angles), atol=1e-9)
+    for options, words in (
+        ({}, "--gripper-frame is not given; its links are base_link, upper"),
+        ({"gripper_frame": "base_link"}, "nothing moves between base_link and base_link"),
+        ({"gripper_frame": "tool0", "base_frame": "finger"}, "no joints lead from finger to tool0"),
+    ):
+        with pytest.raises(jcr.InputError, match=words):
+            read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", **options))
+    (tmp_path / "arm.urdf").write_text("<robot")
+    with pytest.raises(jcr.InputError, match="not a readable URDF"):
+        read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0"))

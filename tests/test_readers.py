@@ -1,0 +1,400 @@
+"""One capture in every format is read as the same capture; each fault is named with its place and cure."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import capture_writers as writers
+import jcr
+from jcr.capture import capture_json
+from jcr.capture.options import ReadOptions
+from jcr.capture.read import FORMATS, format_of, read_source
+from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
+from jcr.geometry import scale_translation
+from jcr.records import Capture, PosePairs
+from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
+
+
+@pytest.fixture(scope="module")
+def problem() -> HandEyeProblem:
+    return hand_eye_problem(np.random.default_rng(3), 12)
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path, problem: HandEyeProblem) -> Capture:
+    """The bundled pictures, with poses whose cameras are known exactly and a lens with distortion."""
+    bundled = jcr.read_capture(tabletop)
+    lens = replace(bundled.intrinsics, distortion=(0.01, -0.02, 1e-3, -2e-3, 0.003))
+    return replace(bundled, base_from_gripper=problem.base_from_gripper, intrinsics=lens)
+
+
+def assert_same(got: Capture, capture: Capture) -> None:
+    """The same pictures, poses to 1e-9, and lens."""
+    assert len(got) == len(capture)
+    for name, expected in zip(got.images, capture.images, strict=True):
+        assert (got.folder / name).read_bytes() == (capture.folder / expected).read_bytes()
+    assert np.allclose(got.base_from_gripper, capture.base_from_gripper, rtol=0, atol=1e-9)
+    lens, expected = got.intrinsics, capture.intrinsics
+    assert lens is not None and (lens.width, lens.height) == (expected.width, expected.height)
+    assert np.allclose([lens.matrix.ravel()], [expected.matrix.ravel()], rtol=0, atol=1e-9)
+    assert np.allclose(lens.distortion, expected.distortion, rtol=0, atol=1e-12)
+
+
+def assert_same_calibration(gripper: np.ndarray, camera: np.ndarray, problem: HandEyeProblem) -> None:
+    solved = jcr.solve_hand_eye(gripper, camera)
+    assert np.abs(solved.gripper_from_camera - problem.gripper_from_camera).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", writers.IMAGE_FORMATS)
+def test_images_and_poses_read_back_as_the_same_capture(
+    name: str, tmp_path: Path, capture: Capture, problem: HandEyeProblem
+):
+    write, options = writers.IMAGE_FORMATS[name]
+    got = jcr.read_capture(write(tmp_path, capture), options)
+    assert_same(got, capture)
+    assert_same_calibration(got.base_from_gripper, problem.recon_from_camera, problem)
+
+
+@pytest.mark.parametrize("name", ["transforms", "colmap"])
+def test_cameras_that_were_given_read_back_with_their_capture(
+    name: str, tmp_path: Path, capture: Capture, problem: HandEyeProblem
+):
+    from jcr.capture import colmap_model, transforms_json
+
+    write = writers.write_transforms if name == "transforms" else writers.write_colmap
+    path = write(tmp_path, capture, problem.recon_from_camera)
+    assert format_of(path) == name
+    got = jcr.read_capture(path)
+    assert_same(got, capture)
+    reader = transforms_json if name == "transforms" else colmap_model
+    _, cameras = reader.read_cameras(got.cameras)
+    assert np.allclose(cameras, problem.recon_from_camera, atol=1e-9)
+    assert_same_calibration(got.base_from_gripper, cameras, problem)
+
+
+@pytest.mark.parametrize("name", ["moveit", "easy_handeye2"])
+def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path, problem: HandEyeProblem):
+    write = writers.write_moveit if name == "moveit" else writers.write_easy_handeye2
+    cameras = scale_translation(problem.recon_from_camera, problem.scale)
+    path = write(tmp_path, problem.base_from_gripper, cameras)
+    assert format_of(path) == name
+    pairs = read_source(path)
+    assert isinstance(pairs, PosePairs) and pairs.is_metric
+    assert_same_calibration(pairs.base_from_gripper, pairs.recon_from_camera, problem)
+    with pytest.raises(jcr.InputError, match="no images; `jcr calibrate` solves it"):
+        jcr.read_capture(path)
+
+
+def test_a_scale_that_is_not_one_tells_of_a_marker_of_another_size(tmp_path: Path, problem: HandEyeProblem):
+    from jcr.pipeline import calibrate_poses
+
+    cameras = scale_translation(problem.recon_from_camera, problem.scale)
+    for size, words in ((1.0, None), (1.1, "10.0 % too large")):
+        path = writers.write_moveit(tmp_path, problem.base_from_gripper, scale_translation(cameras, size))
+        result = calibrate_poses(read_source(path), tmp_path / "out")
+        assert result.converged and result.calibration.backend == "poses given"
+        assert result.calibration.scale == pytest.approx(1 / size, rel=1e-6)
+        assert [words in warning for warning in result.calibration.warnings] == ([True] if words else [])
+
+
+def test_an_orbit_hides_the_scale_and_a_marker_gives_it_back(tmp_path: Path):
+    from jcr.pipeline import calibrate_poses
+
+    orbit = hand_eye_problem(np.random.default_rng(5), 12, "orbit")
+    cameras = scale_translation(orbit.recon_from_camera, orbit.scale)
+    assert not jcr.solve_hand_eye(orbit.base_from_gripper, cameras).converged
+    result = calibrate_poses(
+        read_source(writers.write_moveit(tmp_path, orbit.base_from_gripper, cameras)), tmp_path
+    )
+    assert result.converged and "taken as 1" in " ".join(result.calibration.warnings)
+    off = result.hand_eye.gripper_from_camera - orbit.gripper_from_camera
+    assert np.abs(off).max() < 1e-4
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_every_controller_is_read_as_it_writes(convention: str, problem: HandEyeProblem):
+    poses = problem.base_from_gripper
+    got = poses_from_numbers(writers.rows_as(convention, poses), convention, "auto", "table")
+    assert np.allclose(got, poses, rtol=0, atol=1e-9)
+
+
+def test_known_poses_of_controllers():
+    """Values from the controllers' manuals, not from our own writer."""
+    # UR: p[0.1, 0.2, 0.3, 0, 3.1416, 0] turns by half a turn about y.
+    ur = poses_from_numbers(np.array([[0.1, 0.2, 0.3, 0, np.pi, 0]]), "ur", "auto", "")
+    assert np.allclose(ur[0, :3, :3], np.diag([-1, 1, -1]), atol=1e-9)
+    # KUKA: A=90 about z, then B=90 about the new y: the tool's x axis ends up pointing down.
+    kuka = poses_from_numbers(np.array([[500, 0, 300, 90, 90, 0.0]]), "kuka", "auto", "")
+    assert np.allclose(kuka[0, :3, 0], [0, 0, -1], atol=1e-9)
+    assert np.allclose(kuka[0, :3, 3], [0.5, 0, 0.3])
+    # ABB: [[600,0,400],[0,1,0,0]] is w, x, y, z: half a turn about x.
+    abb = poses_from_numbers(np.array([[600, 0, 400, 0, 1, 0, 0.0]]), "abb", "auto", "")
+    assert np.allclose(abb[0, :3, :3], np.diag([1, -1, -1]), atol=1e-9)
+    # Franka: the translation is the last four of sixteen.
+    franka = poses_from_numbers(
+        np.array([[1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0.3, 0, 0.5, 1.0]]), "franka", "auto", ""
+    )
+    assert np.allclose(franka[0, :3, 3], [0.3, 0, 0.5])
+
+
+def test_units_in_the_names_of_columns_are_believed(tmp_path: Path, capture: Capture):
+    writers.write_table(tmp_path, capture, "xarm", "image,x [mm],y [mm],z [mm],roll_deg,pitch_deg,yaw_deg")
+    assert_same(jcr.read_capture(tmp_path), capture)
+
+
+def test_images_are_paired_as_people_count(tmp_path: Path, capture: Capture):
+    """img2 comes before img10."""
+    names = [f"img{k}.jpg" for k in range(1, 13)]
+    for name, image in zip(names, capture.images, strict=True):
+        shutil.copy(capture.folder / image, tmp_path / name)
+    np.save(tmp_path / "poses.npy", capture.base_from_gripper)
+    got = jcr.read_capture(tmp_path)
+    assert got.images == tuple(names)
+    assert "paired" in got.notes[0]
+
+
+def test_poses_are_interpolated_at_nanosecond_stamps(tmp_path: Path, capture: Capture):
+    """Half-way between two poses, at a stamp whose last digits a float would lose."""
+    moved = capture.base_from_gripper[:3].copy()
+    moved[:, :3, 3] += [0.1, 0, 0]
+    start = 1_700_000_000_000_000_001
+    (tmp_path / "images").mkdir()
+    lines = []
+    for k in range(3):
+        shutil.copy(capture.folder / capture.images[k], tmp_path / "images" / f"{start + k * 10**9}.jpg")
+        for shift, pose in ((-3, capture.base_from_gripper[k]), (1, moved[k])):
+            row = writers.rows_as("quat-xyzw", pose[None])[0]
+            lines.append(" ".join([str(start + k * 10**9 + shift), *map(repr, row.tolist())]))
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    got = jcr.read_capture(tmp_path)
+    assert np.allclose(got.base_from_gripper[:, 0, 3] - capture.base_from_gripper[:3, 0, 3], 0.075, atol=1e-9)
+
+
+def test_a_run_keeps_what_it_read_so_that_it_can_go_on(tmp_path: Path, capture: Capture):
+    source = tmp_path / "source"
+    got = jcr.read_capture(writers.write_table(source, capture))
+    there = capture_json.kept(got, tmp_path / "kept")
+    shutil.rmtree(source)
+    again = jcr.read_capture(tmp_path / "kept")
+    assert_same(again, capture)
+    # To the last bit: a reconstruction is taken up again only where nothing changed.
+    assert (again.base_from_gripper == there.base_from_gripper).all() and again.images == there.images
+
+
+def edit_line(file: Path, number: int, change) -> None:
+    lines = file.read_text().splitlines()
+    lines[number] = change(lines[number])
+    file.write_text("\n".join(lines) + "\n")
+
+
+def scaled(folder: Path, convention: str, header: str, position: float = 1, angle: float = 1) -> None:
+    rows = (folder / "poses.csv").read_text().splitlines()[1:]
+    poses = poses_from_numbers(
+        np.array([[float(cell) for cell in row.split(",")[1:]] for row in rows]), "quat-xyzw", "auto", ""
+    )
+    numbers = writers.rows_as(convention, poses) * ([position] * 3 + [angle] * (len(header.split(",")) - 4))
+    cells = [[row.split(",")[0], *map(repr, line.tolist())] for row, line in zip(rows, numbers, strict=True)]
+    (folder / "poses.csv").write_text("\n".join([header, *(",".join(line) for line in cells)]))
+
+
+RPY = "image,x,y,z,roll,pitch,yaw"
+FAULTS = {
+    "column missing": (lambda f: edit_line(f, 0, lambda line: line.replace("qw", "q")), {}, "show no pose"),
+    "column of the convention missing": (
+        lambda f: None,
+        {"pose_convention": "kuka"},
+        "no column a, b, c, which --pose-convention kuka needs",
+    ),
+    "row short": (
+        lambda f: edit_line(f, 3, lambda line: line.rsplit(",", 1)[0]),
+        {},
+        "row 3 has 7 columns, not 8",
+    ),
+    "word for a number": (
+        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",here"),
+        {},
+        "row 2, column qw: 'here' is no number",
+    ),
+    "NaN": (
+        lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",nan"),
+        {},
+        "pose 2 holds NaN",
+    ),
+    "image not there": (
+        lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]),
+        {},
+        r"99\.jpg: no such image",
+    ),
+    "image outside": (
+        lambda f: edit_line(f, 1, lambda line: "../99.jpg" + line[line.index(",") :]),
+        {},
+        "leads out of",
+    ),
+    "quaternion not of unit length": (
+        lambda f: edit_line(f, 1, lambda line: ",".join([*line.split(",")[:4], "1", "1", "0", "0"])),
+        {},
+        r"quaternion of pose 1 has length 1\.414",
+    ),
+    "millimetres": (
+        lambda f: scaled(f.parent, "rpy", RPY, 1e3),
+        {},
+        "look like millimetres: add --pose-units mm-rad",
+    ),
+    "degrees": (
+        lambda f: scaled(f.parent, "rpy", RPY, 1, 57.3),
+        {},
+        "look like degrees: add --pose-units m-deg",
+    ),
+    "metres for millimetres": (
+        lambda f: scaled(f.parent, "rpy", RPY, 1, 57.3),
+        {"pose_convention": "xarm"},
+        "too near for this convention's millimetres",
+    ),
+    "radians for degrees": (
+        lambda f: scaled(f.parent, "rpy", RPY, 1e3),
+        {"pose_convention": "xarm"},
+        "too small for this convention's degrees",
+    ),
+    "rx ry rz": (
+        lambda f: scaled(f.parent, "ur", "image,x,y,z,rx,ry,rz"),
+        {},
+        "rotation vector .* or angles",
+    ),
+    "gzip": (lambda f: f.write_bytes(b"\x1f\x8b\x08\x00rest"), {}, "compressed by gzip"),
+    "a picture": (lambda f: f.write_bytes((f.parent / "images/00.jpg").read_bytes()), {}, "not UTF-8"),
+    "empty": (lambda f: f.write_text(""), {}, "holds no poses"),
+    "two frames": (
+        lambda f: f.write_text("\n".join(f.read_text().splitlines()[:3])),
+        {},
+        "2 frames; at least 3",
+    ),
+    "lens of another size": (
+        lambda f: (f.parent / "camera_info.yaml").write_text(
+            (f.parent / "camera_info.yaml").read_text().replace("image_width: 640", "image_width: 1280")
+        ),
+        {},
+        "calibrated at 1280x480, the images are 640x480",
+    ),
+    "fisheye lens": (
+        lambda f: (f.parent / "camera_info.yaml").write_text(
+            (f.parent / "camera_info.yaml").read_text().replace("plumb_bob", "equidistant")
+        ),
+        {},
+        "distortion model equidistant",
+    ),
+    "YAML that makes objects": (
+        lambda f: (f.parent / "camera_info.yaml").write_text("!!python/object/apply:os.system [echo]"),
+        {},
+        "not YAML",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_tables_are_named(fault: str, tmp_path: Path, capture: Capture):
+    spoil, options, words = FAULTS[fault]
+    file = writers.write_table(tmp_path, capture)
+    spoil(file)
+    with pytest.raises(jcr.InputError, match=words) as caught:
+        jcr.read_capture(tmp_path, ReadOptions(**options))
+    assert "\n" not in str(caught.value)
+
+
+def test_counts_that_differ_are_named(tmp_path: Path, capture: Capture):
+    writers.write_npy(tmp_path, capture)
+    np.save(tmp_path / "poses.npy", capture.base_from_gripper[:-1])
+    with pytest.raises(jcr.InputError, match="11 poses for 12 images"):
+        jcr.read_capture(tmp_path)
+    np.save(tmp_path / "poses.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(jcr.InputError, match="not a NumPy array of numbers"):
+        jcr.read_capture(tmp_path)
+
+
+def test_numbers_without_names_ask_for_their_convention(tmp_path: Path, capture: Capture):
+    writers.write_table(tmp_path, capture, "ur", header=None)
+    with pytest.raises(jcr.InputError, match="6 columns of numbers without names; .*--pose-convention"):
+        jcr.read_capture(tmp_path)
+    assert_same(jcr.read_capture(tmp_path, ReadOptions(pose_convention="ur")), capture)
+
+
+def test_faults_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    with pytest.raises(jcr.InputError, match="eye_on_base, a camera beside the robot"):
+        read_source(writers.write_easy_handeye2(tmp_path, gripper, camera, "eye_on_base"))
+    empty = read_source(writers.write_easy_handeye2(tmp_path, gripper, camera, ""))
+    assert "taken as eye_in_hand" in empty.notes[0]
+    with pytest.raises(jcr.InputError, match="look like millimetres"):
+        read_source(writers.write_moveit(tmp_path, scale_translation(gripper, 1e3), camera))
+    with pytest.raises(jcr.InputError, match="2 samples"):
+        read_source(writers.write_moveit(tmp_path, gripper[:2], camera[:2]))
+    (tmp_path / "samples.yaml").write_text("- effector_wrt_world: [1, 2]\n")
+    with pytest.raises(jcr.InputError, match="sample 1: effector_wrt_world must be 16 numbers"):
+        read_source(tmp_path / "samples.yaml")
+
+
+def test_faults_of_given_cameras_are_named(tmp_path: Path, capture: Capture, problem: HandEyeProblem):
+    folder = writers.write_transforms(tmp_path, capture, problem.recon_from_camera)
+    content = json.loads((folder / "transforms.json").read_text())
+    for change, words in (
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE"),
+        ({"w": 320}, "w, h are 320x480"),
+        ({"frames": [{"file_path": "../secret.png", "transform_matrix": []}]}, "leads out of"),
+        ({"frames": []}, 'no list "frames"'),
+    ):
+        (folder / "transforms.json").write_text(json.dumps(content | change))
+        with pytest.raises(jcr.InputError, match=words):
+            jcr.read_capture(folder)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    (folder / "poses.npy").unlink()
+    with pytest.raises(jcr.InputError, match="no gripper poses; give --poses TABLE"):
+        jcr.read_capture(folder)
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "cameras.bin").write_bytes(b"nonsense")
+    with pytest.raises(jcr.InputError, match="not a readable COLMAP model"):
+        jcr.read_capture(tmp_path / "model")
+
+
+def test_what_is_no_capture_is_told_what_would_be_one(tmp_path: Path):
+    with pytest.raises(jcr.InputError, match="holds no capture.json, nor anything else"):
+        jcr.read_capture(tmp_path)
+    (tmp_path / "notes.md").write_text("hello")
+    with pytest.raises(jcr.InputError, match="say what it is with --format") as caught:
+        jcr.read_capture(tmp_path / "notes.md")
+    assert all(name in str(caught.value) for name in FORMATS)
+
+
+def run_jcr(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "jcr", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_the_command_line_calibrates_samples(tmp_path: Path, problem: HandEyeProblem):
+    cameras = scale_translation(problem.recon_from_camera, problem.scale)
+    path = writers.write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
+    done = run_jcr("calibrate", path, tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "the scale is 1, as the marker's size says" in done.stdout
+    content = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert np.abs(content["gripper_from_camera"] - problem.gripper_from_camera).max() < 1e-6
+    checked = run_jcr("check", path, "--json")
+    assert checked.returncode == 0 and json.loads(checked.stdout)["observability"]["observable"]
+    refused = run_jcr("run", path, tmp_path / "map")
+    assert (
+        refused.returncode == 2 and refused.stderr.startswith("error: ") and "jcr calibrate" in refused.stderr
+    )
+
+
+def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
+    """Gripper poses given as base in gripper, the commonest mistake of all."""
+    cameras = scale_translation(problem.recon_from_camera, problem.scale)
+    path = writers.write_moveit(tmp_path, np.linalg.inv(problem.base_from_gripper), cameras)
+    from jcr.pipeline import calibrate_poses
+
+    result = calibrate_poses(read_source(path), tmp_path / "out")
+    assert not result.converged and "inverses" in result.calibration.warnings[0]
