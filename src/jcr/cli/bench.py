@@ -16,6 +16,7 @@ from jcr.errors import InputError
 
 BENCHES = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
+    "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
     "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
@@ -37,7 +38,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, calibrate, map, pairs, predictions, real, run or table2."""
+    """align, bag, calibrate, map, pairs, predictions, real, run or table2."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
