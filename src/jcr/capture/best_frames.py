@@ -8,7 +8,6 @@ from numpy import ndarray
 
 from jcr.capture.checks import MIN_FRAMES
 from jcr.capture.images import BLURRED
-
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_angle
 from jcr.information import ASSUMED_NOISE, most_informative, pose_information
