@@ -96,7 +96,7 @@ def robot_noise(
     return max(float(sigma_t), NOISE_FLOOR[0]), max(float(sigma_r), NOISE_FLOOR[1])
 
 
-def deletedresiduals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
+def deleted_residuals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
     """Residuals of each pose from the fit without it, from those of the fit with it: (I − H)⁻¹ r."""
     return np.linalg.solve(np.eye(6) - hat + 1e-9 * np.eye(6), residual[..., None])[..., 0]
 
