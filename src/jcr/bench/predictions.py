@@ -9,12 +9,12 @@ import numpy as np
 from jcr.bench.synthetic_pairs import pairs_of_capture
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.capture.read import read_capture
-from jcr.geometry import rotation_log
 from jcr.pipeline import RunOptions, RunResult
 from jcr.pipeline import run as run_all
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.dust3r.pairs import write_pairs
 from jcr.simulate.capture import SimulateOptions, simulate
+from jcr.simulate.problem import HandEyeProblem, error
 from jcr.simulate.truth import read_truth, truth_points
 
 SEEDS = 3
@@ -81,18 +81,19 @@ def scored(result: RunResult, capture: Path, true_scale: float) -> EndToEnd:
     assert result.scene is not None
     every = max(1, len(surface) // 20_000)
     distance = np.abs(np.asarray(result.scene.query(surface[::every]).distance))
-    error = np.concatenate(
-        [
-            truth.gripper_from_camera[:3, 3] - found.gripper_from_camera[:3, 3],
-            rotation_log(truth.gripper_from_camera[:3, :3] @ found.gripper_from_camera[:3, :3].T),
-            [np.log(true_scale / found.scale)],
-        ]
+    problem = HandEyeProblem(
+        truth.base_from_gripper,
+        result.reconstruction.recon_from_camera,
+        truth.gripper_from_camera,
+        true_scale,
+        truth.base_from_gripper,
     )
+    off = error(problem, found.gripper_from_camera, found.scale)
     return EndToEnd(
-        1e3 * float(np.linalg.norm(error[:3])),
-        float(np.degrees(np.linalg.norm(error[3:6]))),
-        100 * abs(float(error[6])),
+        1e3 * float(np.linalg.norm(off[:3])),
+        float(np.degrees(np.linalg.norm(off[3:6]))),
+        100 * abs(float(off[6])),
         1e3 * float(np.nanmedian(distance)),
-        float(np.sqrt(error @ np.linalg.solve(found.covariance, error) / 7)),
+        float(np.sqrt(off @ np.linalg.solve(found.covariance, off) / 7)),
         sum(result.calibration.timings_s.values()),
     )
