@@ -43,9 +43,9 @@ def calibrate(
 ) -> HandEye:
     """Hand-eye calibration of the registered images; per-pose fields are in the reconstruction's order.
 
-    Camera poses that come with their covariance are weighed with it. Bundle adjustment then follows on
-    correspondences found in the images; on those between pointmaps, whose errors neighbours share, its result
-    stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
+    Camera poses that come with their covariance are weighed with it, and that is all. Else bundle adjustment
+    follows on correspondences found in the images; on those between pointmaps, whose errors neighbours share,
+    its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
     hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
@@ -80,6 +80,9 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     tracks = of_images(reconstruction.tracks, used)
     if (
         not options.bundle_adjustment
+        # What pointmaps say of the cameras is in their covariance, with the errors that neighbours share; their
+        # tracks, taken for independent, make it worse: simulated, 0.2 mm became 1.3 mm.
+        or evidence is not None
         or cues is not None  # bundle adjustment knows the robot's scale and height alone
         or len(tracks.image) < MIN_OBSERVATIONS
         or used.sum() < 3
