@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from PIL import Image
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from jcr.capture.read import read_capture
@@ -27,6 +28,7 @@ from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
 from jcr.represent.scene import SceneMap
+from jcr.segment.tabletop import label_tabletop
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.scenes import make_scene, solid_labels
 from jcr.simulate.truth import Truth, read_truth, true_depth, true_labels
@@ -110,7 +112,12 @@ def run() -> str:
                 rows[source, preset] = score(scene, places)
         trained = _trained(clouds["true poses and depth"], places)
         return "\n".join(
-            [*_accuracy(rows, scenes), *trained, *_speed(scenes["true poses and depth", "default"], folder)]
+            [
+                *_accuracy(rows, scenes),
+                *_geometric(clouds),
+                *trained,
+                *_speed(scenes["true poses and depth", "default"], folder),
+            ]
         )
 
 
@@ -135,6 +142,20 @@ def _accuracy(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str
             + " | "
             + " | ".join(f"{100 * rate:.3f}" for rate in rates)
             + f" | {s.color_psnr:.1f} dB | {s.label_iou:.3f} | {100 * s.unknown:.0f} |"
+        )
+    return [*lines, ""]
+
+
+def _geometric(clouds: dict[str, PointCloud]) -> list[str]:
+    """Labels from geometry alone, on the points: each true thing against the segment that fits it best."""
+    lines = ["| segments from geometry alone | segments | mIoU on the points |", "|---|---|---|"]
+    for source, cloud in clouds.items():
+        found, true = label_tabletop(cloud).label, cloud.label
+        things, segments = np.unique(true[true > 0]), np.unique(found[found > 0])
+        iou = np.array([[mean_iou(found == k, true == t, (True,)) for k in segments] for t in things])
+        rows, columns = linear_sum_assignment(-iou)
+        lines.append(
+            f"| {source} | {len(segments)} for {len(things)} | {iou[rows, columns].sum() / len(things):.3f} |"
         )
     return [*lines, ""]
 
@@ -320,12 +341,11 @@ def score(scene: SceneMap, places: Places) -> MapScore:
     )
 
 
-def mean_iou(found: Int[ndarray, " n"], true: Int[ndarray, " n"]) -> float:
-    """Intersection over union, averaged over the labels that are truly there."""
-    labels = np.unique(true)
-    return float(
-        np.mean([((found == k) & (true == k)).sum() / ((found == k) | (true == k)).sum() for k in labels])
-    )
+def mean_iou(found: ndarray, true: ndarray, labels: tuple = ()) -> float:
+    """Intersection over union of labels (n,), averaged over `labels`: by default those that are truly there."""
+    chosen = labels or tuple(np.unique(true))
+    shares = [((found == k) & (true == k)).sum() / ((found == k) | (true == k)).sum() for k in chosen]
+    return float(np.mean(shares))
 
 
 def _seen(truth: Truth, x_in_base: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
