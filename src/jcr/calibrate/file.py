@@ -311,6 +311,8 @@ def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
     content = read_json(file)
     matrix = content.get("gripper_from_camera") if isinstance(content, dict) else None
+    if isinstance(content, dict) and content.get("format", FORMAT) != FORMAT:
+        raise InputError(f"{file}: format {content['format']!r}, this version reads {FORMAT!r}; update jcr")
     if matrix is None:
         raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
     try:

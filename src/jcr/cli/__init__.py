@@ -6,6 +6,7 @@ status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug.
 """
 
 import contextlib
+import errno
 import io
 import os
 import re
@@ -50,6 +51,18 @@ examples:
 """
 
 
+_DISK = {
+    errno.ENOSPC: "make room on that disk, or choose another folder; finished results are kept",
+    errno.EDQUOT: "make room in that quota, or choose another folder; finished results are kept",
+    errno.EFBIG: "the disk takes no file of that size; choose another folder",
+    errno.EROFS: "choose a folder on a disk that can be written",
+    errno.EACCES: "choose a folder that you may write, or files that you may read",
+    errno.EPERM: "choose a folder that you may write, or files that you may read",
+    errno.EIO: "the disk fails; copy what is on it and choose another",
+}
+"""What the machine, not the program, has wrong, and the cure."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its status."""
     sys.exit(dispatch(sys.argv[1:] if arguments is None else arguments))
@@ -79,6 +92,10 @@ def dispatch(arguments: Sequence[str]) -> int:
         # Whoever read our output has seen enough; nothing more must be written, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        return _fail(2, f"{error.filename or 'the output'}: {error.strerror}; {_DISK[error.errno]}")
     except KeyboardInterrupt:
         return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
 

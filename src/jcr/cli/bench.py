@@ -18,11 +18,13 @@ BENCHES = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
+    "limits": "where it breaks: one thing made worse at a time",
     "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
     "predictions": "the whole job from pointmaps with a network's errors: error, honesty, map, time",
     "real": "real captures in DIR, against the references stored beside them",
     "run": "the whole job on the bundled capture: time and memory of each stage",
+    "table1": "hand-eye calibration from few images of three scenes, by the paper and by ours",
     "table2": "heights of objects in simulated scenes, from 8 and 10 images",
 }
 
@@ -38,7 +40,7 @@ class Arguments:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """align, bag, calibrate, map, pairs, predictions, real, run or table2."""
+    """align, bag, calibrate, limits, map, pairs, predictions, real, run, table1 or table2."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()

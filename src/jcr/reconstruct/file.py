@@ -51,7 +51,8 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 def read_reconstruction(path: Path) -> Reconstruction:
     """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves a file open that it cannot read.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             if about["format"] != FORMAT:
                 raise InputError(

@@ -1,0 +1,431 @@
+"""The catalogue of faults: what is fed to the command line, with which status it ends, and what it says.
+
+After each the message is one line with a cure, no traceback, nothing is half-written, and the results that were
+there are what they were.
+"""
+
+import hashlib
+import json
+import pickle
+import re
+import shutil
+import struct
+import subprocess
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from jcr.calibrate.calibrate import calibrate
+from jcr.calibrate.file import read_calibration
+from jcr.capture.read import read_capture
+from jcr.cli import dispatch
+from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.reconstruct.file import read_reconstruction
+from jcr.simulate.problem import hand_eye_problem
+
+SIZE = (96, 72)
+COUNT = 6
+EXECUTED = Path("/tmp/jcr-fault-executed")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Where a fault may be planted."""
+
+    capture: Path
+    out: Path
+    done: Path
+    """A finished run of the bundled capture, a copy of this case's own."""
+
+    @property
+    def first(self) -> Path:
+        return self.capture / "images" / "0.png"
+
+    @property
+    def calibrate(self) -> list[str]:
+        return ["calibrate", str(self.capture), str(self.out), "--quiet"]
+
+    def content(self) -> dict[str, Any]:
+        return json.loads((self.capture / "capture.json").read_text())
+
+    def write(self, content: dict[str, Any]) -> None:
+        (self.capture / "capture.json").write_text(json.dumps(content))
+
+    def edit(self, change: Callable[[dict[str, Any]], Any]) -> None:
+        content = self.content()
+        change(content)
+        self.write(content)
+
+    def poses(self, change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> None:
+        """Change all gripper poses, or one."""
+        content = self.content()
+        for k, frame in enumerate(content["frames"]):
+            if only is None or k == only:
+                frame["base_from_gripper"] = change(np.array(frame["base_from_gripper"])).tolist()
+        self.write(content)
+
+
+@pytest.fixture(scope="session")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture with nothing wrong but its pictures, which are noise."""
+    folder = tmp_path_factory.mktemp("sound")
+    (folder / "images").mkdir()
+    draw = np.random.default_rng(0)
+    poses = hand_eye_problem(draw, COUNT).base_from_gripper
+    frames = []
+    for k in range(COUNT):
+        pixels = draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"images/{k}.png")
+        frames.append({"image": f"images/{k}.png", "base_from_gripper": poses[k].tolist()})
+    lens = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "distortion": [0.0] * 5}
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    return folder
+
+
+@pytest.fixture
+def case(tmp_path: Path, sound: Path, done: Path) -> Case:
+    shutil.copytree(sound, tmp_path / "capture")
+    shutil.copytree(done, tmp_path / "done", ignore=shutil.ignore_patterns("*.npz", "*.ply", "*.html"))
+    return Case(tmp_path / "capture", tmp_path / "out", tmp_path / "done")
+
+
+Plant = Callable[[Case], list[str]]
+
+
+def picture(change: Callable[[Path], Any]) -> Plant:
+    """A fault of the first picture."""
+
+    def plant(case: Case) -> list[str]:
+        change(case.first)
+        return case.calibrate
+
+    return plant
+
+
+def written(change: Callable[[Case], Any]) -> Plant:
+    """A fault of the capture."""
+
+    def plant(case: Case) -> list[str]:
+        change(case)
+        return case.calibrate
+
+    return plant
+
+
+def posed(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> Plant:
+    return written(lambda case: case.poses(change, only))
+
+
+def bomb(path: Path) -> None:
+    """A PNG whose header promises 60000 x 60000 pixels, with little behind it."""
+    data = path.read_bytes()
+    header = data[12:16] + struct.pack(">II", 60_000, 60_000) + data[24:29]
+    path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
+
+
+def animated(path: Path) -> None:
+    frames = [Image.new("RGB", SIZE, color) for color in ("red", "green")]
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:])
+
+
+def turned(degrees: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(pose: np.ndarray) -> np.ndarray:
+        return pose @ np.diag([degrees, degrees, degrees, 1.0])
+
+    return change
+
+
+def big_json(case: Case) -> None:
+    case.edit(lambda content: content.update(padding="x" * 10_000_000, frames=content["frames"][:2]))
+
+
+def image_named(name: str) -> Plant:
+    return written(lambda case: case.edit(lambda c: c["frames"][0].update(image=name)))
+
+
+def linked_out(case: Case) -> None:
+    secret = case.capture.parent / "secret.png"
+    case.first.rename(secret)
+    case.first.symlink_to(secret)
+
+
+def read_only(case: Case) -> list[str]:
+    # Root may write anywhere but where the kernel itself forbids it.
+    return ["calibrate", str(case.capture), "/proc/jcr-out", "--quiet"]
+
+
+def a_file_as_output(case: Case) -> list[str]:
+    case.out.write_text("precious")
+    return case.calibrate
+
+
+def damaged(name: str, command: Callable[[Case], list[str]], change: Callable[[Path], Any]) -> Plant:
+    """A fault of a file in a finished run folder."""
+
+    def plant(case: Case) -> list[str]:
+        change(case.done / name)
+        return command(case)
+
+    return plant
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def other_format(path: Path) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": "jcr.calibration/9"}))
+
+
+def compare(case: Case) -> list[str]:
+    return ["compare", str(case.done), str(case.done)]
+
+
+def query(case: Case) -> list[str]:
+    points = case.capture.parent / "points.csv"
+    points.write_text("x,y,z\n0.4,0,0.2\n")
+    return ["query", str(case.done), str(points)]
+
+
+class Evil:
+    """Unpickling it writes a file."""
+
+    def __reduce__(self):
+        return Path.touch, (EXECUTED,)
+
+
+def weights(change: Callable[[Path], Any]) -> Plant:
+    def plant(case: Case) -> list[str]:
+        file = case.capture.parent / "weights.pth"
+        change(file)
+        return [*case.calibrate, "--backend", "dust3r", "--weights", str(file)]
+
+    return plant
+
+
+def predictions(change: Callable[[Path], Any]) -> Plant:
+    def plant(case: Case) -> list[str]:
+        file = case.capture.parent / "pairs.npz"
+        change(file)
+        return [*case.calibrate, "--backend", "predictions", "--weights", str(file)]
+
+    return plant
+
+
+def pickled_weights(path: Path) -> None:
+    with path.open("wb") as stream:
+        pickle.dump({"model": Evil()}, stream)
+
+
+def torch_pickled_weights(path: Path) -> None:
+    torch.save({"model": {"weight": torch.zeros(2)}, "args": Evil()}, path)
+
+
+def pickled_predictions(path: Path) -> None:
+    np.savez(path, edges=np.array([Evil()], dtype=object))
+
+
+FAULTS: dict[str, tuple[Plant, int, str]] = {
+    # The folder.
+    "empty folder": (written(lambda c: (shutil.rmtree(c.capture), c.capture.mkdir())), 2, "no capture.json"),
+    "no such folder": (written(lambda c: shutil.rmtree(c.capture)), 2, "no such"),
+    # The pictures.
+    "zero-byte picture": (picture(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
+    "truncated picture": (picture(cut), 2, "not a readable image"),
+    "text file named .png": (picture(lambda p: p.write_text("hello")), 2, "not a readable image"),
+    "16-bit picture": (
+        picture(lambda p: Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96)).save(p)),
+        3,
+        "registered 0 of 6",  # read as it should be: the other pictures are noise
+    ),
+    "CMYK picture": (
+        picture(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF")),
+        3,
+        "registered 0 of 6",
+    ),
+    "animated picture": (picture(animated), 2, "holds 2 pictures"),
+    "100-megapixel picture": (
+        picture(lambda p: Image.new("1", (10_000, 10_000)).save(p)),
+        2,
+        "million pixels",
+    ),
+    "decompression bomb": (picture(bomb), 2, "million pixels"),
+    "one picture under two names": (
+        written(lambda c: shutil.copy(c.first, c.first.with_name("1.png"))),
+        2,
+        "same picture",
+    ),
+    "all pictures equal": (
+        written(lambda c: [shutil.copy(c.first, c.first.with_name(f"{k}.png")) for k in range(1, COUNT)]),
+        2,
+        "same picture",
+    ),
+    "one black picture": (picture(lambda p: Image.new("RGB", SIZE).save(p)), 3, "registered 0 of 6"),
+    "one picture of another size": (
+        picture(lambda p: Image.new("RGB", (48, 36)).save(p)),
+        2,
+        "96x72|48x36",
+    ),
+    "missing picture": (picture(Path.unlink), 2, "no such image"),
+    # The poses.
+    "NaN in a pose": (posed(lambda p: p * np.nan, only=2), 2, "NaN or infinity"),
+    "infinity in a pose": (posed(lambda p: p + np.inf, only=2), 2, "NaN or infinity"),
+    "reflected pose": (posed(lambda p: p @ np.diag([1, 1, -1, 1]), only=2), 2, "reflection"),
+    "scaled pose": (posed(turned(2.0), only=2), 2, "scaled by 2"),
+    "transposed pose": (posed(lambda p: p.T, only=2), 2, "transposed"),
+    "poses in millimetres": (
+        posed(lambda p: np.vstack([np.column_stack([p[:3, :3], 1e3 * p[:3, 3]]), p[3:]])),
+        2,
+        "millimetres",
+    ),
+    "missing pose": (
+        written(lambda c: c.edit(lambda j: j["frames"][1].pop("base_from_gripper"))),
+        2,
+        "6 images but 5 gripper poses",
+    ),
+    "two frames": (written(lambda c: c.edit(lambda j: j.update(frames=j["frames"][:2]))), 2, "at least 3"),
+    # capture.json.
+    "no JSON": (written(lambda c: (c.capture / "capture.json").write_text("frames: []")), 2, "not JSON"),
+    "one key twice": (
+        written(lambda c: (c.capture / "capture.json").write_text('{"frames": [], "frames": []}')),
+        2,
+        "appears twice",
+    ),
+    "10 MB of JSON": (written(big_json), 2, "MB|at least 3"),
+    "deep nesting": (
+        written(lambda c: (c.capture / "capture.json").write_text("[" * 200_000)),
+        2,
+        "nested too deeply",
+    ),
+    "not UTF-8": (
+        written(lambda c: (c.capture / "capture.json").write_bytes(b'{"frames": "\xff\xfe"}')),
+        2,
+        "not UTF-8",
+    ),
+    "NUL in a path": (image_named("images/0\0.png"), 2, "no path inside"),
+    "../ in a path": (image_named("../secret.png"), 2, "leads out"),
+    "absolute path": (image_named("/etc/hostname"), 2, "no path inside"),
+    "link out of the folder": (written(linked_out), 2, "leads out"),
+    # The output.
+    "output below a folder nobody can write": (read_only, 2, "cannot be written"),
+    "output that is a file": (a_file_as_output, 2, "is a file"),
+    # Files of a finished run.
+    "calibration.json of a newer format": (damaged("calibration.json", compare, other_format), 2, "format"),
+    "calibration.json cut in half": (damaged("calibration.json", compare, cut), 2, "JSON|damaged"),
+    "map.safetensors cut in half": (damaged("map.safetensors", query, cut), 2, "damaged"),
+    "map.safetensors of noise": (
+        damaged("map.safetensors", query, lambda p: p.write_bytes(b"\x07" * 1000)),
+        2,
+        "damaged",
+    ),
+    "no map": (damaged("map.safetensors", query, Path.unlink), 2, "no map here"),
+    # Weights and predictions.
+    "weights that are a pickle with code": (weights(pickled_weights), 2, "weights.pth"),
+    "weights that are torch's pickle with code": (weights(torch_pickled_weights), 2, "weights.pth"),
+    "truncated weights": (
+        weights(lambda p: (torch.save({"model": {"w": torch.zeros(999)}}, p), cut(p))),
+        2,
+        "weights.pth",
+    ),
+    "weights of another network": (
+        weights(lambda p: torch.save({"model": {"conv.weight": torch.zeros(3, 3)}}, p)),
+        2,
+        "weights.pth",
+    ),
+    "no such weights": (weights(lambda p: None), 2, "weights.pth"),
+    "predictions that are a pickle with code": (predictions(pickled_predictions), 2, "pairs.npz"),
+    "predictions of noise": (predictions(lambda p: p.write_bytes(b"PK\x03\x04 noise")), 2, "pairs.npz"),
+    "predictions of other things": (predictions(lambda p: np.savez(p, a=np.zeros(3))), 2, "pairs.npz"),
+}
+
+
+def state(folder: Path) -> dict[str, str]:
+    """What every file in a folder holds."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_ends_in_one_line_and_harms_nothing(
+    case: Case, fault: str, capsys: pytest.CaptureFixture[str]
+):
+    plant, status, words = FAULTS[fault]
+    EXECUTED.unlink(missing_ok=True)
+    arguments = plant(case)
+    before = state(case.done), case.out.read_bytes() if case.out.is_file() else None
+    assert dispatch(arguments) == status
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and "Traceback" not in said
+    assert re.search(words, said), said
+    assert (state(case.done), case.out.read_bytes() if case.out.is_file() else None) == before
+    assert not EXECUTED.exists(), "code in the file was run"
+    assert not list(case.capture.parent.rglob("*.part*"))
+    if case.out.is_dir() and status == 2:  # what a second try starts from, and no result
+        assert {path.name for path in case.out.iterdir()} <= {".lock", "run.json", "capture"}
+    if status == 3:
+        assert json.loads((case.out / "calibration.json").read_text())["converged"] is False
+
+
+def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(tmp_path: Path, done: Path, capsys):
+    copy = tmp_path / "done"
+    shutil.copytree(done, copy)
+    cut(copy / "reconstruction.npz")
+    before = state(copy)
+    assert dispatch(["map", str(copy), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "reconstruction.npz: damaged" in said and said.count("\n") == 1
+    assert state(copy) == before
+
+
+def in_degrees(pose: np.ndarray) -> np.ndarray:
+    """A rotation vector in degrees, taken for radians."""
+    return transform(rotation_exp(np.degrees(rotation_log(pose[:3, :3]))), pose[:3, 3])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda poses: np.roll(poses, 1, axis=0), id="shuffled"),
+        pytest.param(lambda poses: np.stack([in_degrees(pose) for pose in poses]), id="degrees"),
+        pytest.param(inverse, id="inverses"),
+        pytest.param(lambda poses: np.repeat(poses[:1], len(poses), axis=0), id="one pose for all"),
+    ],
+)
+def test_poses_that_read_well_and_mean_nothing_are_not_trusted(done: Path, tabletop: Path, change):
+    capture = read_capture(tabletop)
+    wrong = replace(capture, base_from_gripper=change(capture.base_from_gripper))
+    found = calibrate(wrong, read_reconstruction(done / "reconstruction.npz"))
+    assert not found.converged and found.warnings
+
+
+def test_a_full_disk_leaves_the_earlier_results(tmp_path: Path, done: Path, capsys):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    size = sum(path.stat().st_size for path in done.iterdir())
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size + (2 << 20)}", "tmpfs", str(disk)]
+    try:
+        subprocess.run(mount, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("a small file system to fill cannot be mounted here")
+    try:
+        shutil.copytree(done, disk, dirs_exist_ok=True)
+        (disk / "filler").write_bytes(b"x" * (1 << 20))
+        before = state(disk)
+        assert dispatch(["map", str(disk), "--quiet"]) == 2
+        said = capsys.readouterr().err
+        assert "No space left" in said and said.count("\n") == 1
+        changed = {name for name, digest in state(disk).items() if before.get(name) != digest}
+        assert changed <= {"calibration.json", "log.txt", "run.json"}, "a result was lost or is half-written"
+        assert read_calibration(disk).converged
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
