@@ -6,7 +6,7 @@ from pathlib import Path
 SOURCE = Path(__file__).parent.parent / "src" / "jcr"
 LAYERS = [
     {"errors"},
-    {"geometry", "records", "files", "progress"},
+    {"geometry", "records", "files", "progress", "rounding"},
     {"information"},
     {"capture"},
     {"reconstruct"},
@@ -17,7 +17,7 @@ LAYERS = [
     {"report"},
     {"auto", "check", "live"},
     {"pipeline"},
-    {"bench"},
+    {"bench", "view"},
     {"cli"},
     {"__main__"},
 ]

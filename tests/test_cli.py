@@ -1,5 +1,6 @@
 """The command line through a subprocess, on the bundled capture and on faults."""
 
+import html
 import json
 import shutil
 import subprocess
@@ -193,4 +194,5 @@ def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: 
     assert finished.stderr.startswith("error: ") and finished.stderr.count("\n") == 1
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert content["converged"] is False and content["gripper_from_camera"] is None
-    assert content["warnings"]
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "No calibration" in report and html.escape(content["warnings"][0]) in report

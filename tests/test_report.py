@@ -1,41 +1,37 @@
 """The report: that it says what was found, harms nobody, needs nothing, and works in a browser."""
 
 import base64
-import io
 import itertools
 import json
-import os
 import re
-import select
 import shutil
-import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from chromium import Chromium
 from jcr.calibrate.calibrate import calibrate
-from jcr.calibrate.file import calibration_file
+from jcr.calibrate.file import calibration_file, failed_file, worst_direction
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.pipeline import RunResult
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
-from jcr.report.html import report_html
-from jcr.report.markup import significant
+from jcr.report.html import failed_report_html, report_html
+from jcr.report.images import MAGNIFIED
+from jcr.report.motion import _excitation_bars
 from jcr.report.notations import notations
 from jcr.report.samples import CLEARANCE, sample_surface, slices
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
+from jcr.rounding import significant
 from jcr.simulate.truth import Truth, read_truth
 
 EVIL = "<script>alert(1)</script>&\"'.jpg"
@@ -255,6 +251,53 @@ def test_untrusted_calibration_is_not_recommended(run):
     assert all(advice in text for advice in content.observability.advice)
 
 
+def test_reprojections_and_poses_to_add_are_those_of_the_run(run, page: str):
+    capture, result = run
+    marks = re.findall(r'<svg class="marks" viewBox="0 0 640 480".*?d="([^"]*)"', page)
+    assert len(marks) == len(result.reconstruction.image_index)
+    ways = np.array([re.findall(r"l(-?\d+) (-?\d+)", path)[:20] for path in marks], float) / MAGNIFIED
+    # The features were moved by 0.3 px along each axis.
+    assert 0.25 < ways.std() < 0.35
+    elements = Elements(page)
+    for k, pose in enumerate(result.calibration.next_poses, start=1):
+        copied = np.array(json.loads(elements.copied(f"pose {k}")))
+        np.testing.assert_allclose(copied, pose.base_from_gripper, atol=1e-6)
+        near = capture.base_from_gripper[capture.images.index(pose.like), :3, 3]
+        assert f"{1e3 * np.linalg.norm(copied[:3, 3] - near):.0f} mm" in elements.text
+    assert all(part in elements.text for part in ("left of the tick", "tracked features in red"))
+
+
+def test_unseen_direction_has_a_red_bar(run):
+    capture, result = run
+    turned = capture.base_from_gripper.copy()
+    yaw = np.linspace(0, 2, len(turned))[:, None] * [0.0, 0.0, 1.0]
+    turned[:, :3, :3] = rotation_exp(yaw) @ turned[0, :3, :3]
+    bars = _excitation_bars(turned, result.hand_eye.gripper_from_camera)
+    red = re.findall(r'class="rejected"><th>([^<]*)</th>', bars)
+    assert len(red) == 1 and "offset" in red[0] and bars.index("rejected") < bars.index('"used"')
+
+
+def test_a_run_without_camera_poses_says_why_with_its_images(run, tmp_path: Path):
+    capture, _ = run
+    reason = "only 2 of 12 images share features; lay <textured> things on the table"
+    failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
+    elements = Elements(failed_report_html(capture, failed, tmp_path))
+    assert f"No calibration: {reason}." in elements.text
+    names = [a.get("alt") for tag, a in elements.found if tag == "img"]
+    assert names == list(capture.images)
+    assert "together" in elements.text and "$" not in elements.text
+
+
+def test_uncertainty_of_metres_is_said_in_metres(run):
+    _, result = run
+    covariance = result.hand_eye.covariance.copy()
+    optical = result.hand_eye.gripper_from_camera[:3, 2]
+    for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
+        covariance[:3, :3] = std**2 * np.outer(optical, optical)
+        told = worst_direction(replace(result.hand_eye, covariance=covariance))
+        assert told == f"along the optical axis: {words}"
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.7, 3.0, np.pi - 1e-6])
 def test_uncertainty_of_every_notation_is_what_small_errors_make(angle: float):
     rng = np.random.default_rng(3)
@@ -345,122 +388,9 @@ def test_surface_is_sampled_on_the_surface(run, tabletop: Path):
     assert level.occupancy.shape == level.unknown.shape and upright.axes == (0, 2)
 
 
-class Chromium:
-    """A headless browser, spoken to in its DevTools protocol through a pair of pipes."""
-
-    def __init__(self, binary: str, profile: Path) -> None:
-        child_in, self._to = os.pipe()
-        self._from, child_out = os.pipe()
-        flags = [
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--disable-quic",
-            "--no-first-run",
-            "--disable-background-networking",
-            "--disable-component-update",
-            "--disable-sync",
-            "--hide-scrollbars",
-            "--remote-debugging-pipe",
-        ]
-        # The protocol's pipes are file descriptors 3 and 4 of the browser.
-        shell = f'exec "$0" "$@" 3<&{child_in} 4>&{child_out}'
-        self._process = subprocess.Popen(
-            ["bash", "-c", shell, binary, *flags, f"--user-data-dir={profile}", "about:blank"],
-            pass_fds=(child_in, child_out),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        os.close(child_in)
-        os.close(child_out)
-        self._numbers, self._received = itertools.count(1), b""
-        self._session: dict[str, str] = {}
-        self.events: list[dict[str, Any]] = []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = {
-            "sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        }
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.call(f"{domain}.enable")
-
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        number = next(self._numbers)
-        message = {"id": number, "method": method, "params": parameters, **self._session}
-        os.write(self._to, json.dumps(message).encode() + b"\0")
-        while True:
-            answer = self._receive()
-            if answer.get("id") == number:
-                assert "error" not in answer, (method, answer)
-                return answer["result"]
-            self.events.append(answer)
-
-    def _receive(self) -> dict[str, Any]:
-        while b"\0" not in self._received:
-            assert select.select([self._from], [], [], 60)[0], "the browser does not answer"
-            part = os.read(self._from, 1 << 20)
-            assert part, "the browser has ended"
-            self._received += part
-        message, _, self._received = self._received.partition(b"\0")
-        return json.loads(message)
-
-    def open(self, file: Path, width: int, *, phone: bool = False, scheme: str = "light") -> None:
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=900,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
-        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        self.call("Page.navigate", url=file.as_uri())
-        while not any(event["method"] == "Page.loadEventFired" for event in self.events):
-            self.events.append(self._receive())
-        self.js("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-
-    def js(self, expression: str) -> Any:
-        answer = self.call(
-            "Runtime.evaluate",
-            expression=expression,
-            awaitPromise=True,
-            returnByValue=True,
-            userGesture=True,
-        )
-        assert "exceptionDetails" not in answer, answer
-        return answer["result"].get("value")
-
-    def picture(self) -> np.ndarray:
-        """The 3D view as it is seen (h,w,3), once it has drawn what it was last told."""
-        self.js("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        box = self.js(
-            "(() => { const b = document.getElementById('scene').getBoundingClientRect(); return"
-            " {x: b.x + scrollX, y: b.y + scrollY, width: b.width, height: b.height, scale: 1}; })()"
-        )
-        png = self.call("Page.captureScreenshot", clip=box, captureBeyondViewport=True)["data"]
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"))
-
-    def center(self, selector: str) -> tuple[float, float]:
-        self.js(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
-        box = self.js(
-            f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect();"
-            " return [b.x + b.width / 2, b.y + b.height / 2]; })()"
-        )
-        return box[0], box[1]
-
-    def close(self) -> None:
-        os.killpg(self._process.pid, signal.SIGTERM)
-        self._process.wait(20)
-        os.close(self._to)
-        os.close(self._from)
-
-
 @pytest.fixture(scope="module")
 def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    names = ("chromium", "chromium-browser", "google-chrome")
-    binary = next(filter(None, map(shutil.which, names)), None)
-    if binary is None:
-        pytest.skip(f"no browser to open the report in: none of {', '.join(names)} is installed")
-    browser = Chromium(binary, tmp_path_factory.mktemp("chromium"))
+    browser = Chromium(tmp_path_factory.mktemp("chromium"), "--disable-gpu")
     yield browser
     browser.close()
 
@@ -474,21 +404,21 @@ def file(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_in_a_browser(chromium: Chromium, file: Path):
     chromium.events.clear()
-    chromium.open(file, 1280)
-    picture = chromium.picture()
+    chromium.open(file.as_uri(), 1280)
+    picture = chromium.picture("#scene")
     drawn = picture[(picture != picture[20, 20]).any(-1)]
     assert len(drawn) > 0.05 * picture.shape[0] * picture.shape[1]
     assert len(np.unique(drawn, axis=0)) > 200
 
     # Turned by the mouse, it shows something else; every layer and switch changes it too.
     x, y = chromium.center("#scene")
-    before = chromium.picture()
+    before = chromium.picture("#scene")
     mouse = {"button": "left", "buttons": 1, "clickCount": 1}
     chromium.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
     for k in range(1, 5):
         chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 20 * k, y=y + 5 * k, **mouse)
     chromium.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 80, y=y + 20, **mouse)
-    pictures = [before, chromium.picture()]
+    pictures = [before, chromium.picture("#scene")]
     for control in (
         'input[name="scene-layer"][value="1"]',
         'input[name="scene-layer"][value="2"]',
@@ -496,11 +426,12 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         "#scene-grippers",
         "#scene-grid",
         "#scene-tracks",
+        "#scene-next",
         '[data-look="[-90, 89]"]',
         '[data-through="1"]',
     ):
         chromium.js(f"document.querySelector('{control}').click()")
-        pictures.append(chromium.picture())
+        pictures.append(chromium.picture("#scene"))
     for one, two in itertools.pairwise(pictures):
         assert (one != two).any()
     # Out of a camera, the photograph can be laid over the map.
@@ -512,7 +443,7 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         " { b.click(); await new Promise(done => setTimeout(done, 50)); out.push([b.dataset.copy,"
         " await navigator.clipboard.readText(), b.textContent]); } return out; })()"
     )
-    assert len(copied) == 8
+    assert len(copied) == 8 + 2  # notations, and poses to add
     for wanted, found, label in copied:
         assert wanted == found and label == "copied"
     _assert_quiet(chromium)
@@ -520,21 +451,21 @@ def test_in_a_browser(chromium: Chromium, file: Path):
 
 def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.events.clear()
-    chromium.open(file, 400, phone=True)
+    chromium.open(file.as_uri(), 400, phone=True)
     assert chromium.js("document.documentElement.scrollWidth") <= 400
     light = chromium.js("getComputedStyle(document.body).backgroundColor")
     x, y = chromium.center("#scene")
     time.sleep(0.1)  # the emulated finger is refused while the page still scrolls
-    before = chromium.picture()
+    before = chromium.picture("#scene")
     finger = [{"x": x, "y": y, "id": 0}]
     chromium.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=finger)
     for k in range(1, 6):
         moved = [{"x": x + 12 * k, "y": y, "id": 0}]
         chromium.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=moved)
     chromium.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-    assert (chromium.picture() != before).any()
+    assert (chromium.picture("#scene") != before).any()
 
-    chromium.open(file, 1280, scheme="dark")
+    chromium.open(file.as_uri(), 1280, scheme="dark")
     dark = chromium.js("getComputedStyle(document.body).backgroundColor")
     assert sum(map(int, re.findall(r"\d+", dark)[:3])) < 200 < sum(map(int, re.findall(r"\d+", light)[:3]))
     printed = base64.b64decode(chromium.call("Page.printToPDF")["data"])

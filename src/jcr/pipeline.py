@@ -224,6 +224,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         failed = failed_file(capture, candidates(options.reconstruct)[-1], str(error), timings, __version__)
         write_calibration(folder / "calibration.json", failed)
         _write_log(folder, failed)
+        _report_failure(capture, folder, failed)
         raise
     timings = {
         "reconstruct": round(reconstructed - start, 3),
@@ -298,6 +299,12 @@ def _report(capture: Capture, result: RunResult) -> None:
     from jcr.report.html import report_html
 
     write_text(result.out / "report.html", report_html(capture, result))
+
+
+def _report_failure(capture: Capture, folder: Path, failed: CalibrationFile) -> None:
+    from jcr.report.html import failed_report_html
+
+    write_text(folder / "report.html", failed_report_html(capture, failed, folder))
 
 
 def _with_backend(options: RunOptions | None, backend: str | None, capture: Capture) -> RunOptions:

@@ -23,6 +23,7 @@ from jcr.records import (
     PosePairs,
     Reconstruction,
 )
+from jcr.rounding import significant
 
 FORMAT = "jcr.calibration/1"
 PROPOSED = 2
@@ -270,7 +271,9 @@ def worst_direction(hand_eye: HandEye) -> str:
     name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
     if abs(axis @ direction) < np.cos(np.radians(30)):
         name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
-    return f"along {name}: ±{std_mm:.2g} mm"
+    # An offset that no motion shows may be uncertain by metres.
+    size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
+    return f"along {name}: ±{size}"
 
 
 def write_calibration(path: Path, content: CalibrationFile) -> None:

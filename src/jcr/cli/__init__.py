@@ -28,6 +28,7 @@ COMMANDS = {
     "query": "occupancy, distance, colour, label at points",
     "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
     "measure": "support plane and the objects on it: height, footprint, label",
+    "view": "a run in 3D, in the browser",
     "compare": "difference of two calibrations in mm and degrees",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README",

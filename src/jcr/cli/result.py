@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jcr.rounding import significant
+
 if TYPE_CHECKING:
     from jcr.pipeline import PosesResult, RunResult
 
@@ -62,7 +64,7 @@ def summary(result: "RunResult | PosesResult") -> str:
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
     if content.next_poses:
         after = content.next_poses[-1].expected_std
-        offset = " ".join(f"{1e3 * value:.2g}" for value in after[:3])
+        offset = " ".join(significant(1e3 * value) for value in after[:3])
         near = ", ".join(f"{pose.like}" for pose in content.next_poses)
         lines.append(
             f"{len(content.next_poses)} more views, like {near} but turned (next_poses in calibration.json), "

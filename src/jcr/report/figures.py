@@ -19,6 +19,7 @@ WIDTH, HEIGHT = 440.0, 330.0
 """Of the panels; small enough that their text is still read when a phone shrinks them."""
 OBLIQUE, ABOVE = (-50.0, 28.0), (-90.0, 90.0)
 """Azimuth of the eye about the base's z axis and its elevation in degrees; the second has x to the right."""
+TRACK_COLOR = (229, 40, 40)
 CAMERA_LENGTH = 0.07
 """Of a drawn pyramid, as a share of the figure's contents."""
 

@@ -14,13 +14,16 @@ from jcr.calibrate.file import CalibrationFile
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
-from jcr.report.images import images_section, lens_of, residuals_section
+from jcr.report.images import images_section, lens_of, residuals_section, thumbnails
 from jcr.report.map import map_section
-from jcr.report.markup import PAGE, filled, significant
+from jcr.report.markup import PAGE, filled
+from jcr.report.motion import motion_section
 from jcr.report.objects import objects_section
 from jcr.report.samples import sample_surface
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
+from jcr.represent.scene import SceneMap
+from jcr.rounding import significant
 
 if TYPE_CHECKING:
     from jcr.pipeline import RunResult
@@ -48,7 +51,7 @@ def report_html(capture: Capture, result: "RunResult") -> str:
         scene_section(capture, result, base_from_camera, surface),
         images_section(capture, result),
         residuals_section(capture, result),
-        _uncertainty(calibration),
+        motion_section(capture, result),
         filled("before_after.html", panels=_before_after(capture, result, base_from_camera)),
         ""
         if result.scene is None or surface is None
@@ -56,8 +59,30 @@ def report_html(capture: Capture, result: "RunResult") -> str:
         ""
         if result.scene is None or result.measured is None
         else objects_section(result.measured, result.scene.label_names),
-        _details(result),
+        _details(calibration, result.out, result.scene),
     ]
+    return _page(capture, calibration, sections)
+
+
+def failed_report_html(capture: Capture, calibration: CalibrationFile, out: Path) -> str:
+    """The report of a run in the folder `out` that found no camera poses: why, with the cure, and the images."""
+    reason = escape(calibration.warnings[0])
+    verdict = f"<h2><b>No calibration:</b> {reason}.</h2><p>Nothing was calibrated and nothing mapped.</p>"
+    cards = "".join(
+        f'<figure><img src="{url}" alt="{escape(name)}"><figcaption><span class="file">{escape(name)}</span>'
+        "</figcaption></figure>"
+        for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
+    )
+    say = "What the camera saw. Without texture, overlap or light no features are found in them."
+    sections = [
+        f'<section class="verdict bad">{verdict}</section>',
+        filled("images.html", say=say, about="", cards=cards),
+        _details(calibration, out),
+    ]
+    return _page(capture, calibration, sections)
+
+
+def _page(capture: Capture, calibration: CalibrationFile, sections: Sequence[str]) -> str:
     return filled(
         "page.html",
         name=escape(capture.folder.resolve().name),
@@ -142,37 +167,6 @@ def _warnings(calibration: CalibrationFile) -> str:
     return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
 
 
-def _uncertainty(calibration: CalibrationFile) -> str:
-    observed, uncertainty = calibration.observability, calibration.uncertainty
-    says = ["<p>The motions show every direction of the calibration: offset, orientation and scale.</p>"]
-    if not observed.observable:
-        pairs = zip(observed.unobservable, observed.advice, strict=False)
-        items = "".join(f"<li><b>{escape(name)}</b>; cure: {escape(cure)}</li>" for name, cure in pairs)
-        says = [f"<p>The motions leave unseen:</p><ul>{items}</ul>"]
-    if uncertainty is not None:
-        offset = _spreads("offset along", uncertainty.translation_std_mm, " mm")
-        turn = _spreads("turn about", uncertainty.rotation_std_deg, "°")
-        says += [
-            f'<div class="columns">{offset}{turn}</div>',
-            '<p class="soft">One standard deviation, axes of the gripper frame; scale '
-            f"±{significant(uncertainty.scale_std_percent)}\u00a0%.</p>",
-        ]
-    return f'<section id="uncertainty"><h2>What the images can tell</h2>{"".join(says)}</section>'
-
-
-def _spreads(name: str, std: Sequence[float], unit: str) -> str:
-    """A bar each axis, as wide as ± one standard deviation against the largest of them."""
-    rows = []
-    for axis, value in zip("xyz", std, strict=True):
-        half = 50 * value / (max(std) or 1.0)
-        bar = f'<i style="left:{50 - half:.1f}%;width:{2 * half:.1f}%"></i><b></b>'
-        rows.append(
-            f'<tr><th>{name} {axis}</th><td><div class="track centred">{bar}</div></td>'
-            f"<td>±{significant(value)}{unit}</td></tr>"
-        )
-    return f'<table class="spread"><tbody>{"".join(rows)}</tbody></table>'
-
-
 def _before_after(capture: Capture, result: "RunResult", base_from_camera: Transforms) -> str:
     grippers, lens = capture.base_from_gripper, lens_of(result)
     before, rows = result.reconstruction.recon_from_camera, result.reconstruction.image_index
@@ -186,8 +180,8 @@ def _before_after(capture: Capture, result: "RunResult", base_from_camera: Trans
     )
 
 
-def _details(result: "RunResult") -> str:
-    calibration, timings = result.calibration, result.calibration.timings_s
+def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = None) -> str:
+    timings = calibration.timings_s
     blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
     blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
     if (lens := calibration.intrinsics) is not None:
@@ -197,9 +191,9 @@ def _details(result: "RunResult") -> str:
             "principal point": f"{lens.cx:.2f}, {lens.cy:.2f} px",
             "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
         }
-    if result.scene is not None:
-        blocks["Map"] = result.scene.history
-    for stage, options in _options(result.out).items():
+    if scene is not None:
+        blocks["Map"] = scene.history
+    for stage, options in _options(out).items():
         blocks[f"Options: {stage}"] = {name: str(value) for name, value in options.items()}
     packages = ("numpy", "scipy", "torch", "pycolmap")
     blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}

@@ -13,11 +13,13 @@ from numpy import ndarray
 
 from jcr.calibrate.file import Image
 from jcr.calibrate.hand_eye import solve_hand_eye
+from jcr.calibrate.projection import parameters, project
 from jcr.capture.images import read_image
-from jcr.geometry import rotation_between_deg
+from jcr.geometry import apply, inverse, rotation_between_deg
 from jcr.records import Capture, HandEye, Intrinsics
 from jcr.report.figures import picture_url
-from jcr.report.markup import filled, significant
+from jcr.report.markup import filled
+from jcr.rounding import significant
 
 if TYPE_CHECKING:
     from jcr.pipeline import RunResult
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 THUMBNAIL = 320
 """Pixels across; half of it for more than MANY images."""
 MANY = 40
+MARKS, MAGNIFIED = 120, 20
+"""Features drawn over each image, and how many times their reprojection errors are drawn longer."""
 
 
 def lens_of(result: "RunResult") -> Intrinsics:
@@ -51,7 +55,7 @@ def image_numbers(image: Image) -> str:
 def images_section(capture: Capture, result: "RunResult") -> str:
     """Every image with its numbers, and why it was rejected if it was."""
     images = result.calibration.images
-    cards = []
+    cards, marks = [], _reprojections(result)
     pictures = zip(images, shown_names(images), thumbnails(capture, lens_of(result)), strict=True)
     for k, (image, name, picture) in enumerate(pictures):
         numbers = image_numbers(image)
@@ -63,23 +67,55 @@ def images_section(capture: Capture, result: "RunResult") -> str:
         if numbers:
             lines.append(f'<button data-through="{k}">look from here</button>')
         cards.append(
-            f'<figure class="{"used" if image.used else "rejected"}"><img id="image-{k}" src="{picture}" '
-            f'alt="{escape(image.image)}"><figcaption>{"".join(lines)}</figcaption></figure>'
+            f'<figure class="{"used" if image.used else "rejected"}"><div class="shot"><img id="image-{k}" '
+            f'src="{picture}" alt="{escape(image.image)}">{marks.get(k, "")}</div>'
+            f"<figcaption>{''.join(lines)}</figcaption></figure>"
         )
     rejected = sum(not image.used for image in images)
     say = f"{rejected} of {len(images)} were rejected." if rejected else f"All {len(images)} were used."
-    return filled("images.html", say=say, cards="".join(cards))
+    about = (
+        "With each: how far its gripper pose is from where the calibration puts it (mm, degrees), and the median "
+        "distance between its features and their 3D points (pixels). Marks are features that other images show too, "
+        f"each with the way to where its 3D point falls, {MAGNIFIED} times as long."
+    )
+    return filled("images.html", say=say, about=about, cards="".join(cards))
 
 
-def thumbnails(capture: Capture, lens: Intrinsics) -> list[str]:
-    """Every image as a small JPEG, straightened by the lens so that it covers what the 3D view shows."""
+def _reprojections(result: "RunResult") -> dict[int, str]:
+    """Per image of the capture a drawing over its picture: some features, and where their 3D points fall."""
+    reconstruction, lens = result.reconstruction, lens_of(result)
+    tracks, own_lens = reconstruction.tracks, parameters(reconstruction.intrinsics)
+    drawings, draw = {}, np.random.default_rng(0)
+    for k, row in enumerate(reconstruction.image_index):
+        seen = np.flatnonzero(tracks.image == k)
+        if len(seen) == 0:
+            continue
+        seen = draw.permutation(seen)[:MARKS]
+        x_in_camera = apply(
+            inverse(reconstruction.recon_from_camera[k]), tracks.points_in_recon[tracks.point[seen]]
+        )
+        miss = project(x_in_camera, own_lens) - tracks.x_px[seen]
+        distortion = np.array(lens.distortion)
+        at = cv2.undistortPoints(tracks.x_px[seen, None], lens.matrix, distortion, P=lens.matrix)[:, 0] + 0.5
+        ways = "".join(
+            f"M{x:.0f} {y:.0f}l{dx:.0f} {dy:.0f}"
+            for (x, y), (dx, dy) in zip(at, MAGNIFIED * miss, strict=True)
+        )
+        drawings[int(row)] = (
+            f'<svg class="marks" viewBox="0 0 {lens.width} {lens.height}" aria-hidden="true"><path d="{ways}"/></svg>'
+        )
+    return drawings
+
+
+def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
+    """Every image as a small JPEG; a lens straightens it, so that it covers what the 3D view shows."""
     width = THUMBNAIL if len(capture) <= MANY else THUMBNAIL // 2
 
     def thumbnail(name: str) -> str:
         pixels = read_image(capture.folder / name)
         zoom = width / pixels.shape[1]
         pixels = cv2.resize(pixels, (width, round(zoom * pixels.shape[0])), interpolation=cv2.INTER_AREA)
-        if any(lens.distortion):
+        if lens is not None and any(lens.distortion):
             matrix = lens.matrix
             # Pixel centres are whole numbers: half a pixel must not be scaled away.
             matrix[:2, 2] = zoom * (matrix[:2, 2] + 0.5) - 0.5

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import apply, inverse
-from jcr.report.figures import label_colors, picture_url, rendered_points, slice_figure
+from jcr.geometry import apply, apply_similarity, inverse
+from jcr.report.figures import TRACK_COLOR, label_colors, picture_url, rendered_points, slice_figure
 from jcr.report.images import THUMBNAIL, shown_names
 from jcr.report.markup import filled
 from jcr.report.samples import CLEARANCE, SurfacePoints, point_size, slices
@@ -18,6 +18,8 @@ from jcr.represent.scene import SceneMap
 if TYPE_CHECKING:
     from jcr.pipeline import RunResult
 
+WIDE = 480
+"""Pixels across of a picture that stands alone."""
 PAIRS = 4
 """Images that are shown beside the map."""
 
@@ -36,8 +38,36 @@ def map_section(
         size=" × ".join(f"{side:.2f}" for side in scene.box[1] - scene.box[0]),
         unknown=f"{100 * surface.unknown_share:.0f}",
         pairs=_pairs(result, scene, surface, base_from_camera),
+        overlaid=_overlaid(result, base_from_camera),
         slices=slice_figure(f"Occupancy at z = {level.at:.3f} m, {above}", level, upright.at, "upright slice")
         + slice_figure(f"Occupancy at y = {upright.at:.3f} m", upright, level.at, "level slice"),
+    )
+
+
+def _overlaid(result: "RunResult", base_from_camera: Float[ndarray, "m 4 4"]) -> str:
+    """The dense cloud with the tracked features in red (paper, section V), as two cameras see it."""
+    reconstruction, hand_eye, cloud = result.reconstruction, result.hand_eye, result.cloud
+    tracked = reconstruction.tracks.points_in_recon
+    if cloud is None or len(tracked) == 0:
+        return ""
+    tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
+    lens, side = reconstruction.pointmap_intrinsics, point_size(cloud.points_in_base)
+    red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
+    names = shown_names(result.calibration.images)
+    figures = []
+    for k in np.unique(np.flatnonzero(hand_eye.inliers)[[0, -1]]):
+        camera_from_base = inverse(base_from_camera[k])
+        pixels = rendered_points(apply(camera_from_base, cloud.points_in_base), cloud.color, side, lens, WIDE)
+        over = rendered_points(apply(camera_from_base, tracked), red, side, lens, WIDE)
+        pixels = np.where(over[..., 3:] > 0, over, pixels)
+        name = escape(names[int(reconstruction.image_index[k])])
+        figures.append(
+            f'<figure><div class="pair"><img src="{picture_url(pixels, "WEBP")}" alt="{name}"></div>'
+            f"<figcaption>from the place of {name}</figcaption></figure>"
+        )
+    return (
+        "<h3>Points as measured, and the tracked features in red</h3>"
+        f'<div class="pairs">{"".join(figures)}</div>'
     )
 
 

@@ -1,9 +1,7 @@
-"""Filling the page's templates, and numbers as people read them."""
+"""Filling the page's templates."""
 
 from importlib import resources
 from string import Template
-
-import numpy as np
 
 PAGE = resources.files("jcr.report") / "page"
 
@@ -11,13 +9,3 @@ PAGE = resources.files("jcr.report") / "page"
 def filled(template: str, **parts: str) -> str:
     """The template with its placeholders replaced by markup; text from files must come escaped."""
     return Template((PAGE / template).read_text()).substitute(parts)
-
-
-def significant(value: float, digits: int = 2) -> str:
-    """The number with so many significant digits, never in powers of ten; at most six decimals."""
-    if not np.isfinite(value):
-        return "unknown"
-    if abs(value) < 0.5e-6:
-        return "0"
-    decimals = digits - 1 - int(np.floor(np.log10(abs(value))))
-    return f"{value:.{min(max(decimals, 0), 6)}f}"

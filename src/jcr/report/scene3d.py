@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.geometry import apply_similarity
 from jcr.records import Capture
-from jcr.report.figures import label_colors
+from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.report.images import image_numbers, lens_of, shown_names
 from jcr.report.markup import filled
 from jcr.report.samples import SurfacePoints, point_size
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 POINTS = 60_000
 """Of each layer, at most."""
-TRACK_COLOR = (229, 40, 40)
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,20 @@ def scene_section(
     data = {
         **_packed_layers([*layers, tracks], base_from_camera[:, :3, 3]),
         "views": views,
+        "next": [
+            {
+                "gripper": pose.base_from_gripper[:3],
+                "camera": (np.array(pose.base_from_gripper) @ result.hand_eye.gripper_from_camera)[
+                    :3
+                ].tolist(),
+            }
+            for pose in result.calibration.next_poses
+        ],
         "lens": asdict(lens_of(result)),
     }
     checks = [("cameras", "cameras", True), ("grippers", "grippers", True), ("grid", "base and grid", True)]
+    if result.calibration.next_poses:
+        checks.append(("next", "poses to add (green)", False))
     checks.append(("tracks", "tracked features (red)", not layers))
     return filled(
         "scene3d.html",

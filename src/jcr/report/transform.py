@@ -5,8 +5,9 @@ from html import escape
 
 from jcr.export.ros import CHILD, PARENT, static_transform_publisher, urdf_origin
 from jcr.records import HandEye
-from jcr.report.markup import filled, significant
+from jcr.report.markup import filled
 from jcr.report.notations import Notation, matrix_json, notations
+from jcr.rounding import significant
 
 
 def transform_section(hand_eye: HandEye) -> str:
@@ -16,12 +17,12 @@ def transform_section(hand_eye: HandEye) -> str:
     return filled(
         "transform.html",
         matrix="\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in x),
-        copy_matrix=_copy_button(matrix_json(x), "the matrix"),
+        copy_matrix=copy_button(matrix_json(x), "the matrix"),
         notations="\n".join(_notation(part) for part in notations(x, hand_eye.covariance)),
         ros=escape(ros),
-        copy_ros=_copy_button(ros, "the ROS 2 command"),
+        copy_ros=copy_button(ros, "the ROS 2 command"),
         urdf=escape(urdf),
-        copy_urdf=_copy_button(urdf, "the URDF origin"),
+        copy_urdf=copy_button(urdf, "the URDF origin"),
         parent=PARENT,
         child=CHILD,
         doubt="" if hand_eye.converged else '<p class="why">Not to be trusted: see above.</p>',
@@ -40,12 +41,13 @@ def _notation(part: Notation) -> str:
         )
     title = part.name + (f" ({part.unit})" if part.unit else "")
     note = f'<p class="note">{escape(part.note)}</p>' if part.note else ""
-    button = _copy_button(json.dumps(part.value.round(9).tolist()), title)
+    button = copy_button(json.dumps(part.value.round(9).tolist()), title)
     return (
         f'<div class="notation"><header><h3>{title}</h3>{button}</header>'
         f"<table>{''.join(rows)}</table>{note}</div>"
     )
 
 
-def _copy_button(text: str, what: str) -> str:
+def copy_button(text: str, what: str) -> str:
+    """A button that copies the text; `what` says to a screen reader what that is."""
     return f'<button data-copy="{escape(text)}" aria-label="copy {escape(what)}">copy</button>'

@@ -36,6 +36,7 @@
     cameras: document.getElementById("scene-cameras").checked,
     grippers: document.getElementById("scene-grippers").checked,
     grid: document.getElementById("scene-grid").checked,
+    next: document.getElementById("scene-next")?.checked,
   });
 
   // Right, down and forward of the eye in the base frame, its centre, and its lens in canvas pixels.
@@ -132,8 +133,6 @@
   }
 
   function drawViews(view, show, colors) {
-    const { fx, fy, cx, cy, width, height } = scene.lens;
-    const reach = 0.05;
     scene.views.forEach((image, k) => {
       if (k === state.through) return;
       const color = k === picked ? colors.accent : image.used ? colors.camera : colors.bad;
@@ -142,14 +141,23 @@
       if (!image.camera) return;
       const center = column(image.camera, 3);
       if (show.grippers && show.cameras) line(view, [grip, center], colors.faint, 1);
-      if (!show.cameras) return;
-      const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) =>
-        apply(image.camera, [(reach * (u - 0.5 - cx)) / fx, (reach * (v - 0.5 - cy)) / fy, reach]));
-      const thick = k === picked ? 3 : 1.5;
-      corners.forEach((corner, i) => {
-        line(view, [center, corner], color, thick);
-        line(view, [corner, corners[(i + 1) % 4]], color, thick);
-      });
+      if (show.cameras) frustum(view, image.camera, color, k === picked ? 3 : 1.5);
+    });
+    if (show.next) scene.next.forEach(({ gripper, camera }) => {
+      triad(view, gripper, 0.03, 2.5);
+      line(view, [column(gripper, 3), column(camera, 3)], colors.next, 1);
+      frustum(view, camera, colors.next, 2.5);
+    });
+  }
+
+  function frustum(view, camera, color, thick) {
+    const { fx, fy, cx, cy, width, height } = scene.lens;
+    const [center, reach] = [column(camera, 3), 0.05];
+    const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) =>
+      apply(camera, [(reach * (u - 0.5 - cx)) / fx, (reach * (v - 0.5 - cy)) / fy, reach]));
+    corners.forEach((corner, i) => {
+      line(view, [center, corner], color, thick);
+      line(view, [corner, corners[(i + 1) % 4]], color, thick);
     });
   }
 
@@ -174,7 +182,7 @@
     const show = shown();
     const view = eye();
     const style = getComputedStyle(canvas);
-    const colors = Object.fromEntries(["ink", "faint", "camera", "accent", "bad"].map((name) =>
+    const colors = Object.fromEntries(["ink", "faint", "camera", "accent", "bad", "next"].map((name) =>
       [name, style.getPropertyValue(`--scene-${name}`).trim()]));
     context.clearRect(0, 0, canvas.width, canvas.height);
     const picture = context.createImageData(canvas.width, canvas.height);

@@ -1,0 +1,88 @@
+"""`jcr view`: a run in 3D, in the browser."""
+
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
+
+    The page is served to this machine alone, until Ctrl-C. Needs viser: pip install 'jcr[view]'.
+
+    examples:
+      jcr view out/table
+      jcr view out/table --urdf arm.urdf --tip tool0
+      jcr view out/table --urdf arm.urdf --joints joints.csv --port 9000
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    urdf: Path | None = None
+    """The robot, shown at the pose of each image; its root link is the base of the gripper poses."""
+    joints: Path | None = None
+    """Its joint values (rad, m), a row an image: .csv or .npy. Left out, values are found that put TIP at each gripper
+    pose: one of the ways the robot may have stood."""
+    tip: str | None = None
+    """The URDF's link whose poses the capture has."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Beyond 127.0.0.1 whoever reaches it sees the run: the page has no password."""
+    port: int = 8080
+    """Port to listen on; 0 takes a free one."""
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Serve the page until Ctrl-C."""
+    from jcr.errors import InputError
+    from jcr.progress import progress_bars
+
+    try:
+        from jcr.view.server import is_loopback, open_server
+        from jcr.view.viewer import Viewer
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        raise InputError("jcr view: needs viser; pip install 'jcr[view]'") from None
+    from jcr.view.robot import read_joints, read_urdf, solve_joints
+    from jcr.view.run import read_run
+
+    if arguments.urdf is None and (arguments.joints or arguments.tip):
+        raise InputError("--joints and --tip tell how a robot stands; name its --urdf too")
+    if arguments.urdf is not None and (arguments.joints is None) == (arguments.tip is None):
+        raise InputError(
+            "--urdf: give either --joints FILE, or --tip LINK, the link whose poses the capture has"
+        )
+    run = read_run(arguments.out)
+    robot = values = None
+    if arguments.urdf is not None:
+        robot = read_urdf(arguments.urdf)
+        if arguments.joints is not None:
+            values = read_joints(arguments.joints, robot, len(run.calibration.images))[run.gripper_image]
+        elif arguments.tip is not None:
+            values = solve_joints(robot, arguments.tip, run.base_from_gripper)
+    server = open_server(arguments.host, arguments.port, f"jcr · {run.name}")
+    try:
+        with progress_bars(arguments.quiet) as progress:
+            Viewer(server, run, robot, values, progress)
+        address = f"http://{arguments.host}:{server.get_port()}"
+        if not is_loopback(arguments.host):
+            sys.stderr.write(
+                f"warning: whoever reaches {address} sees this run and may move what is shown: there is no password "
+                "and no encryption; from another machine rather use ssh -L "
+                f"{server.get_port()}:127.0.0.1:{server.get_port()} and the default --host\n"
+            )
+        sys.stdout.write(f"{address} (Ctrl-C ends it)\n")
+        sys.stdout.flush()
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        server.stop()
+    return 0

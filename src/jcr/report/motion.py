@@ -1,0 +1,118 @@
+"""The section on what the motions show of the calibration, and which gripper poses would show more."""
+
+import json
+from collections.abc import Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.calibrate.file import CalibrationFile, Proposal
+from jcr.calibrate.observability import WEAK, excitation
+from jcr.geometry import inverse, rotation_angle
+from jcr.records import Capture
+from jcr.report.markup import filled
+from jcr.report.transform import copy_button
+from jcr.rounding import significant
+
+if TYPE_CHECKING:
+    from jcr.pipeline import RunResult
+
+PARTS = ("offset x", "offset y", "offset z", "turn x", "turn y", "turn z", "scale")
+"""Of a direction, in records.COVARIANCE_ORDER."""
+NAMED = 0.4
+"""Share of a unit direction from which a part is named."""
+GENERAL = 0.4
+"""Excitation that general motions reach: the full length of a bar."""
+
+
+def motion_section(capture: Capture, result: "RunResult") -> str:
+    """Excitation of the seven directions, standard deviations of their parts, and the poses to add."""
+    calibration = result.calibration
+    observed, uncertainty = calibration.observability, calibration.uncertainty
+    says = "<p>The motions show every direction of the calibration: offset, orientation and scale.</p>"
+    if not observed.observable:
+        pairs = zip(observed.unobservable, observed.advice, strict=False)
+        items = "".join(f"<li><b>{escape(name)}</b>; cure: {escape(cure)}</li>" for name, cure in pairs)
+        says = f"<p>The motions leave unseen:</p><ul>{items}</ul>"
+    spreads = ""
+    if uncertainty is not None:
+        offset = _spreads("offset along", uncertainty.translation_std_mm, " mm")
+        turn = _spreads("turn about", uncertainty.rotation_std_deg, "°")
+        spreads = (
+            f'<h3>What that leaves uncertain</h3><div class="columns">{offset}{turn}</div>'
+            '<p class="soft">One standard deviation, axes of the gripper frame; scale '
+            f"±{significant(uncertainty.scale_std_percent)}\u00a0%.</p>"
+        )
+    used = capture.base_from_gripper[result.reconstruction.image_index[result.hand_eye.inliers]]
+    bars = _excitation_bars(used, result.hand_eye.gripper_from_camera) if len(used) > 1 else ""
+    return filled(
+        "motion.html", says=says, bars=bars, spreads=spreads, next_poses=_next_poses(capture, calibration)
+    )
+
+
+def _excitation_bars(
+    base_from_gripper: Float[ndarray, "n 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
+) -> str:
+    """A bar each principal direction, least seen first, with a tick at what counts as unseen."""
+    found = excitation(base_from_gripper, gripper_from_camera)
+    tick, rows = 100 * WEAK / GENERAL, []
+    for value, direction in zip(found.value, np.abs(found.direction), strict=True):
+        parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
+        name = ", ".join(parts) or PARTS[int(direction.argmax())]
+        kind = "used" if value >= WEAK else "rejected"
+        bar = f'<i style="width:{min(100 * value / GENERAL, 100):.1f}%"></i><b style="left:{tick:.1f}%"></b>'
+        rows.append(
+            f'<tr class="{kind}"><th>{name}</th><td><div class="track">{bar}</div></td>'
+            f"<td>{significant(float(value))}</td></tr>"
+        )
+    return (
+        '<h3>How far the motions show each direction</h3><p class="soft">By how many metres one metre along it '
+        "moves the gripper positions that the calibration predicts (0.3 m for a radian); least seen first. General "
+        'motions reach about 0.4; left of the tick a direction counts as unseen.</p><table class="spread"><tbody>'
+        f"{''.join(rows)}</tbody></table>"
+    )
+
+
+def _spreads(name: str, std: Sequence[float], unit: str) -> str:
+    """A bar each axis, as wide as ± one standard deviation against the largest of them."""
+    rows = []
+    for axis, value in zip("xyz", std, strict=True):
+        half = 50 * value / (max(std) or 1.0)
+        bar = f'<i style="left:{50 - half:.1f}%;width:{2 * half:.1f}%"></i><b></b>'
+        rows.append(
+            f'<tr><th>{name} {axis}</th><td><div class="track centred">{bar}</div></td>'
+            f"<td>±{significant(value)}{unit}</td></tr>"
+        )
+    return f'<table class="spread"><tbody>{"".join(rows)}</tbody></table>'
+
+
+def _next_poses(capture: Capture, calibration: CalibrationFile) -> str:
+    """The proposed gripper poses, what each would leave uncertain, ready to copy."""
+    if not calibration.next_poses:
+        return ""
+    rows = "".join(_next_pose(capture, k, pose) for k, pose in enumerate(calibration.next_poses, start=1))
+    return (
+        '<h3>Poses to add</h3><p class="soft">Gripper poses that would shrink these most, one after the other, in '
+        "reach of those of the capture; look that the arm is free to go there. The 3D view shows them in green.</p>"
+        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>move</th><th>turn</th><th>then offset</th>'
+        f"<th>orientation</th><th>scale</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _next_pose(capture: Capture, number: int, pose: Proposal) -> str:
+    near = capture.base_from_gripper[capture.images.index(pose.like)]
+    motion = inverse(near) @ np.array(pose.base_from_gripper)
+    std = np.array(pose.expected_std)
+    cells = (
+        escape(pose.like),
+        f"{1e3 * np.linalg.norm(motion[:3, 3]):.0f} mm",
+        f"{np.degrees(rotation_angle(motion[:3, :3])):.0f}°",
+        f"±{significant(1e3 * float(std[:3].max()))} mm",
+        f"±{significant(float(np.degrees(std[3:6].max())))}°",
+        f"±{significant(100 * float(std[6]))}\u00a0%",
+        copy_button(json.dumps(np.array(pose.base_from_gripper).round(6).tolist()), f"pose {number}"),
+    )
+    return f"<tr><th>{number}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"

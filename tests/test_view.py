@@ -1,0 +1,258 @@
+"""The viewer: what its controls answer on the bundled capture, and that a browser shows it."""
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chromium import Chromium
+from jcr.errors import InputError
+from jcr.simulate.truth import Truth, read_truth
+from jcr.view import layers
+from jcr.view.layers import level_slice
+from jcr.view.robot import read_joints, read_urdf, solve_joints
+from jcr.view.run import read_run
+from jcr.view.server import open_server
+from jcr.view.viewer import CHOSEN, CLOUD, COLLIDES, FREE, REJECTED, Viewer
+
+AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+
+
+@pytest.fixture(scope="module")
+def truth(tabletop: Path) -> Truth:
+    return read_truth(tabletop)
+
+
+@pytest.fixture(scope="module")
+def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A URDF that slides along x, y, z and then turns about z, y, x: it can bring its tool anywhere."""
+    parts, parent = ['<robot name="gantry"><link name="floor"/>'], "floor"
+    for kind, axes, reach in (("prismatic", "xyz", 2.0), ("revolute", "zyx", 3.1)):
+        for axis in axes:
+            link = f"{kind}_{axis}"
+            parts.append(
+                f'<link name="{link}"><visual><geometry><box size="0.04 0.05 0.06"/></geometry></visual></link>'
+                f'<joint name="to_{link}" type="{kind}"><parent link="{parent}"/><child link="{link}"/>'
+                f'<axis xyz="{AXES[axis]}"/><limit lower="-{reach}" upper="{reach}" effort="1" velocity="1"/></joint>'
+            )
+            parent = link
+    path = tmp_path_factory.mktemp("robot") / "gantry.urdf"
+    path.write_text("".join([*parts, "</robot>"]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def viewer(done: Path, gantry: Path) -> Iterator[Viewer]:
+    run, robot = read_run(done), read_urdf(gantry)
+    values = solve_joints(robot, "revolute_x", run.base_from_gripper)
+    server = open_server("127.0.0.1", 0, "test")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layers, "MAP_POINTS", 15_000)  # drawn without a graphics card
+        yield Viewer(server, run, robot, values)
+    server.stop()
+
+
+def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: Viewer):
+    counts = []
+    for threshold in (0.02, 0.5, 0.98):
+        viewer.threshold.value = threshold
+        viewer.show_points()
+        occupancy = viewer.run.scene.query(viewer.points).occupancy
+        assert (occupancy >= threshold).all()
+        counts.append(len(viewer.points))
+    assert counts[0] > counts[1] > counts[2] > 1000
+    viewer.shown.value = CLOUD
+    viewer.show_points()
+    assert len(viewer.points) == len(viewer.run.cloud.points_in_base)
+    viewer.shown.value, viewer.threshold.value = "map", 0.5
+    viewer.show_points()
+
+
+def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: Viewer, truth: Truth):
+    book = next(thing for thing in truth.objects if thing.name == "book")
+    top = book.base_from_box[2, 3] + book.box_size[2] / 2
+
+    def color(x: float, y: float, z: float) -> tuple[int, ...]:
+        viewer.gizmo.position = (x, y, z)
+        viewer.move_sphere()
+        return tuple(viewer.ball.color)
+
+    viewer.radius.value = 30.0
+    over = (*book.base_from_box[:2, 3], top + 0.08)
+    assert color(*over) == FREE and "free" in viewer.answer.content
+    assert color(*book.base_from_box[:2, 3], top - 0.01) == COLLIDES and "collides" in viewer.answer.content
+    viewer.radius.value = 150.0
+    assert color(*over) == COLLIDES
+    viewer.radius.value = 30.0
+    under = (*over[:2], viewer.run.scene.box[0, 2] + 1e-3)
+    assert color(*under) == COLLIDES
+    far = (*over[:2], 5.0)
+    assert color(*far) == COLLIDES and "outside of the workspace" in viewer.answer.content
+    viewer.unknown.value = "free"
+    assert color(*far) == FREE
+    viewer.unknown.value = "occupied"
+    color(*over)
+
+
+def test_click_finds_the_first_point_and_says_what_is_there(viewer: Viewer, truth: Truth):
+    book = next(thing for thing in truth.objects if thing.name == "book")
+    x, y, z = book.base_from_box[:3, 3]
+    viewer.shown.value = CLOUD
+    viewer.show_points()
+    said = viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, -1.0]))
+    found = np.asarray(viewer._mark.position)
+    assert abs(found[2] - (z + book.box_size[2] / 2)) < 0.01
+    at = viewer.run.scene.query(found[None].astype(float))
+    assert f"| occupancy | {at.occupancy[0]:.2f} |" in said and "images/" in said and "margin" in said
+    assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
+    viewer.shown.value = "map"
+    viewer.show_points()
+
+
+def test_slice_has_the_base_frames_y_upwards(viewer: Viewer, truth: Truth):
+    can = next(thing for thing in truth.objects if thing.name == "can")
+    scene, (x, y, z) = viewer.run.scene, can.base_from_box[:3, 3]
+    pixels = level_slice(scene, z, "distance", "occupied")
+    low, high = scene.box[:, :2]
+    column, row = ([x, high[1]] - np.array([low[0], y])) / (high - low) * pixels.shape[1::-1]
+    assert pixels[int(row), int(column)].tolist() == [200, 30, 30, 230]
+    mirrored = pixels[::-1][int(row), int(column)]
+    assert scene.query(np.array([[x, low[1] + high[1] - y, z]]), "occupied").distance[0] > 0
+    assert mirrored.tolist() != [200, 30, 30, 230]
+
+
+def test_robot_and_chosen_camera_follow_the_image(viewer: Viewer):
+    for row in (7, 2):
+        viewer.image.value = row
+        viewer.choose_image()
+        assert [tuple(f.color) == CHOSEN for f in viewer.frusta] == [k == row for k in range(12)]
+        stands = viewer.robot._urdf.get_transform("revolute_x", "floor")
+        np.testing.assert_allclose(stands, viewer.run.base_from_gripper[row], atol=3e-3)
+        assert f"images/{row:02d}.jpg" in viewer._about_image.content
+
+
+def test_joint_values_are_read_and_doubted(gantry: Path, tmp_path: Path):
+    robot = read_urdf(gantry)
+    values = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    names = ",".join(robot.actuated_joint_names)
+    np.savetxt(tmp_path / "joints.csv", values, delimiter=",", header=names, comments="", fmt="%.12f")
+    np.testing.assert_allclose(read_joints(tmp_path / "joints.csv", robot, 5), values, atol=1e-9)
+    with pytest.raises(InputError, match=r"\(4, 6\).*a row an image"):
+        read_joints(tmp_path / "joints.csv", robot, 4)
+    with pytest.raises(InputError, match="no such link"):
+        solve_joints(robot, "hand", np.eye(4)[None])
+    away = np.eye(4)
+    away[0, 3] = 2.5
+    with pytest.raises(InputError, match="gripper pose 0 .* 500 mm off"):
+        solve_joints(robot, "revolute_x", away[None])
+
+
+def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: Path, viewer: Viewer):
+    for name in ("calibration.json", "reconstruction.npz"):
+        shutil.copy(done / name, tmp_path / name)
+    run = read_run(tmp_path)
+    assert run.scene is None and len(run.notes) == 2 and "jcr map" in run.notes[1]
+    near = np.linalg.norm(
+        np.median(run.cloud.points_in_base, 0) - np.median(viewer.run.cloud.points_in_base, 0)
+    )
+    assert near < 0.05
+    moved = run.base_from_gripper[:, :3, 3] - viewer.run.base_from_gripper[:, :3, 3]
+    assert np.abs(moved).max() < 2e-3
+    server = open_server("127.0.0.1", 0, "bare")
+    try:
+        bare = Viewer(server, run)
+        assert len(bare.points) and len(bare.frusta) == 12
+        assert "from images/" in bare.click(run.base_from_camera[0, :3, 3], run.base_from_camera[0, :3, 2])
+        assert tuple(bare.frusta[3].color) != REJECTED
+    finally:
+        server.stop()
+
+
+def test_port_and_host_are_taken_or_refused(done: Path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 .*--port"):
+            open_server("127.0.0.1", port, "")
+    with pytest.raises(InputError, match="192.0.2.1"):
+        open_server("192.0.2.1", 0, "")
+    with pytest.raises(InputError, match="70000"):
+        open_server("127.0.0.1", 70000, "")
+
+
+def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
+    command = [sys.executable, "-m", "jcr", "view", str(done), "--port", "0", "--quiet"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None
+        address = served.stdout.readline().split()[0]
+        host, port = address.removeprefix("http://").split(":")
+        assert host == "127.0.0.1"
+        with socket.create_connection((host, int(port)), timeout=10) as asked:
+            asked.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+            assert b"200" in asked.recv(100)
+        outside = [ip for *_, (ip, *_) in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+        for ip in outside:
+            if not ip.startswith("127."):
+                with pytest.raises(OSError):
+                    socket.create_connection((ip, int(port)), timeout=2).close()
+        served.send_signal(signal.SIGINT)
+        out, err = served.communicate(timeout=30)
+        assert served.returncode == 0 and out == "" and err == ""
+
+
+def test_in_a_browser(viewer: Viewer, tmp_path: Path):
+    gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    chromium = Chromium(tmp_path, *gpu)
+    try:
+        chromium.open(f"http://127.0.0.1:{viewer.server.get_port()}", 800, 400)
+        deadline = time.monotonic() + 120
+        picture = chromium.picture("canvas")
+        while len(np.unique(picture.reshape(-1, 3), axis=0)) < 3000:
+            assert time.monotonic() < deadline, "the scene does not appear"
+            time.sleep(1)
+            picture = chromium.picture("canvas")
+        assert "occupancy over" in chromium.js("document.body.innerText")
+
+        viewer.clicked.content = "not yet"
+        x, y = chromium.center("canvas")
+        chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        for kind in ("mousePressed", "mouseReleased"):
+            chromium.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        while viewer.clicked.content == "not yet":
+            assert time.monotonic() < deadline, "the click does not arrive"
+            time.sleep(0.2)
+        assert "occupancy" in viewer.clicked.content
+
+        def red(picture: np.ndarray) -> int:
+            r, g, b = np.moveaxis(picture.astype(int), -1, 0)
+            return int(((r > 150) & (r - g > 80) & (r - b > 80)).sum())  # the ball is translucent
+
+        viewer.shown.value = "none"
+        viewer.show_points()
+        viewer.radius.value = 150.0
+        viewer.move_sphere()
+        before = red(picture)
+        while red(chromium.picture("canvas")) < before + 500:
+            assert time.monotonic() < deadline, "the sphere does not turn red"
+            time.sleep(1)
+        bad = [
+            event["params"]
+            for event in chromium.events
+            if event["method"] == "Runtime.exceptionThrown"
+            or event["params"].get("type") == "error"
+            or event["params"].get("entry", {}).get("level") == "error"
+        ]
+        assert not bad
+        asked = [e["params"]["request"]["url"] for e in chromium.events if e["method"].endswith("WillBeSent")]
+        assert asked and all(
+            url.startswith((f"http://127.0.0.1:{viewer.server.get_port()}", "data:", "blob:"))
+            for url in asked
+        )
+    finally:
+        chromium.close()
