@@ -235,6 +235,17 @@ def test_sections_without_a_record_are_left_out(run):
     assert "predicted colour" not in bare and "points as measured" not in bare
 
 
+def test_cameras_alone_are_reported_without_tracks_points_or_map(run):
+    capture, result = run
+    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
+    hand_eye = calibrate(capture, reconstruction)
+    content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
+    page = report_html(capture, RunResult(result.out, content, hand_eye, reconstruction))
+    assert "back end marker" in Elements(page).text and 'class="marks"' not in page
+    assert "features refined" not in page
+
+
 def test_untrusted_calibration_is_not_recommended(run):
     capture, result = run
     still = capture.base_from_gripper.copy()

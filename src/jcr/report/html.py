@@ -111,6 +111,8 @@ def _verdict(calibration: CalibrationFile) -> str:
     elif not calibration.observability.observable:
         # An error along a direction that no motion shows changes no prediction.
         believe = f"Its held-out error of {miss} is no comfort: what no motion shows, no image can miss."
+    elif not calibration.converged:
+        believe = f"Its held-out error of {miss} is no comfort: what is wrong with all images, none of them can miss."
     else:
         believe = (
             f"Held-out error, the number to believe: {miss} ({escape(held_out.how)}). The residuals of a fit "
