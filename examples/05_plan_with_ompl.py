@@ -21,10 +21,10 @@ from jcr.represent.robot import RobotSpheres, load_robot
 from jcr.represent.scene import SceneMap
 
 ARM = Path(__file__).parent / "arm.urdf"
-START = np.array([-0.340, 0.719, -0.618, 1.470, 0.0, 1.17])
-"""Joint angles (rad): the gripper points down at (0.40, -0.17), 9 cm above the table."""
-GOAL = np.array([0.0, 0.563, -0.343, 1.351, 0.0, 1.17])
-"""At (0.38, 0.00). The carton stands between them."""
+START = np.array([-0.34, 0.80, -0.66, 1.04, 0.08, 1.10])
+"""Joint angles (rad): the gripper points down at (0.46, -0.19), 7 cm above the table."""
+GOAL = np.array([0.13, 0.85, -0.71, 1.47, 0.03, 1.10])
+"""At (0.45, 0.07), 4 cm above it. The carton stands between them."""
 STEP_RAD = 0.01
 """Between the joint values that are checked along a motion; it moves the gripper by at most 8 mm."""
 

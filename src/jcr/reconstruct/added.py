@@ -74,6 +74,7 @@ def extend(
         (middle + REACH * (planes - middle))[taken],
         device,
         report,
+        changing=True,
     )
     points, confidence = points[-new:], confidence[-new:]
     for name, of_image in zip(added.images, confidence, strict=True):

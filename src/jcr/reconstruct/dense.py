@@ -20,10 +20,11 @@ def dense_pointmaps(
     planes: Float[ndarray, "m d 3"],
     device: str,
     report: Progress,
+    changing: bool = False,
 ) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
     """Points in the recon frame and their confidence, per pixel of undistorted images.
 
-    `neighbours` and `planes` are what `views` chooses; confidence is the plane sweep's, 0 for no estimate.
+    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times; confidence is the plane sweep's, 0 for no estimate.
     """
     depth, confidence = plane_sweep(
         colors,
@@ -31,7 +32,7 @@ def dense_pointmaps(
         pinhole,
         neighbours,
         planes,
-        PlaneSweepOptions(device=device),
+        PlaneSweepOptions(device=device, changing=changing),
         lambda fraction: report("dense depth", fraction),
     )
     x_in_camera = depth[..., None] * rays(pinhole)

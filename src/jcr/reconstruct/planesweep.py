@@ -54,6 +54,8 @@ class PlaneSweepOptions:
     """Neighbours whose correlations count at a pixel; the worse ones are taken to be occluded."""
     color_sigma: float = 0.1
     """Distance of colours (RGB, each 0 to 1) at which a pixel of the window counts 0.6."""
+    changing: bool = False
+    """The images are of different times: one that sees through a point of another may show what was there before."""
     device: str = "cpu"
     """cpu or cuda."""
 
@@ -119,7 +121,9 @@ def plane_sweep(
             agreed = list(pool.map(agree, range(m), repeat(tolerance)))
             inverse_depth, count, through = (torch.stack(maps) for maps in zip(*agreed, strict=True))
     needed = torch.tensor([1 if len(others) < 3 else 2 for others in neighbours], device=device)
-    believed = (count >= needed[:, None, None]) & (count > 2 * through) & (score >= _LEAST_CORRELATION)
+    believed = (count >= needed[:, None, None]) & (score >= _LEAST_CORRELATION)
+    if not options.changing:
+        believed &= count > 2 * through
     confidence = torch.where(believed, score.clamp(max=1) * count, 0.0)
     return (1 / inverse_depth).double().cpu().numpy(), confidence.double().cpu().numpy()
 
