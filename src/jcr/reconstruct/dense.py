@@ -24,7 +24,8 @@ def dense_pointmaps(
 ) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
     """Points in the recon frame and their confidence, per pixel of undistorted images.
 
-    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times; confidence is the plane sweep's, 0 for no estimate.
+    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times. Confidence
+    is the plane sweep's, 0 for no estimate.
     """
     depth, confidence = plane_sweep(
         colors,
