@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from jcr import auto
+from jcr.calibrate import calibrate
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
@@ -32,7 +33,7 @@ GARBAGE = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere."""
-    monkeypatch.setattr("jcr.calibrate.calibrate.better_reading", lambda gripper, camera: None)
+    monkeypatch.setattr(calibrate, "better_reading", lambda gripper, camera: None)
 
 
 @pytest.fixture

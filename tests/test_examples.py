@@ -1,5 +1,10 @@
 """The examples run, and what they claim holds."""
 
+import json
+import re
+import shutil
+import subprocess
+import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -8,6 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 import yourdfpy
+
+import jcr
+from jcr.geometry import rotation_between_deg
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -53,8 +61,6 @@ def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
     done: Path, true_mesh: trimesh.Trimesh
 ):
     pytest.importorskip("ompl", reason="needs ompl: pip install 'jcr[planning]'")
-    import jcr
-
     planner = example("05_plan_with_ompl")
     planner.util.RNG.setSeed(1)
     planner.util.setLogLevel(planner.util.LogLevel.LOG_ERROR)
@@ -66,3 +72,99 @@ def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
     np.testing.assert_allclose(path[[0, -1]], [planner.START, planner.GOAL], atol=1e-6)
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 2 * planner.STEP_RAD
     assert not truly_touches(path, true_mesh).any()
+
+
+def told(name: str, where: Path, *arguments: object) -> str:
+    """What an example prints, run in a folder that has the project's examples and nothing else."""
+    if not (where / "examples").exists():
+        (where / "examples").symlink_to(EXAMPLES)
+    command = [sys.executable, f"examples/{name}.py", *map(str, arguments)]
+    ran = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False, timeout=200)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def numbers(pattern: str, text: str) -> list[float]:
+    """The groups of the one place that a pattern has in a text."""
+    (found,) = re.findall(pattern, text)
+    return [float(number) for number in ([found] if isinstance(found, str) else found)]
+
+
+def test_quick_start_prints_the_true_camera_and_the_things_on_the_table(done: Path, tmp_path: Path):
+    shutil.copytree(done, tmp_path / "out" / "quick_start")  # its finished stages are taken from there
+    text = told("01_quick_start", tmp_path)
+    rows = re.search(r"\(m\):\n(.*?)\none sigma", text, re.DOTALL)
+    assert rows is not None and "trusted: True" in text
+    found = np.array(re.findall(r"-?\d+\.\d*", rows[1]), float).reshape(4, 4)
+    truth = true_hand_eye()
+    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 5e-4
+    assert rotation_between_deg(found[:3, :3], truth[:3, :3]) < 0.05
+    assert len(re.findall(r"± \d+ mm high", text)) >= 3
+    assert "touches above it: False, at its middle: True" in text
+
+
+def true_hand_eye() -> np.ndarray:
+    """Of the bundled capture."""
+    return np.array(json.loads((EXAMPLES / "tabletop/reference.json").read_text())["gripper_from_camera"])
+
+
+def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: Path):
+    text = told("02_own_camera_poses", tmp_path)
+    sigma_mm, sigma_deg = numbers(r"one sigma: (.+) mm, (.+)°", text)
+    off_mm, off_deg = numbers(r"off the truth: (.+) mm, (.+)°", text)
+    assert off_mm < 3 * np.sqrt(3) * sigma_mm < 10 and off_deg < 3 * np.sqrt(3) * sigma_deg < 1
+    assert "used: 10 of 10" in text
+    assert "without turning: observable False, trusted False" in text
+    assert re.search(r"^- .*translation.*; .*turn", text, re.MULTILINE)
+
+
+def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):
+    pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
+    text = told("03_ros_bag", tmp_path)
+    assert "took 12 frames, intrinsics given" in text and "show everything: True" in text
+    halts = jcr.read_capture(EXAMPLES / "tabletop").base_from_gripper[:, :3, 3]
+    taken = [np.array(row.split(), float) for row in re.findall(r"gripper at \[(.+)\] m", text)]
+    distance = np.linalg.norm(np.array(taken)[:, None] - halts, axis=2)
+    assert distance.min(1).max() < 1.5e-3  # of printed millimetres
+    assert 0 < numbers(r"expected: (.+) mm", text)[0] < 10
+
+
+def test_a_simulated_ur_arm_gives_a_capture_of_its_stops(tmp_path: Path):
+    assert "5 pictures in out/ur_robot" in told("04_ur_robot", tmp_path)
+    taken, table = (jcr.read_capture(path) for path in (tmp_path / "out/ur_robot", EXAMPLES / "tabletop"))
+    np.testing.assert_allclose(taken.base_from_gripper, table.base_from_gripper[:5], atol=1e-9)
+
+
+def test_the_splat_s_cameras_are_where_the_robot_held_them(done: Path, tmp_path: Path):
+    shutil.copytree(done, tmp_path / "run")
+    text = told("06_splat_export", tmp_path, "run")
+    table = jcr.read_capture(EXAMPLES / "tabletop")
+    heights = (table.base_from_gripper @ true_hand_eye())[:, 2, 3]
+    assert "12 cameras of 640 x 480 px" in text
+    lowest_and_highest = numbers(r"hang (.+) to (.+) m above", text)
+    np.testing.assert_allclose(lowest_and_highest, [heights.min(), heights.max()], atol=2e-3)
+    assert (tmp_path / "run/splat/points.ply").is_file()
+
+
+def test_the_api_is_called_as_it_is_shown_and_twice(done: Path, tmp_path: Path):
+    """The subpackage jcr.calibrate must not take the function's name once something of it was imported."""
+    out = shutil.copytree(done, tmp_path / "run")
+    capture = jcr.read_capture(EXAMPLES / "tabletop")
+    first, second = (jcr.calibrate(capture, out) for _ in range(2))
+    assert first.converged
+    np.testing.assert_array_equal(first.hand_eye.gripper_from_camera, second.hand_eye.gripper_from_camera)
+    from jcr.calibrate.file import read_calibration
+
+    assert read_calibration(out).converged and callable(jcr.calibrate)
+    assert callable(jcr.run) and callable(jcr.build_map)
+    assert len(jcr.measure(out).objects) >= 3
+    scene = jcr.load_map(out)
+    middle = jcr.measure(out).objects[0].base_from_box[:3, 3]
+    assert scene.query(middle[None]).occupancy.shape == (1,)
+    reconstruction = first.reconstruction
+    solve = jcr.solve_hand_eye(
+        capture.base_from_gripper[reconstruction.image_index], reconstruction.recon_from_camera
+    )
+    assert solve.observability.observable and not solve.observability.unobservable
+    assert solve.covariance.shape == (7, 7) and solve.inliers.all()
+    np.testing.assert_allclose(solve.gripper_from_camera, true_hand_eye(), atol=2e-3)

@@ -3,11 +3,9 @@
 import json
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +17,6 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.geometry import rotation_log
 from jcr.live import ur
 from jcr.live.asks import Ask, pose_of_numbers
 from jcr.live.camera import Frame, opened
@@ -28,6 +25,7 @@ from jcr.live.folder import LiveFolder
 from jcr.live.line_server import MAX_LINE, Listen, bound, served_poses
 from jcr.live.look import picture
 from jcr.live.typed import typed_poses
+from jcr.simulate.ur import SimulatedUr
 
 RATE = 10
 CLIENT = Path(__file__).parent.parent / "examples" / "pose_client.py"
@@ -224,63 +222,16 @@ def test_silence_ends_the_wait():
         next(served_poses(server, listen))
 
 
-class Robot:
-    """A UR arm that goes from pose to pose and rests 0.8 s of its own time in each."""
-
-    def __init__(self, goals: list[ndarray], length: int, rate: int = 125):
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.port = self.server.getsockname()[1]
-        vectors = [np.concatenate([goal[:3, 3], rotation_log(goal[:3, :3])]) for goal in goals]
-        self.path: list[ndarray] = []
-        for a, b in zip([vectors[0] + 0.05, *vectors], vectors, strict=False):
-            self.path += [*np.linspace(a, b, rate // 4), *[b] * int(0.8 * rate)]
-        self.offset = 588 if length < 1000 else 444
-        self.length, self.rate, self.tick, self.stop = length, rate, 0, False
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
-
-    def run(self) -> None:
-        self.server.settimeout(0.2)
-        while not self.stop:
-            try:
-                connection, _ = self.server.accept()
-            except TimeoutError:
-                continue
-            with connection:
-                try:
-                    while not self.stop:
-                        connection.sendall(self.packet())
-                        time.sleep(0.001)
-                except OSError:
-                    continue
-
-    def packet(self) -> bytes:
-        packet = bytearray(np.random.default_rng(self.tick).bytes(self.length))
-        pose = self.path[min(self.tick, len(self.path) - 1)]
-        struct.pack_into("!id", packet, 0, self.length, self.tick / self.rate)
-        struct.pack_into("!6d", packet, self.offset, *pose)
-        self.tick += 1
-        return bytes(packet)
-
-    def close(self) -> None:
-        self.stop = True
-        self.thread.join(5)
-        self.server.close()
-
-
 @pytest.mark.parametrize("length", [812, 1060, 1220])
 def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
-    goals = poses(tabletop)[:3]
-    robot = Robot(goals, length)
-    try:
+    goals = np.array(poses(tabletop)[:3])
+    with SimulatedUr(goals, length) as robot:
         asks = ur.ur_poses("127.0.0.1", robot.port, lambda text: None)
         for goal in goals:
             ask = next(asks)
             assert np.allclose(ask.base_from_gripper, goal, atol=1e-9)
             ask.answer({"accepted": True})
         assert ask.current is not None and np.allclose(ask.current(), goals[2], atol=1e-9)
-    finally:
-        robot.close()
 
 
 def test_an_arm_that_moves_while_the_picture_is_taken_is_told_to_rest(tmp_path: Path, tabletop: Path):

@@ -47,3 +47,9 @@ def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return getattr(import_module(_ROOMS[name]), name)
     raise AttributeError(f"module 'jcr' has no attribute {name!r}")
+
+
+# Python binds a subpackage to its name in here once, when it is first imported: done now and undone, that name is
+# the function's for good, and `from jcr.calibrate.file import ...` goes on working.
+import_module("jcr.calibrate")
+globals().pop("calibrate", None)
