@@ -17,6 +17,7 @@ LAYERS = [
     {"report"},
     {"auto", "check", "live"},
     {"pipeline"},
+    {"batch", "verify"},
     {"bench", "view"},
     {"cli"},
     {"__main__"},

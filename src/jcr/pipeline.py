@@ -162,14 +162,12 @@ def build_map(
     not the calibration, and every later map of the folder has them.
     """
     capture = read_capture_of(out)
-    state = _read_state(Path(out))
     with _run_folder(Path(out)) as folder:
-        options = RunOptions(
-            ReconstructOptions(**state["options"]["reconstruct"]),
-            CalibrateOptions(**state["options"]["calibrate"]),
-            cloud or CloudOptions(),
-            map or MapOptions(),
-            segment or SegmentOptions(),
+        options = replace(
+            options_of(out),
+            cloud=cloud or CloudOptions(),
+            map=map or MapOptions(),
+            segment=segment or SegmentOptions(),
         )
         added = with_images(read_added(folder, capture), add)
         result = _calibrate(capture, folder, options, progress)
@@ -195,10 +193,16 @@ def measure(out: str | Path) -> Measured:
     return _measured(cloud, read_calibration(Path(out)))
 
 
+def options_of(out: str | Path) -> RunOptions:
+    """The options that a run folder's calibration was made with."""
+    state = _read_state(Path(out))["options"]
+    return RunOptions(ReconstructOptions(**state["reconstruct"]), CalibrateOptions(**state["calibrate"]))
+
+
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
     report = progress or silent
     # What auto stands for changes with the weights that are on this machine.
-    made_from = _fingerprint(
+    made_from = fingerprint(
         capture, asdict(options.reconstruct) | {"backend": candidates(options.reconstruct)}
     )
     state = _read_state(folder)
@@ -341,7 +345,7 @@ def _run_folder(folder: Path) -> Iterator[Path]:
         yield folder
 
 
-def _fingerprint(capture: Capture, options: dict[str, Any]) -> str:
+def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
     """A hash of all that a stage's result depends on: pictures, poses, lens, options and version."""
     digest = hashlib.sha256()
     for name in capture.images:

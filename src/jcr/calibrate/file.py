@@ -333,3 +333,9 @@ def _lens(intrinsics: Intrinsics | None) -> Lens | None:
     if intrinsics is None:
         return None
     return Lens.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion)})
+
+
+def intrinsics_of(lens: Lens) -> Intrinsics:
+    """The record of a file's lens."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    return Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, (k1, k2, p1, p2, k3))

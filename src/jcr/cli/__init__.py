@@ -30,6 +30,8 @@ COMMANDS = {
     "measure": "support plane and the objects on it: height, footprint, label",
     "view": "a run in 3D, in the browser",
     "compare": "difference of two calibrations in mm and degrees",
+    "verify": "is a calibration still true of today's few images",
+    "batch": "many captures, on this machine or a Ray cluster",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README",
     "models": "back ends, weights present or not, licences",

@@ -1,0 +1,318 @@
+"""Many captures: each run on its own, over processes of this machine or a Ray cluster, and a table that ranks them."""
+
+import csv
+import hashlib
+import io
+import json
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from html import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from jcr.calibrate.file import CalibrationFile, read_calibration
+from jcr.capture.read import read_capture
+from jcr.errors import InputError, NotTrustedError
+from jcr.files import write_text
+from jcr.pipeline import RunOptions, calibrate, fingerprint, run
+from jcr.progress import Progress
+
+STATE = "batch.json"
+"""In each run folder: its row of the table, and a fingerprint of what it was made from."""
+RETRIES = 3
+"""Of a task whose Ray node died."""
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Where and how much to run."""
+
+    processes: int | None = None
+    """Captures at a time on this machine (None: one for every two cores); cores are shared out among them."""
+    calibrate_only: bool = False
+    """Stop at calibration.json: no cloud, map and report."""
+    ray: str | None = None
+    """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
+    folders. Needs the extra jcr[cluster]."""
+    cpus_per_task: int = 2
+    """With --ray: cores that a capture takes."""
+    gpus_per_task: float = 0.0
+    """With --ray: GPUs that a capture takes; 0.25 lets four share one."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One capture in the table."""
+
+    capture: str
+    out: str
+    status: Literal["done", "not trusted", "failed"]
+    backend: str = ""
+    images: int = 0
+    used: int = 0
+    offset_std_mm: float | None = None
+    """Of the worst axis, as the next."""
+    turn_std_deg: float | None = None
+    scale_std_percent: float | None = None
+    held_out_mm: float | None = None
+    held_out_deg: float | None = None
+    seconds: float = 0.0
+    reason: str = ""
+    """Why it failed or is not trusted."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A capture to run, and with what."""
+
+    capture: Path
+    out: Path
+    run: RunOptions
+    calibrate_only: bool
+
+
+def batch(
+    captures: Sequence[Path],
+    out: Path,
+    run_options: RunOptions,
+    options: BatchOptions,
+    progress: Progress | None = None,
+) -> list[Row]:
+    """Run every capture into a folder of its own in `out`; summary.csv and summary.html rank them, best first.
+
+    A capture that fails fails alone. One that was finished from the same inputs and options is not run again.
+    Raises InputError for options that mean nothing.
+    """
+    if options.processes is not None and options.processes < 1:
+        raise InputError(f"--processes {options.processes}: give 1 or more")
+    report = progress or (lambda stage, fraction: None)
+    tasks = [
+        Task(path.resolve(), out.resolve() / name, run_options, options.calibrate_only)
+        for path, name in zip(captures, _names(captures), strict=True)
+    ]
+    out.mkdir(parents=True, exist_ok=True)
+    report("captures", 0.0)
+    rows: list[Row] = []
+    for row in _on_ray(tasks, options) if options.ray else _on_this_machine(tasks, options):
+        rows.append(row)
+        rows.sort(key=_rank)
+        _write_summary(out, rows)
+        report("captures", len(rows) / len(tasks))
+    return rows
+
+
+def run_one(task: Task) -> Row:
+    """The row of one capture, run unless it was finished before; whatever goes wrong is in the row."""
+    start = time.perf_counter()
+    failed = Row(str(task.capture), str(task.out), "failed")
+    try:
+        capture = read_capture(task.capture)
+        made_from = fingerprint(capture, asdict(task.run.reconstruct))
+        others = json.dumps([asdict(task.run), task.calibrate_only], sort_keys=True, default=str)
+        made_from += hashlib.sha256(others.encode()).hexdigest()
+        if (row := _finished(task, made_from)) is not None:
+            return row
+        try:
+            result = (calibrate if task.calibrate_only else run)(capture, task.out, task.run)
+            content, reason = result.calibration, ""
+        except NotTrustedError as error:
+            content, reason = read_calibration(task.out), str(error)
+        row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
+        if not content.converged:
+            row = replace(row, reason=reason or content.warnings[0])
+        write_text(
+            task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
+        )
+        return row
+    except InputError as error:
+        return replace(failed, reason=str(error))
+    except Exception as error:  # a bug shows in its row, and does not take the other captures with it
+        return replace(failed, reason=f"{type(error).__name__}: {error}")
+
+
+def _finished(task: Task, made_from: str) -> Row | None:
+    try:
+        state = json.loads((task.out / STATE).read_text())
+        row = Row(**state["row"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return row if state.get("made_from") == made_from else None
+
+
+def _row(task: Task, content: CalibrationFile) -> Row:
+    row = Row(
+        str(task.capture),
+        str(task.out),
+        "done" if content.converged else "not trusted",
+        content.backend,
+        len(content.images),
+        sum(image.used for image in content.images),
+    )
+    if content.uncertainty is not None:
+        uncertainty = content.uncertainty
+        row = replace(
+            row,
+            offset_std_mm=max(uncertainty.translation_std_mm),
+            turn_std_deg=max(uncertainty.rotation_std_deg),
+            scale_std_percent=uncertainty.scale_std_percent,
+        )
+    if content.held_out is not None:
+        row = replace(
+            row, held_out_mm=content.held_out.translation_mm, held_out_deg=content.held_out.rotation_deg
+        )
+    return row
+
+
+def _rank(row: Row) -> tuple[int, float, str]:
+    order = ("done", "not trusted", "failed").index(row.status)
+    return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
+
+
+def _names(captures: Sequence[Path]) -> list[str]:
+    """A folder name a capture: its own, with a number where two are called the same."""
+    names: list[str] = []
+    for path in captures:
+        own = (path.parent if path.is_file() else path).resolve().name or "capture"
+        name, number = own, 2
+        while name in names:
+            name, number = f"{own}-{number}", number + 1
+        names.append(name)
+    return names
+
+
+def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
+    cores = len(os.sched_getaffinity(0))
+    processes = min(options.processes or max(1, cores // 2), len(tasks))
+    with _threads_per_process(max(1, cores // processes)):
+        left = yield from _over_pool(tasks, processes)
+        # A process that was killed takes its pool along; alone, only the capture that did it fails.
+        for task in left:
+            if (yield from _over_pool([task], 1)):
+                reason = "its process died: out of memory, or a crash in a library"
+                yield Row(str(task.capture), str(task.out), "failed", reason=reason)
+
+
+def _over_pool(tasks: list[Task], processes: int):
+    """Rows as they come; returns the tasks that a broken pool left undone."""
+    left: list[Task] = []
+    # Spawned, not forked: libraries with threads of their own do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, context, initializer=_dies_on_interrupt)
+    try:
+        task_of = {pool.submit(run_one, task): task for task in tasks}
+        for future in as_completed(task_of):
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                left.append(task_of[future])
+        pool.shutdown()
+        return left
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()
+        pool.shutdown(cancel_futures=True)
+        raise
+
+
+def _dies_on_interrupt() -> None:
+    """Ctrl-C reaches every process of the terminal; only the first one has something to say about it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@contextmanager
+def _threads_per_process(threads: int) -> Iterator[None]:
+    """Numerical libraries read these when a process starts; one each for all cores would stand in each other's way."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, str(threads)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
+    if find_spec("ray") is None:
+        raise InputError("--ray: Ray is not installed; pip install 'jcr[cluster]'")
+    import ray
+    from ray.exceptions import RayError
+
+    own = not ray.is_initialized()
+    if own:
+        try:
+            ray.init(address=options.ray, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError) as error:
+            raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
+    try:
+        remote = ray.remote(
+            num_cpus=options.cpus_per_task, num_gpus=options.gpus_per_task, max_retries=RETRIES
+        )(run_one)
+        task_of = {remote.remote(task): task for task in tasks}
+        waiting = list(task_of)
+        while waiting:
+            (done,), waiting = ray.wait(waiting, num_returns=1)
+            try:
+                yield ray.get(done)
+            except RayError as error:
+                task, reason = task_of[done], " ".join(str(error).split())[:200]
+                yield Row(str(task.capture), str(task.out), "failed", reason=reason)
+    finally:
+        if own:
+            ray.shutdown()
+
+
+def _write_summary(out: Path, rows: list[Row]) -> None:
+    text = io.StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
+    table.writeheader()
+    table.writerows(asdict(row) for row in rows)
+    write_text(out / "summary.csv", text.getvalue())
+    write_text(out / "summary.html", _page(rows))
+
+
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>jcr batch</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>:root{{color-scheme:light dark}}body{{font:15px system-ui,sans-serif;margin:1.5em}}
+table{{border-collapse:collapse}}th,td{{padding:.3em .8em;text-align:left;border-bottom:1px solid #8885}}
+td.n,th.n{{text-align:right;font-variant-numeric:tabular-nums}}.bad{{color:#c33}}</style>
+<h1>{done} of {n} captures calibrated</h1><table><thead><tr><th class="n">#</th><th>capture</th><th>status</th>
+<th class="n">images used</th><th class="n">offset ± mm</th><th class="n">turn ± °</th><th class="n">scale ± %</th>
+<th class="n">held out mm</th><th class="n">held out °</th><th class="n">s</th><th>reason</th></tr></thead>
+<tbody>{rows}</tbody></table></html>
+"""
+
+
+def _page(rows: list[Row]) -> str:
+    lines = []
+    for rank, row in enumerate(rows, start=1):
+        name = Path(row.out).name
+        link = escape(name)
+        if (Path(row.out) / "report.html").is_file():
+            link = f'<a href="{escape(name, quote=True)}/report.html">{link}</a>'
+        numbers = (
+            row.offset_std_mm, row.turn_std_deg, row.scale_std_percent, row.held_out_mm, row.held_out_deg,
+            row.seconds,
+        )  # fmt: skip
+        cells = "".join(
+            f'<td class="n">{"" if number is None else f"{number:.3g}"}</td>' for number in numbers
+        )
+        bad = "" if row.status == "done" else ' class="bad"'
+        lines.append(
+            f'<tr><td class="n">{rank}</td><td>{link}</td><td{bad}>{row.status}</td>'
+            f'<td class="n">{row.used} of {row.images}</td>{cells}<td>{escape(row.reason)}</td></tr>'
+        )
+    done = sum(row.status == "done" for row in rows)
+    return _PAGE.format(done=done, n=len(rows), rows="\n".join(lines))

@@ -1,0 +1,106 @@
+"""`jcr verify`: is yesterday's calibration still true of today's few images?"""
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import tyro
+
+from jcr.verify import VerifyOptions
+
+if TYPE_CHECKING:
+    from jcr.verify import Verification
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Hold a calibration against new images: has the camera moved on the gripper since?
+
+    OUT is the run folder of the calibration, whose capture must still be where it was; CAPTURE a capture folder
+    with one or more new images of the same scene (two or three tell a moved camera from a moved table), or five
+    or more of another. Exit status 3 when something has moved, or when the images cannot tell.
+
+    examples:
+      jcr verify out/table captures/this-morning
+      jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the run that calibrated the camera."""
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Folder of the new images, with capture.json."""
+    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    json: bool = False
+    """Print the verdict as JSON on stdout."""
+    quiet: bool = False
+    """No progress on stderr."""
+
+
+def main(arguments: Arguments) -> int:
+    """Verify and say what to do."""
+    from jcr.progress import progress_bars
+    from jcr.verify import verify
+
+    with progress_bars(arguments.quiet) as progress:
+        found = verify(arguments.out, arguments.capture, arguments.verify, progress)
+    sys.stdout.write(json.dumps(_as_json(found)) + "\n" if arguments.json else _as_text(found))
+    for note in found.notes:
+        sys.stderr.write(f"warning: {note}\n")
+    if found.moved:
+        sys.stderr.write(f"error: {_advice(found)}\n")
+        return 3
+    return 0
+
+
+def _as_text(found: "Verification") -> str:
+    shift, turn = np.linalg.norm(found.offset[:3]), np.linalg.norm(found.offset[3:])
+    moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}[found.cause]
+    verdict = f"{moved} has moved" if found.moved else "still true"
+    offset, std = _spaced(1e3 * found.offset[:3], 2), _spaced(1e3 * found.std[:3], 2)
+    angle, angle_std = _spaced(np.degrees(found.offset[3:]), 3), _spaced(np.degrees(found.std[3:]), 3)
+    return (
+        f"{verdict}: {1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from the calibration, p = {found.p_value:.2g}\n"
+        f"  drift in gripper axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
+        f"  {len(found.images)} images, {found.how}; a drift of {1e3 * found.detectable[0]:.1f} mm or "
+        f"{np.degrees(found.detectable[1]):.2f}° would be noticed 9 times in 10\n"
+    )
+
+
+def _advice(found: "Verification") -> str:
+    anew = "tighten the mount, then calibrate anew from 8 or more images (jcr run)"
+    if found.cause == "scene":
+        return (
+            "the scene or the robot's base was moved as a whole; the map is no longer true, the camera still "
+            "fits: build the map anew (jcr run)"
+        )
+    if found.cause == "either":
+        return (
+            f"moved: the camera on the gripper, or the whole scene; two more images with the wrist turned tell "
+            f"which; if it is the camera, {anew}"
+        )
+    return f"the camera has moved on the gripper; {anew}"
+
+
+def _spaced(values: np.ndarray, digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _as_json(found: "Verification") -> dict[str, object]:
+    return {
+        "moved": found.moved,
+        "cause": found.cause if found.moved else None,
+        "drift_mm": (1e3 * found.offset[:3]).tolist(),
+        "drift_deg": np.degrees(found.offset[3:]).tolist(),
+        "drift_std_mm": (1e3 * found.std[:3]).tolist(),
+        "drift_std_deg": np.degrees(found.std[3:]).tolist(),
+        "p_value": found.p_value,
+        "misfit_p_value": found.misfit_p_value,
+        "detectable_mm": 1e3 * found.detectable[0],
+        "detectable_deg": float(np.degrees(found.detectable[1])),
+        "images": list(found.images),
+        "notes": list(found.notes),
+        "how": found.how,
+    }

@@ -1,0 +1,188 @@
+"""Where new images of a reconstructed scene were taken from: features matched to older images of known pose.
+
+A feature that a new image shares with two or more older ones is triangulated from those; the new camera follows
+from the points (perspective-n-point), with its covariance. Any back end's camera poses will do.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy import ndarray
+
+from jcr.geometry import inverse, rotation_exp, skew, transform
+from jcr.reconstruct.lens import resized, undistort
+from jcr.records import Intrinsics, Reconstruction
+
+WORKING_SIZE_PX = 1600
+FEATURES = 4000
+RATIO = 0.8
+"""A match must be so much nearer than the second nearest (Lowe 2004)."""
+GATE_PX = 3.0
+"""Reprojection error beyond which an observation is a mismatch."""
+MIN_PARALLAX = np.radians(1.5)
+MIN_POINTS = 30
+"""Fewer agree by chance on repeated patterns."""
+LOSS_SCALE = 2.0
+"""Cauchy loss, in sigma."""
+
+
+@dataclass(frozen=True)
+class _Features:
+    rays: Float[ndarray, "k 2"]
+    """(x/z, y/z), undistorted."""
+    descriptors: Float32[ndarray, "k 128"]
+    """Of unit length."""
+
+
+@dataclass(frozen=True)
+class Located:
+    """A new image's camera in the frame of the reconstruction."""
+
+    recon_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "6 6"]
+    """Of a motion (translation in recon units, rotation vector) in camera axes applied on the right."""
+    points: int
+    sigma_px: float
+    """Noise of its image coordinates."""
+
+
+def relocate(
+    reconstruction: Reconstruction,
+    older: Sequence[UInt8[ndarray, "h w 3"]],
+    new: Sequence[UInt8[ndarray, "h w 3"]],
+) -> list[Located | int]:
+    """The camera of each new image; where it shares too little with the older ones, how many points it shares.
+
+    `older` are the images of the reconstruction's rows, in their order; all are of one camera.
+    """
+    lens = reconstruction.intrinsics
+    known = [_features(image, lens) for image in older]
+    return [
+        _located(_features(image, lens), known, reconstruction.recon_from_camera, lens.fx) for image in new
+    ]
+
+
+def _features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> _Features:
+    scale = min(1.0, WORKING_SIZE_PX / max(lens.width, lens.height))
+    size = round(lens.width * scale), round(lens.height * scale)
+    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    # Without the precise upscaling every point is off by a quarter of a pixel.
+    sift = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
+    points, descriptors = sift.detectAndCompute(grey, None)
+    if not points:
+        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
+    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    return _Features(undistort(resized(lens, *size), np.array([point.pt for point in points])), root)
+
+
+def _located(
+    features: _Features, known: list[_Features], recon_from_camera: Float[ndarray, "m 4 4"], focal_px: float
+) -> Located | int:
+    rays = features.rays
+    gate = GATE_PX / focal_px
+    of_row = [_matches(features.descriptors, others.descriptors) for others in known]
+    feature = np.concatenate([mine for mine, _ in of_row])
+    row = np.repeat(np.arange(len(known)), [len(mine) for mine, _ in of_row])
+    seen = np.concatenate([known[k].rays[theirs] for k, (_, theirs) in enumerate(of_row)])
+    x_in_recon, spread, good = _triangulated(feature, row, seen, recon_from_camera, gate, len(rays))
+    if good.sum() < MIN_POINTS:
+        return int(good.sum())
+    points, spread, rays = x_in_recon[good], spread[good], rays[good]
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        points, focal_px * rays, np.diag([focal_px, focal_px, 1.0]), None,
+        iterationsCount=2000, reprojectionError=GATE_PX, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not found or inliers is None or len(inliers) < MIN_POINTS:
+        return 0 if inliers is None else len(inliers)
+    start = transform(rotation_exp(turn[:, 0]), shift[:, 0])
+    agree = np.asarray(inliers, int)[:, 0]
+    return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
+
+
+def _matches(
+    mine: Float32[ndarray, "k 128"], theirs: Float32[ndarray, "l 128"]
+) -> tuple[Int[ndarray, " c"], Int[ndarray, " c"]]:
+    """Pairs that are each other's nearest and clearly nearer than the next."""
+    if len(mine) < 2 or len(theirs) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    likeness = mine @ theirs.T
+    best = likeness.argmax(1)
+    mutual = likeness.argmax(0)[best] == np.arange(len(mine))
+    two = np.partition(likeness, -2, axis=1)[:, -2:].clip(max=1.0)
+    distance = np.sqrt(2 - 2 * two)
+    kept = np.flatnonzero(mutual & (distance[:, 1] < RATIO * distance[:, 0]))
+    return kept, best[kept]
+
+
+def _triangulated(
+    feature: Int[ndarray, " c"],
+    row: Int[ndarray, " c"],
+    seen: Float[ndarray, "c 2"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    gate: float,
+    n: int,
+) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"], Bool[ndarray, " n"]]:
+    """The point nearest to the rays of each feature, its covariance for rays of 1 rad noise, and whether two agree."""
+    rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
+    direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    across = np.eye(3) - direction[:, :, None] * direction[:, None]
+    point, kept, weight = np.zeros((n, 3)), np.ones(len(row), bool), np.ones(len(row))
+    normal = np.zeros((n, 3, 3))
+    for _ in range(3):  # later without those that missed, and by how far each camera was
+        normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        told = weight[kept, None, None] * across[kept]
+        np.add.at(normal, feature[kept], told)
+        np.add.at(right, feature[kept], np.einsum("cij,cj->ci", told, center[kept]))
+        # With one ray, or parallel ones, the depth is open; the small term keeps it finite.
+        normal += 1e-9 * np.eye(3)
+        point = np.linalg.solve(normal, right[..., None])[..., 0]
+        in_camera = np.einsum("cji,cj->ci", rotation, point[feature] - center)
+        ahead = in_camera[:, 2] > 1e-6
+        miss = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] - seen
+        kept = ahead & (np.linalg.norm(miss, axis=1) < gate)
+        squared = (in_camera**2).sum(1)
+        weight = 1 / np.maximum(squared, 1e-2 * np.median(squared)) if len(squared) else weight
+    count = np.bincount(feature[kept], minlength=n)
+    mean = np.zeros((n, 3))
+    np.add.at(mean, feature[kept], direction[kept])
+    # The mean of unit vectors is shorter than one by half their mean squared angle from it.
+    angle = np.sqrt(np.maximum(2 - 2 * np.linalg.norm(mean, axis=1) / np.maximum(count, 1), 0.0))
+    return point, np.linalg.inv(normal), (count >= 2) & (2 * angle > MIN_PARALLAX)
+
+
+def _refined(
+    points: Float[ndarray, "k 3"],
+    spread: Float[ndarray, "k 3 3"],
+    rays: Float[ndarray, "k 2"],
+    camera_from_recon: Float[ndarray, "4 4"],
+    focal_px: float,
+) -> Located:
+    """Gauss-Newton on the reprojection error under a Cauchy loss, and the covariance that it leaves.
+
+    A point is as uncertain as the old rays that met in it; one that few saw counts for little.
+    """
+    sigma, hessian = 1.0 / focal_px, np.eye(6)
+    for _ in range(15):
+        rotation = camera_from_recon[:3, :3]
+        x = points @ rotation.T + camera_from_recon[:3, 3]
+        miss = x[:, :2] / x[:, 2:] - rays
+        by_point = np.zeros((len(x), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / x[:, 2]
+        by_point[:, :, 2] = -x[:, :2] / x[:, 2:] ** 2
+        turned = by_point @ rotation
+        told = np.linalg.inv(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2))
+        squared = np.einsum("ki,kij,kj->k", miss, told, miss)
+        sigma = max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
+        told = told / (sigma**2 * (1 + squared / (LOSS_SCALE * sigma) ** 2))[:, None, None]
+        jacobian = by_point @ np.concatenate([np.broadcast_to(np.eye(3), (len(x), 3, 3)), -skew(x)], axis=2)
+        hessian = np.einsum("kai,kab,kbj->ij", jacobian, told, jacobian)
+        step = -np.linalg.solve(hessian, np.einsum("kai,kab,kb->i", jacobian, told, miss))
+        camera_from_recon = transform(rotation_exp(step[3:]), step[:3]) @ camera_from_recon
+        if float(step @ hessian @ step) < 1e-8:
+            break
+    return Located(inverse(camera_from_recon), np.linalg.inv(hessian), len(points), sigma * focal_px)

@@ -1,0 +1,203 @@
+"""Is yesterday's calibration still true of today's images? What `jcr verify` answers."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.stats import chi2
+
+from jcr.calibrate.calibrate import CalibrateOptions, calibrate
+from jcr.calibrate.drift import Cause, Drift, detectable, drift
+from jcr.calibrate.file import CalibrationFile, intrinsics_of, read_calibration
+from jcr.calibrate.pose_fit import PoseFit, fit_poses
+from jcr.capture.images import read_image
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import rotation_log
+from jcr.live.folder import LiveFolder
+from jcr.pipeline import options_of, read_capture_of
+from jcr.progress import Progress
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.reconstruct.file import read_reconstruction
+from jcr.reconstruct.relocate import Located, relocate
+from jcr.records import Capture, Reconstruction
+
+MIN_TO_RECALIBRATE = 5
+"""Images of another scene; with fewer a wrong one cannot be outvoted."""
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """What counts as moved."""
+
+    alpha: float = 1e-3
+    """Rate of false alarms: moved means less likely than this when nothing has moved."""
+    tolerance: tuple[float, float] = (0.5, 0.05)
+    """MM DEG: drifts smaller than both are no alarm, however significant."""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The verdict on a calibration, and what it rests on."""
+
+    moved: bool
+    cause: Cause
+    """Of what was found, where it has moved."""
+    offset: Float[ndarray, "6"]
+    """Drift: translation (m) and rotation vector (rad) of the camera in gripper axes."""
+    std: Float[ndarray, "6"]
+    p_value: float
+    misfit_p_value: float | None
+    detectable: tuple[float, float]
+    """m, rad: a drift of this size in the worst direction would be found nine times in ten."""
+    images: tuple[str, ...]
+    """Those that were used."""
+    notes: tuple[str, ...]
+    how: str
+
+
+def verify(
+    out: Path, today: Path, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
+) -> Verification:
+    """Hold the calibration in the run folder `out` against the few images in the capture folder `today`.
+
+    Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
+    when the images show too little of the old scene, or too few of another, to tell.
+    """
+    report = progress or (lambda stage, fraction: None)
+    if not 0 < options.alpha < 0.5:
+        raise InputError(f"--alpha {options.alpha}: a rate of false alarms between 0 and 0.5")
+    calibration = read_calibration(out)
+    if not calibration.converged:
+        raise InputError(
+            f"{out}: its calibration is not to be trusted, so that nothing can be held against it"
+        )
+    capture, reconstruction = read_capture_of(out), read_reconstruction(out / "reconstruction.npz")
+    if [image.image for image in calibration.images] != list(capture.images):
+        raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")
+    new = read_few(today)
+    if new.image_size != capture.image_size:
+        raise InputError(
+            f"{today}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
+            f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
+        )
+    report("find the old scene", 0.0)
+    located = relocate(
+        reconstruction,
+        [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index],
+        [read_image(new.folder / name) for name in new.images],
+    )
+    report("find the old scene", 1.0)
+    shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
+    lost = [f"{name} shares {place} points with the calibrated scene"
+            for name, place in zip(new.images, located, strict=True) if not isinstance(place, Located)]  # fmt: skip
+    if shared:
+        places = [place for place in located if isinstance(place, Located)]
+        found = drift(
+            fitted(calibration, capture, reconstruction, options_of(out).calibrate),
+            new.base_from_gripper[shared],
+            np.stack([place.recon_from_camera for place in places]),
+            np.stack([place.covariance for place in places]),
+            options.alpha,
+        )
+        return _judged(found, options, tuple(new.images[k] for k in shared), tuple(lost), "in the old scene")
+    if len(new) < MIN_TO_RECALIBRATE:
+        raise NotTrustedError(
+            f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
+            f"{MIN_TO_RECALIBRATE} or more of another one"
+        )
+    return _by_recalibration(calibration, new, options_of(out).reconstruct, options, progress)
+
+
+def read_few(folder: Path) -> Capture:
+    """A capture folder, however few its images."""
+    live = LiveFolder(folder)
+    if not live.names or live.size is None:
+        raise InputError(f"{folder}: holds no capture.json with images; take one or two (jcr capture)")
+    return Capture(folder, tuple(live.names), np.stack(live.poses), live.size)
+
+
+def fitted(
+    calibration: CalibrationFile, capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
+) -> PoseFit:
+    """The calibration's poses fitted again, for the joint covariance that its file does not keep.
+
+    Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame.
+    """
+    row_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
+    noise = options.robot_noise
+    return fit_poses(
+        capture.base_from_gripper[reconstruction.image_index][row_used],
+        reconstruction.recon_from_camera[row_used],
+        (
+            np.array(calibration.gripper_from_camera),
+            calibration.scale or 1.0,
+            np.array(calibration.base_from_recon),
+        ),
+        np.ones(int(row_used.sum())),
+        None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+    )
+
+
+def _judged(
+    found: Drift, options: VerifyOptions, images: tuple[str, ...], notes: tuple[str, ...], how: str
+) -> Verification:
+    if found.misfit_p_value is not None and found.misfit_p_value < options.alpha and found.cause != "scene":
+        notes += ("the images disagree with one another; something else than the camera moved too, or the robot "
+                  "is less exact than when it was calibrated",)  # fmt: skip
+    return Verification(
+        _is_moved(found.offset, found.p_value, options),
+        found.cause,
+        found.offset,
+        np.sqrt(np.diag(found.covariance)),
+        found.p_value,
+        found.misfit_p_value,
+        found.detectable,
+        images,
+        notes,
+        how,
+    )
+
+
+def _is_moved(offset: Float[ndarray, "6"], p_value: float, options: VerifyOptions) -> bool:
+    millimetres = 1e3 * float(np.linalg.norm(offset[:3]))
+    degrees = float(np.degrees(np.linalg.norm(offset[3:])))
+    matters = millimetres > options.tolerance[0] or degrees > options.tolerance[1]
+    return p_value < options.alpha and matters
+
+
+def _by_recalibration(
+    calibration: CalibrationFile,
+    new: Capture,
+    reconstruct_options: ReconstructOptions,
+    options: VerifyOptions,
+    progress: Progress | None,
+) -> Verification:
+    """Another scene: a calibration of its own, and the difference of the two against both covariances."""
+    assert calibration.uncertainty is not None  # a converged calibration has one
+    if calibration.intrinsics is not None:
+        new = replace(new, intrinsics=intrinsics_of(calibration.intrinsics))
+    reconstruction = reconstruct(new, reconstruct_options, progress)
+    hand_eye = calibrate(new, reconstruction)
+    if not hand_eye.converged:
+        raise NotTrustedError(
+            f"cannot tell: a new calibration from these images failed ({hand_eye.warnings[0]})"
+        )
+    before = np.array(calibration.gripper_from_camera)
+    now = hand_eye.gripper_from_camera
+    offset = np.r_[now[:3, 3] - before[:3, 3], rotation_log(now[:3, :3] @ before[:3, :3].T)]
+    covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]
+    p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
+    return Verification(
+        _is_moved(offset, p_value, options),
+        "camera",
+        offset,
+        np.sqrt(np.diag(covariance)),
+        p_value,
+        None,
+        detectable(covariance, options.alpha),
+        tuple(new.images[row] for row in reconstruction.image_index[hand_eye.inliers]),
+        (),
+        "against a calibration of its own in another scene",
+    )

@@ -1,0 +1,128 @@
+"""Many captures at once: the broken one fails alone, finished ones are not run again."""
+
+import csv
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from jcr import batch as module
+from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
+from jcr.cli import dispatch
+from jcr.pipeline import RunOptions
+
+COMPLETE = BatchOptions(calibrate_only=True, processes=2)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[Path]:
+    """Four and five small pictures of the table, one folder with a broken picture, one with no features."""
+    from PIL import Image
+
+    root = tmp_path_factory.mktemp("captures")
+    content = json.loads((tabletop / "capture.json").read_text())
+    lens = content["intrinsics"] | {key: content["intrinsics"][key] / 2 for key in ("fx", "fy")}
+    lens |= {"cx": 159.5, "cy": 119.5}
+    for name, rows in (("a", range(4)), ("b", range(5)), ("broken", range(4)), ("plain", range(4))):
+        (root / name / "images").mkdir(parents=True)
+        frames = [content["frames"][k] for k in rows]
+        for k, frame in enumerate(frames):
+            image = Image.open(tabletop / frame["image"]).resize((320, 240), Image.Resampling.BOX)
+            if name == "plain":
+                image = Image.new("RGB", (320, 240), (90 + k, 90, 90))
+            image.save(root / name / frame["image"], quality=95)
+        (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    (root / "broken" / "images" / "01.jpg").write_bytes(b"no picture")
+    return [root / name for name in ("a", "b", "broken", "plain")]
+
+
+def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
+    captures: list[Path], tmp_path: Path, capsys
+):
+    out = tmp_path / "all"
+    names = [str(path) for path in captures]
+    command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
+    assert dispatch([*command, "--json"]) == 3
+    told = capsys.readouterr()
+    rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(told.out)}
+    assert "of 4 captures failed or are not" in told.err and told.err.count("\n") == 1
+    assert rows["broken"].status == "failed" and "01.jpg: not a readable image" in rows["broken"].reason
+    assert rows["plain"].status == "not trusted" and "registered" in rows["plain"].reason
+    assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
+
+    with (out / "summary.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == 4 and table[-1]["status"] == "failed"
+    page = (out / "summary.html").read_text()
+    assert page.count("<tr>") == 5 and "not a readable image" in page
+
+    stamps = {name: (out / name / "calibration.json").stat().st_mtime_ns for name in ("a", "b", "plain")}
+    content = json.loads((captures[0] / "capture.json").read_text())
+    content["frames"][0]["base_from_gripper"][0][3] += 1e-4
+    (captures[0] / "capture.json").write_text(json.dumps(content))
+    assert dispatch(command) == 3
+    assert str(out / "summary.html") in capsys.readouterr().out
+    again = {name: (out / name / "calibration.json").stat().st_mtime_ns for name in stamps}
+    assert again["a"] > stamps["a"] and again["b"] == stamps["b"] and again["plain"] == stamps["plain"]
+
+
+def die(task: Task) -> Row:
+    """What a process short of memory does."""
+    if task.capture.name == "bad":
+        os._exit(9)
+    return Row(str(task.capture), str(task.out), "done", offset_std_mm=1.0)
+
+
+def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(module, "run_one", die)
+    paths = [tmp_path / name for name in ("one", "bad", "two", "three")]
+    rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
+    assert [row.status for row in rows] == ["done", "done", "done", "failed"]
+    assert "process died" in rows[-1].reason
+
+
+def test_folders_of_one_name_are_kept_apart(tmp_path: Path):
+    assert module._names([tmp_path / "a/x", tmp_path / "b/x", tmp_path / "x-2", tmp_path / "b/x"]) == [
+        "x",
+        "x-2",
+        "x-2-2",
+        "x-3",
+    ]
+
+
+def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]):
+    def broken(*arguments: object) -> None:
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(module, "calibrate", broken)
+    row = run_one(Task(captures[1], tmp_path / "out", RunOptions(), calibrate_only=True))
+    assert row.status == "failed" and "ZeroDivisionError: oops" in row.reason
+    assert not (tmp_path / "out" / STATE).exists()
+
+
+def test_without_ray_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    with pytest.raises(module.InputError, match=r"jcr\[cluster\]"):
+        batch(captures[:1], tmp_path / "out", RunOptions(), replace(COMPLETE, ray="auto"))
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_runs_them_and_survives_a_node(tmp_path: Path):
+    pytest.importorskip("ray", reason="the extra jcr[cluster] is not installed")
+    cluster_utils = pytest.importorskip("ray.cluster_utils")
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
+    try:
+        cluster.add_node(num_cpus=2)
+        rows = batch(
+            [tmp_path / f"missing{k}" for k in range(3)],
+            tmp_path / "out",
+            RunOptions(),
+            replace(COMPLETE, ray=cluster.address),
+        )
+    finally:
+        cluster.shutdown()
+    assert len(rows) == 3 and all("no such capture" in row.reason for row in rows)

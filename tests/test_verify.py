@@ -1,0 +1,227 @@
+"""Whether a calibration is still true: false alarms at their rate, bumps found, a moved table told from them."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.calibrate.calibrate import CalibrateOptions, calibrate
+from jcr.calibrate.drift import drift
+from jcr.calibrate.file import calibration_file, write_calibration
+from jcr.calibrate.pose_fit import fit_poses
+from jcr.capture.images import read_image
+from jcr.cli import dispatch
+from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.file import write_reconstruction
+from jcr.reconstruct.relocate import Located, relocate
+from jcr.records import Capture, Reconstruction, Tracks
+from jcr.simulate.capture import with_robot_noise
+
+OLD = 9
+"""Images of the bundled capture that calibrate; the other three are of the day after."""
+SCALE = 0.37
+BUMP = transform(rotation_exp(np.radians(1.0) * np.array([0.0, 0.6, 0.8])), np.array([0.003, 0.0, 0.0]))
+NUDGE = transform(rotation_exp(np.array([0.0, 0.0, 0.02])), np.array([0.02, -0.01, 0.0]))
+"""Of the table, in the base frame."""
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path) -> Capture:
+    return jcr.read_capture(tabletop)
+
+
+@pytest.fixture(scope="module")
+def x(tabletop: Path) -> np.ndarray:
+    return np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+
+
+def cameras(capture: Capture, x: np.ndarray) -> np.ndarray:
+    """recon_from_camera of every image, in a frame and unit of no meaning."""
+    recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
+    return scale_translation(recon_from_base @ capture.base_from_gripper @ x, 1 / SCALE)
+
+
+@pytest.fixture(scope="module")
+def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
+    """Of the old images, as a structure from motion without error would give."""
+    lens = capture.intrinsics
+    assert lens is not None
+    none = np.zeros((OLD, 4, 6))
+    return Reconstruction(
+        image_index=np.arange(OLD),
+        recon_from_camera=cameras(capture, x)[:OLD],
+        intrinsics=lens,
+        pointmap_intrinsics=replace(lens, width=6, height=4),
+        points_in_recon=np.zeros((*none.shape, 3)),
+        confidence=none,
+        colors=np.zeros((*none.shape, 3), np.uint8),
+        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        backend="colmap",
+    )
+
+
+@pytest.fixture(scope="module")
+def located(capture: Capture, reconstruction: Reconstruction) -> list[Located]:
+    images = [read_image(capture.folder / name) for name in capture.images]
+    found = relocate(reconstruction, images[:OLD], images[OLD:])
+    assert all(isinstance(place, Located) for place in found)
+    return found  # type: ignore[return-value]
+
+
+def test_new_images_are_located_to_a_fraction_of_a_millimetre(
+    located: list[Located], capture: Capture, x: np.ndarray
+):
+    for place, truth in zip(located, cameras(capture, x)[OLD:], strict=True):
+        error = inverse(truth) @ place.recon_from_camera
+        assert 1e3 * SCALE * np.linalg.norm(error[:3, 3]) < 1.0
+        motion = np.r_[error[:3, 3], [error[2, 1], error[0, 2], error[1, 0]]]
+        assert motion @ np.linalg.solve(place.covariance, motion) < 25
+        assert place.sigma_px < 0.6
+
+
+def test_a_picture_of_something_else_is_not_located(reconstruction: Reconstruction, capture: Capture):
+    images = [read_image(capture.folder / name) for name in capture.images]
+    noise = np.random.default_rng(0).integers(0, 255, images[0].shape, dtype=np.uint8)
+    other, plain = relocate(reconstruction, images[:OLD], [noise, np.full_like(noise, 90)])
+    assert other == 0 or (isinstance(other, int) and other < 30)
+    assert plain == 0
+
+
+def drifts(
+    capture: Capture, x: np.ndarray, seed: int, rows: list[int], noise=(0.5, 0.1), bump=None, nudge=None
+):
+    """The drift of images `rows` on poses alone: the robot's noise and the cameras' drawn anew."""
+    rng = np.random.default_rng(seed)
+    camera_std = np.r_[np.full(3, 3e-4 / SCALE), np.full(3, 5e-4)]
+    places = cameras(capture, x)
+    for k in rows:
+        motion = camera_std * rng.normal(size=6)
+        places[k] = places[k] @ transform(rotation_exp(motion[3:]), motion[:3])
+    gripper = capture.base_from_gripper.copy()
+    if bump is not None:
+        gripper[rows] = gripper[rows] @ x @ inverse(x @ bump)
+    if nudge is not None:
+        gripper[rows] = nudge @ gripper[rows]
+    reported = with_robot_noise(gripper, *noise, rng)
+    start = (
+        x,
+        SCALE,
+        inverse(transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))),
+    )
+    fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD))
+    spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
+    return drift(fit, reported[rows], places[rows], spread, 1e-3)
+
+
+def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):
+    p = np.array([[drifts(capture, x, 7 * seed + k, rows).p_value for k, rows in enumerate(([9], [9, 10, 11]))]
+                  for seed in range(60)])  # fmt: skip
+    # Binomial: 5 % of 120 is 6 ± 2.4, 50 % is 60 ± 5.5.
+    assert (p < 0.05).sum() <= 14
+    assert 40 <= (p < 0.5).sum() <= 78
+    assert (p < 1e-3).sum() <= 1
+
+
+def test_a_bump_is_found_and_measured(capture: Capture, x: np.ndarray):
+    true = np.r_[(x @ BUMP - x)[:3, 3], np.radians(1.0) * x[:3, :3] @ [0.0, 0.6, 0.8]]
+    for seed in range(10):
+        found = drifts(capture, x, seed, [9, 10, 11], bump=BUMP)
+        assert found.p_value < 1e-3
+        error = found.offset - true
+        assert error @ np.linalg.solve(found.covariance, error) < 30
+        assert found.cause != "scene"
+
+
+def test_what_is_called_detectable_is_detected_nine_times_in_ten(capture: Capture, x: np.ndarray):
+    shape = drifts(capture, x, 0, [9, 10]).covariance[:3, :3]
+    found = []
+    for seed in range(30):
+        detectable = drifts(capture, x, seed, [9, 10]).detectable[0]
+        shift = detectable * np.linalg.eigh(shape)[1][:, -1]
+        bump = transform(np.eye(3), x[:3, :3].T @ shift)
+        found.append(drifts(capture, x, seed, [9, 10], bump=bump).p_value < 1e-3)
+    # The F test with few degrees of freedom finds a little less than the χ² of the promise.
+    assert np.mean(found) > 0.7
+
+
+def test_a_moved_table_is_told_from_a_moved_camera(capture: Capture, x: np.ndarray):
+    exact = (0.05, 0.01)
+    rows = [9, 10, 11]
+    assert drifts(capture, x, 0, rows, exact, nudge=NUDGE).cause == "scene"
+    assert drifts(capture, x, 0, rows, exact, bump=BUMP).cause == "camera"
+    assert drifts(capture, x, 0, [9], exact, nudge=NUDGE).cause == "either"
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstruction: Reconstruction) -> Path:
+    """The run folder of a calibration from the first nine images, with the noise of a good robot."""
+    folder = tmp_path_factory.mktemp("run")
+    content = json.loads((capture.folder / "capture.json").read_text())
+    noisy = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(1))
+    for frame, pose in zip(content["frames"], noisy, strict=True):
+        frame["base_from_gripper"] = pose.tolist()
+    old = write_capture(folder / "yesterday", capture, noisy, range(OLD))
+    (folder / "out").mkdir()
+    hand_eye = calibrate(old, reconstruction)
+    assert hand_eye.converged
+    write_calibration(
+        folder / "out/calibration.json", calibration_file(old, reconstruction, hand_eye, {}, "0")
+    )
+    write_reconstruction(folder / "out/reconstruction.npz", reconstruction)
+    options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
+    (folder / "out/run.json").write_text(json.dumps({"capture": str(old.folder), "options": options}))
+    return folder / "out"
+
+
+def write_capture(folder: Path, capture: Capture, poses: np.ndarray, rows) -> Capture:
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for k in rows:
+        (folder / capture.images[k]).write_bytes((capture.folder / capture.images[k]).read_bytes())
+        frames.append({"image": capture.images[k], "base_from_gripper": poses[k].tolist()})
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
+    return replace(
+        capture,
+        folder=folder,
+        images=tuple(frame["image"] for frame in frames),
+        base_from_gripper=poses[list(rows)],
+    )
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_the_command_is_content_with_what_has_not_moved(
+    out: Path, capture: Capture, tmp_path: Path, capsys, seed: int
+):
+    poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(seed))
+    write_capture(tmp_path / "today", capture, poses, [10, 11])
+    assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 0
+    assert "still true" in capsys.readouterr().out
+
+
+def test_the_command_finds_a_bump_from_one_image_and_says_what_to_do(
+    out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, capsys
+):
+    poses = capture.base_from_gripper @ x @ inverse(x @ BUMP)
+    write_capture(tmp_path / "today", capture, poses, [10])
+    assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet", "--json"]) == 3
+    told = capsys.readouterr()
+    found = json.loads(told.out)
+    assert found["moved"] and found["p_value"] < 1e-3 and found["cause"] == "either"
+    assert np.linalg.norm(found["drift_mm"]) == pytest.approx(3.0, abs=2.0)
+    assert np.linalg.norm(found["drift_deg"]) == pytest.approx(1.0, abs=0.3)
+    assert "calibrate anew" in told.err
+
+
+def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, tmp_path: Path, capsys):
+    today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10])
+    from PIL import Image
+
+    Image.new("RGB", (640, 480), (90, 90, 90)).save(today.folder / today.images[0], format="PNG")
+    assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
+    assert "cannot tell" in capsys.readouterr().err
+    assert dispatch(["verify", str(out), str(tmp_path / "nothing"), "--quiet"]) == 2
+    assert "jcr capture" in capsys.readouterr().err
