@@ -2,13 +2,13 @@
 
 import csv
 import json
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from dying_process import dies_on_bad
 from jcr import batch as module
 from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
 from jcr.cli import dispatch
@@ -32,7 +32,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
         for k, frame in enumerate(frames):
             image = Image.open(tabletop / frame["image"]).resize((320, 240), Image.Resampling.BOX)
             if name == "plain":
-                image = Image.new("RGB", (320, 240), (90 + k, 90, 90))
+                image = Image.new("RGB", (320, 240), (90 + 8 * k, 90, 90))
             image.save(root / name / frame["image"], quality=95)
         (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
     (root / "broken" / "images" / "01.jpg").write_bytes(b"no picture")
@@ -69,15 +69,8 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     assert again["a"] > stamps["a"] and again["b"] == stamps["b"] and again["plain"] == stamps["plain"]
 
 
-def die(task: Task) -> Row:
-    """What a process short of memory does."""
-    if task.capture.name == "bad":
-        os._exit(9)
-    return Row(str(task.capture), str(task.out), "done", offset_std_mm=1.0)
-
-
 def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(module, "run_one", die)
+    monkeypatch.setattr(module, "run_one", dies_on_bad)
     paths = [tmp_path / name for name in ("one", "bad", "two", "three")]
     rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
     assert [row.status for row in rows] == ["done", "done", "done", "failed"]
