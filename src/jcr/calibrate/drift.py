@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.optimize import root_scalar
-from scipy.stats import chi2, f, ncx2
+from scipy.stats import chi2, f, ncf, ncx2
 
 from jcr.calibrate.pose_fit import (
     BASE_ROTATION,
@@ -78,7 +78,7 @@ def drift(
         _tail(float(offset @ np.linalg.solve(covariance, offset)), 6, nu),
         _tail(camera_misfit, more, nu) if more else None,
         "either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
-        detectable(covariance, alpha),
+        detectable(covariance, alpha, nu),
     )
 
 
@@ -87,11 +87,15 @@ def _tail(squares: float, dof: int, nu: float) -> float:
     return float(chi2.sf(squares, dof) if np.isinf(nu) else f.sf(squares / dof, dof, nu))
 
 
-def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, float]:
+def detectable(covariance: Float[ndarray, "6 6"], alpha: float, nu: float = np.inf) -> tuple[float, float]:
     """Shifts (m) and turns (rad) in the worst direction that a test at `alpha` finds nine times in ten."""
-    limit = chi2.isf(alpha, 6)
-    found = root_scalar(lambda c: float(ncx2.sf(limit, 6, c)) - POWER, bracket=(1e-3, 1e4))
-    length = np.sqrt(found.root)
+
+    def power(squared: float) -> float:
+        if np.isinf(nu):
+            return float(ncx2.sf(chi2.isf(alpha, 6), 6, squared))
+        return float(ncf.sf(f.isf(alpha, 6, nu), 6, nu, squared))
+
+    length = np.sqrt(root_scalar(lambda squared: power(squared) - POWER, bracket=(1e-3, 1e3)).root)
     worst = [np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in (TRANSLATION, ROTATION)]
     return float(length * worst[0]), float(length * worst[1])
 
