@@ -112,7 +112,7 @@ def drifts(
         SCALE,
         inverse(transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))),
     )
-    fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD))
+    fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD, bool))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
     return drift(fit, reported[rows], places[rows], spread, 1e-3)
 

@@ -135,7 +135,7 @@ def fitted(
             calibration.scale or 1.0,
             np.array(calibration.base_from_recon),
         ),
-        np.ones(int(row_used.sum())),
+        np.ones(int(row_used.sum()), bool),
         None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
     )
 

@@ -26,7 +26,7 @@ from jcr.calibrate.pose_fit import (
     TRANSLATION,
     PoseFit,
     Poses,
-    pose_residuals,
+    residuals,
 )
 from jcr.geometry import rotation_exp, rotation_log, transform
 
@@ -116,9 +116,8 @@ def _moved_by(
     n = 6 * len(base_from_gripper)
     normal, misfit = np.eye(6), 0.0
     for _ in range(10):
-        r_t, r_r, j_t, j_r = pose_residuals(x, scale, z, base_from_gripper, recon_from_camera)
-        residual = np.concatenate([r_t, r_r], axis=1).ravel()
-        jacobian = np.concatenate([j_t, j_r], axis=1)
+        residual, jacobian = residuals(x, scale, z, base_from_gripper, recon_from_camera)
+        residual = residual.ravel()
         by_camera = _by_camera(x, scale, z, base_from_gripper, recon_from_camera)
         of_image = by_camera @ camera_covariance @ np.swapaxes(by_camera, 1, 2) + np.diag(sigma**2)
         stacked = jacobian.reshape(n, 13)
@@ -150,10 +149,11 @@ def _by_camera(
     """Derivative of the residuals by motions of the cameras, by central differences."""
     step, out = 1e-5, np.zeros((len(base_from_gripper), 6, 6))
     for k, motion in enumerate(step * np.eye(6)):
-        both = []
-        for sign in (1.0, -1.0):
-            moved = recon_from_camera @ transform(rotation_exp(sign * motion[3:]), sign * motion[:3])
-            r_t, r_r, _, _ = pose_residuals(x, scale, z, base_from_gripper, moved)
-            both.append(np.concatenate([r_t, r_r], axis=1))
-        out[:, :, k] = (both[0] - both[1]) / (2 * step)
+        ahead, behind = (
+            residuals(
+                x, scale, z, base_from_gripper, recon_from_camera @ transform(rotation_exp(m[3:]), m[:3])
+            )[0]
+            for m in (motion, -motion)
+        )
+        out[:, :, k] = (ahead - behind) / (2 * step)
     return out
