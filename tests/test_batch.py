@@ -2,7 +2,7 @@
 
 import csv
 import json
-import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,19 +103,26 @@ def test_without_ray_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 @pytest.mark.slow
-def test_a_ray_cluster_runs_them_and_survives_a_node(tmp_path: Path):
+def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     pytest.importorskip("ray", reason="the extra jcr[cluster] is not installed")
-    cluster_utils = pytest.importorskip("ray.cluster_utils")
-    shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
+    from ray.cluster_utils import Cluster
+
+    def slow(task: Task) -> Row:
+        time.sleep(1.0)
+        return Row(str(task.capture), str(task.out), "done", offset_std_mm=1.0)
+
+    monkeypatch.setattr(module, "run_one", slow)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
     try:
-        cluster.add_node(num_cpus=2)
-        rows = batch(
-            [tmp_path / f"missing{k}" for k in range(3)],
-            tmp_path / "out",
-            RunOptions(),
-            replace(COMPLETE, ray=cluster.address),
-        )
+        nodes = [cluster.add_node(num_cpus=2)]
+
+        def kill(stage: str, fraction: float) -> None:
+            if fraction > 0 and nodes:
+                cluster.remove_node(nodes.pop(), allow_graceful=False)
+
+        options = replace(COMPLETE, ray=cluster.address)
+        rows = batch([tmp_path / f"{k}" for k in range(6)], tmp_path / "out", RunOptions(), options, kill)
     finally:
         cluster.shutdown()
-    assert len(rows) == 3 and all("no such capture" in row.reason for row in rows)
+    assert not nodes
+    assert sorted(Path(row.capture).name for row in rows if row.status == "done") == list("012345")

@@ -99,8 +99,19 @@ def dispatch(arguments: Sequence[str]) -> int:
         if error.errno not in _DISK:
             raise
         return _fail(2, f"{error.filename or 'the output'}: {error.strerror}; {_DISK[error.errno]}")
-    except KeyboardInterrupt:
+    except BaseException as error:
+        if not _interrupted(error):
+            raise
         return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error; libraries interrupted while they load call it an error of their own."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
