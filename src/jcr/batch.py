@@ -247,8 +247,8 @@ def _threads_per_process(threads: int) -> Iterator[None]:
 def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
     if find_spec("ray") is None:
         raise InputError("--ray: Ray is not installed; pip install 'jcr[cluster]'")
-    import ray
-    from ray.exceptions import RayError
+    import ray  # pyright: ignore[reportMissingImports]
+    from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
     own = not ray.is_initialized()
     if own:
