@@ -202,7 +202,11 @@ def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
                 with pytest.raises(OSError):
                     socket.create_connection((ip, int(port)), timeout=2).close()
         served.send_signal(signal.SIGINT)
-        out, err = served.communicate(timeout=30)
+        try:
+            out, err = served.communicate(timeout=30)
+        except subprocess.TimeoutExpired:
+            served.kill()  # or the test would wait for it for ever
+            raise
         assert served.returncode == 0 and out == "" and err == ""
 
 
