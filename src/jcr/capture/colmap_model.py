@@ -51,12 +51,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
     names, _ = read_cameras(folder)
     located = [f"images/{name}" if (root / "images" / name).is_file() else name for name in names]
-    known, poses, table = gripper_poses(root, located, options)
-    notes = ()
-    if len(known) < len(names):
-        notes = (
-            f"{len(names) - len(known)} of {len(names)} images have no gripper pose in {table.name}: left out",
-        )
+    known, poses, notes = gripper_poses(root, located, options)
     capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
     lens = read_lens(folder, capture.image_size)
     return replace(capture, intrinsics=lens, source=folder, cameras=folder, notes=notes)

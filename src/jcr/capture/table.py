@@ -52,8 +52,8 @@ def with_camera_info(capture: Capture, options: ReadOptions) -> Capture:
 
 def gripper_poses(
     folder: Path, images: Sequence[str], options: ReadOptions
-) -> tuple[list[int], Float[ndarray, "m 4 4"], Path]:
-    """Rows of `images` that a table of gripper poses knows, their poses, and the table.
+) -> tuple[list[int], Float[ndarray, "m 4 4"], tuple[str, ...]]:
+    """Rows of `images` that a table of gripper poses knows, their poses, and a note of those it does not know.
 
     Raises InputError when there is no table or it does not belong to these images.
     """
@@ -67,7 +67,7 @@ def gripper_poses(
                 f"{file}: {len(table.base_from_gripper)} poses for {len(images)} images; add a column with the "
                 "images' names"
             )
-        return list(range(len(images))), table.base_from_gripper, file
+        return list(range(len(images))), table.base_from_gripper, ()
     row_of = {_plain(name): row for row, name in enumerate(table.images)}
     if len(row_of) < len(table.images):
         raise InputError(f"{file}: names an image more than once; keep one row per image")
@@ -75,7 +75,10 @@ def gripper_poses(
     if not known:
         raise InputError(f"{file}: knows none of the images; it has {table.images[0]}, they have {images[0]}")
     rows = [row_of[_plain(images[k])] for k in known]
-    return known, table.base_from_gripper[rows], file
+    notes = ()
+    if unknown := len(images) - len(known):
+        notes = (f"{unknown} of {len(images)} images have no gripper pose in {file.name}: left out",)
+    return known, table.base_from_gripper[rows], notes
 
 
 def _plain(name: str) -> str:

@@ -29,12 +29,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
     """The images that a transforms.json and a table of gripper poses both know."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     names, _ = read_cameras(file)
-    known, poses, table = gripper_poses(folder, names, options)
-    notes = ()
-    if len(known) < len(names):
-        notes = (
-            f"{len(names) - len(known)} of {len(names)} images have no gripper pose in {table.name}: left out",
-        )
+    known, poses, notes = gripper_poses(folder, names, options)
     capture = checked_capture(folder, [names[k] for k in known], poses, str(file))
     lens = read_lens(file, capture.image_size)
     return replace(capture, intrinsics=lens, source=file, cameras=file, notes=notes)
