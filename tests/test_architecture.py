@@ -13,7 +13,7 @@ LAYERS = [
     {"calibrate"},
     {"represent", "segment"},
     {"export"},
-    {"simulate"},
+    {"simulate", "results"},
     {"report"},
     {"auto", "check", "live"},
     {"pipeline"},
@@ -23,25 +23,16 @@ LAYERS = [
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-# The report shows what the pipeline found, and names its type; the pipeline calls it at run time.
-TYPE_ONLY = {("report", "pipeline")}
 TORCH_ROOMS = {"reconstruct", "represent", "segment", "bench"}
 
 
-def imports(file: Path) -> list[tuple[str, bool]]:
-    """Modules that a file imports, with whether only for type checking."""
+def imports(file: Path) -> list[str]:
     found = []
-
-    def visit(node: ast.AST, typing: bool) -> None:
-        for child in ast.iter_child_nodes(node):
-            inside = typing or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
-            if isinstance(child, ast.Import):
-                found.extend((alias.name, inside) for alias in child.names)
-            elif isinstance(child, ast.ImportFrom) and child.module:
-                found.append((child.module, inside))
-            visit(child, inside)
-
-    visit(ast.parse(file.read_text()), False)
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found.extend(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.append(node.module)
     return found
 
 
@@ -60,11 +51,11 @@ def test_imports_run_one_way():
         mine = room(file)
         if mine == "__init__":
             continue
-        for module, typing in imports(file):
+        for module in imports(file):
             if not module.startswith("jcr."):
                 continue
             other = module.split(".")[1]
-            if other != mine and LEVEL[other] >= LEVEL[mine] and not (typing and (mine, other) in TYPE_ONLY):
+            if other != mine and LEVEL[other] >= LEVEL[mine]:
                 against.append(f"{file.relative_to(SOURCE)} imports {module}")
     assert not against
 
@@ -73,7 +64,6 @@ def test_torch_stays_where_networks_are():
     outside = [
         str(file.relative_to(SOURCE))
         for file in SOURCE.rglob("*.py")
-        if any(module.split(".")[0] == "torch" for module, _ in imports(file))
-        and room(file) not in TORCH_ROOMS
+        if any(module.split(".")[0] == "torch" for module in imports(file)) and room(file) not in TORCH_ROOMS
     ]
     assert not outside

@@ -20,7 +20,6 @@ from jcr.calibrate.calibrate import calibrate
 from jcr.calibrate.file import calibration_file, failed_file, worst_direction
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.pipeline import RunResult
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -31,6 +30,7 @@ from jcr.report.samples import CLEARANCE, sample_surface, slices
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
+from jcr.results import RunResult
 from jcr.rounding import significant
 from jcr.simulate.truth import Truth, read_truth
 

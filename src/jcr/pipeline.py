@@ -40,7 +40,7 @@ from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
 from jcr.represent.options import MapOptions
-from jcr.represent.scene import SceneMap
+from jcr.results import PosesResult, RunResult
 from jcr.segment.measure import Measured
 from jcr.segment.measure import measure as measure_cloud
 from jcr.segment.options import SegmentOptions
@@ -61,39 +61,6 @@ class RunOptions:
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """What a run found, and where it is kept."""
-
-    out: Path
-    calibration: CalibrationFile
-    hand_eye: HandEye
-    reconstruction: Reconstruction
-    cloud: PointCloud | None = None
-    scene: SceneMap | None = None
-    measured: Measured | None = None
-    """None without a map, and where no plane carries the scene."""
-
-    @property
-    def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
-        return self.hand_eye.converged
-
-
-@dataclass(frozen=True)
-class PosesResult:
-    """What camera poses that were given say, without images."""
-
-    out: Path
-    calibration: CalibrationFile
-    hand_eye: HandEye
-
-    @property
-    def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
-        return self.hand_eye.converged
 
 
 def run(

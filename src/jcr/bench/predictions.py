@@ -9,10 +9,11 @@ import numpy as np
 from jcr.bench.synthetic_pairs import pairs_of_capture
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.capture.read import read_capture
-from jcr.pipeline import RunOptions, RunResult
+from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.dust3r.pairs import write_pairs
+from jcr.results import RunResult
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.problem import HandEyeProblem, error
 from jcr.simulate.truth import read_truth, truth_points

@@ -9,7 +9,7 @@ import numpy as np
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
-    from jcr.pipeline import PosesResult, RunResult
+    from jcr.results import PosesResult, RunResult
 
 
 def show(result: "RunResult | PosesResult", as_json: bool) -> int:

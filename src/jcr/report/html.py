@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +23,14 @@ from jcr.report.samples import sample_surface
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
 from jcr.represent.scene import SceneMap
+from jcr.results import RunResult
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
 
 
-def report_html(capture: Capture, result: "RunResult") -> str:
+def report_html(capture: Capture, result: RunResult) -> str:
     """The report of a run as one HTML page that loads nothing else.
 
     Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
@@ -169,7 +167,7 @@ def _warnings(calibration: CalibrationFile) -> str:
     return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
 
 
-def _before_after(capture: Capture, result: "RunResult", base_from_camera: Transforms) -> str:
+def _before_after(capture: Capture, result: RunResult, base_from_camera: Transforms) -> str:
     grippers, lens = capture.base_from_gripper, lens_of(result)
     before, rows = result.reconstruction.recon_from_camera, result.reconstruction.image_index
     return "".join(

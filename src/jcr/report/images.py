@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -19,10 +18,8 @@ from jcr.geometry import apply, inverse, rotation_between_deg
 from jcr.records import Capture, HandEye, Intrinsics
 from jcr.report.figures import picture_url
 from jcr.report.markup import filled
+from jcr.results import RunResult
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
 
 THUMBNAIL = 320
 """Pixels across; half of it for more than MANY images."""
@@ -31,7 +28,7 @@ MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
 
 
-def lens_of(result: "RunResult") -> Intrinsics:
+def lens_of(result: RunResult) -> Intrinsics:
     """The lens as the calibration left it."""
     return result.hand_eye.intrinsics or result.reconstruction.intrinsics
 
@@ -52,7 +49,7 @@ def image_numbers(image: Image) -> str:
     return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
 
 
-def images_section(capture: Capture, result: "RunResult") -> str:
+def images_section(capture: Capture, result: RunResult) -> str:
     """Every image with its numbers, and why it was rejected if it was."""
     images = result.calibration.images
     cards, marks = [], _reprojections(result)
@@ -81,7 +78,7 @@ def images_section(capture: Capture, result: "RunResult") -> str:
     return filled("images.html", say=say, about=about, cards="".join(cards))
 
 
-def _reprojections(result: "RunResult") -> dict[int, str]:
+def _reprojections(result: RunResult) -> dict[int, str]:
     """Per image of the capture a drawing over its picture: some features, and where their 3D points fall."""
     reconstruction, lens = result.reconstruction, lens_of(result)
     tracks, own_lens = reconstruction.tracks, parameters(reconstruction.intrinsics)
@@ -127,7 +124,7 @@ def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
         return list(pool.map(thumbnail, capture.images))
 
 
-def residuals_section(capture: Capture, result: "RunResult") -> str:
+def residuals_section(capture: Capture, result: RunResult) -> str:
     """Residuals image by image and of the whole, before and after the images' features refined the fit."""
     now, before = result.hand_eye, _poses_alone(capture, result)
     rows, used = [], now.inliers
@@ -165,7 +162,7 @@ def residuals_section(capture: Capture, result: "RunResult") -> str:
     )
 
 
-def _poses_alone(capture: Capture, result: "RunResult") -> HandEye | None:
+def _poses_alone(capture: Capture, result: RunResult) -> HandEye | None:
     """The calibration before the images' features refined it; None where they did not."""
     if result.hand_eye.reprojection_px is None:
         return None

@@ -1,7 +1,6 @@
 """The section that shows the trained map: from the cameras' places, and cut open."""
 
 from html import escape
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,9 +13,7 @@ from jcr.report.images import THUMBNAIL, shown_names
 from jcr.report.markup import filled
 from jcr.report.samples import CLEARANCE, SurfacePoints, point_size, slices
 from jcr.represent.scene import SceneMap
-
-if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
+from jcr.results import RunResult
 
 WIDE = 480
 """Pixels across of a picture that stands alone."""
@@ -25,7 +22,7 @@ PAIRS = 4
 
 
 def map_section(
-    result: "RunResult",
+    result: RunResult,
     scene: SceneMap,
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
@@ -44,7 +41,7 @@ def map_section(
     )
 
 
-def _overlaid(result: "RunResult", base_from_camera: Float[ndarray, "m 4 4"]) -> str:
+def _overlaid(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> str:
     """The dense cloud with the tracked features in red (paper, section V), as two cameras see it."""
     reconstruction, hand_eye, cloud = result.reconstruction, result.hand_eye, result.cloud
     tracked = reconstruction.tracks.points_in_recon
@@ -72,7 +69,7 @@ def _overlaid(result: "RunResult", base_from_camera: Float[ndarray, "m 4 4"]) ->
 
 
 def _pairs(
-    result: "RunResult",
+    result: RunResult,
     scene: SceneMap,
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -15,10 +14,8 @@ from jcr.geometry import inverse, rotation_angle
 from jcr.records import Capture
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button
+from jcr.results import RunResult
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
 
 PARTS = ("offset x", "offset y", "offset z", "turn x", "turn y", "turn z", "scale")
 """Of a direction, in records.COVARIANCE_ORDER."""
@@ -28,7 +25,7 @@ GENERAL = 0.4
 """Excitation that general motions reach: the full length of a bar."""
 
 
-def motion_section(capture: Capture, result: "RunResult") -> str:
+def motion_section(capture: Capture, result: RunResult) -> str:
     """Excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     calibration = result.calibration
     observed, uncertainty = calibration.observability, calibration.uncertainty

@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,9 +17,7 @@ from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.report.images import image_numbers, lens_of, shown_names
 from jcr.report.markup import filled
 from jcr.report.samples import SurfacePoints, point_size
-
-if TYPE_CHECKING:
-    from jcr.pipeline import RunResult
+from jcr.results import RunResult
 
 POINTS = 60_000
 """Of each layer, at most."""
@@ -36,7 +34,7 @@ class PointLayer:
 
 def scene_section(
     capture: Capture,
-    result: "RunResult",
+    result: RunResult,
     base_from_camera: Float[ndarray, "m 4 4"],
     surface: SurfacePoints | None,
 ) -> str:
@@ -90,7 +88,7 @@ def _choice(attributes: str, name: str, on: bool) -> str:
     return f"<label><input {attributes}{' checked' if on else ''}>{name}</label>"
 
 
-def _layers(result: "RunResult", surface: SurfacePoints | None) -> tuple[list[PointLayer], str]:
+def _layers(result: RunResult, surface: SurfacePoints | None) -> tuple[list[PointLayer], str]:
     """The layers to choose from, and the legend of the labels."""
     layers, legend = [], ""
     if surface is not None and result.scene is not None:
@@ -136,7 +134,7 @@ def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
 
 
 def _views(
-    capture: Capture, result: "RunResult", base_from_camera: Float[ndarray, "m 4 4"]
+    capture: Capture, result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]
 ) -> list[dict[str, Any]]:
     """Per image its name, its numbers, and three rows of where its gripper and its camera (or null) were."""
     row_of = {int(row): k for k, row in enumerate(result.reconstruction.image_index)}
