@@ -1,15 +1,15 @@
 """The COLMAP back end: structure from motion, then dense pointmaps by plane sweep; no network, no weights."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 from PIL import ExifTags, Image
 
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.progress import Progress, silent
-from jcr.reconstruct.lens import pinhole_inside, undistort_image, usable_lens
+from jcr.reconstruct.dense import DenseOptions, with_pointmaps
+from jcr.reconstruct.lens import usable_lens
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
@@ -19,22 +19,14 @@ _START_FOCALS = (0.8, 0.5, 1.2)
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 
 
-@dataclass(frozen=True)
-class ColmapOptions:
+@dataclass(frozen=True, kw_only=True)
+class ColmapOptions(DenseOptions):
     """Structure from motion and dense pointmaps without a network."""
 
     working_size_px: int = 1600
     """Images whose long side is larger are reduced to this before features are extracted."""
-    pointmap_size_px: int = 400
-    """Long side of the dense pointmaps."""
-    dense: bool = True
-    """Off: cameras and tracks alone, with pointmaps of no confidence."""
-    neighbours: int = 5
-    """Other images that each is compared with for its pointmap."""
     seed: int = 0
     """Same seed, same result, bit for bit."""
-    device: str = "cpu"
-    """Where the plane sweep runs: cpu or cuda."""
     verbose: bool = False
     """Let COLMAP's own log through."""
 
@@ -47,9 +39,7 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.reconstruct.dense import dense_pointmaps
     from jcr.reconstruct.sfm import structure_from_motion
-    from jcr.reconstruct.views import choose_neighbours, sweep_planes
 
     options = options or ColmapOptions()
     report = progress or silent
@@ -65,31 +55,12 @@ def reconstruct(
     notes += sparse.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in sparse.rows]:
         notes.append(f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}")
-    pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
-    colors = np.stack([undistort_image(images[row], sparse.lens, pinhole) for row in sparse.rows])
-    if options.dense:
-        points, confidence = dense_pointmaps(
-            colors,
-            sparse.recon_from_camera,
-            pinhole,
-            choose_neighbours(sparse.tracks, sparse.recon_from_camera, options.neighbours),
-            sweep_planes(sparse.tracks, sparse.recon_from_camera),
-            options.device,
-            report,
-        )
-    else:
-        points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
-    return Reconstruction(
-        image_index=sparse.rows,
-        recon_from_camera=sparse.recon_from_camera,
-        intrinsics=sparse.lens,
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points,
-        confidence=confidence,
-        colors=colors,
-        tracks=sparse.tracks,
+    return with_pointmaps(
+        replace(sparse, notes=tuple(notes)),
+        [images[row] for row in sparse.rows],
+        options,
+        report,
         backend="colmap",
-        notes=tuple(notes),
     )
 
 

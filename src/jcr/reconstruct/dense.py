@@ -1,15 +1,84 @@
 """Dense pointmaps of images whose cameras are known, whichever back end found them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.progress import Progress
-from jcr.reconstruct.lens import rays
-from jcr.reconstruct.planesweep import PlaneSweepOptions, plane_sweep
-from jcr.records import Intrinsics
+from jcr.reconstruct.lens import pinhole_inside, rays, undistort_image
+from jcr.reconstruct.views import choose_neighbours, sweep_planes
+from jcr.records import Intrinsics, Reconstruction, Tracks
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseOptions:
+    """Pointmaps without a network."""
+
+    pointmap_size_px: int = 400
+    """Long side of the dense pointmaps."""
+    dense: bool = True
+    """Off: cameras and tracks alone, with pointmaps of no confidence."""
+    neighbours: int = 5
+    """Other images that each is compared with for its pointmap."""
+    device: str = "cpu"
+    """Where the plane sweep runs: cpu or cuda."""
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Cameras whose poses are known, and points that they see."""
+
+    rows: Int[ndarray, " m"]
+    """Of the images given, those that have a pose, ascending."""
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    lens: Intrinsics
+    """Of the images given: the one given, or estimated."""
+    tracks: Tracks
+    notes: tuple[str, ...] = ()
+
+
+def with_pointmaps(
+    sparse: SparseModel,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    options: DenseOptions,
+    report: Progress,
+    *,
+    backend: str,
+    planes: Float[ndarray, "m d 3"] | None = None,
+) -> Reconstruction:
+    """The record of a sparse model, with pointmaps of its images, which are given row by row.
+
+    `planes` where the tracks do not span what is in view.
+    """
+    pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
+    colors = np.stack([undistort_image(image, sparse.lens, pinhole) for image in images])
+    if options.dense:
+        points, confidence = dense_pointmaps(
+            colors,
+            sparse.recon_from_camera,
+            pinhole,
+            choose_neighbours(sparse.tracks, sparse.recon_from_camera, options.neighbours),
+            sweep_planes(sparse.tracks, sparse.recon_from_camera) if planes is None else planes,
+            options.device,
+            report,
+        )
+    else:
+        points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
+    return Reconstruction(
+        image_index=sparse.rows,
+        recon_from_camera=sparse.recon_from_camera,
+        intrinsics=sparse.lens,
+        pointmap_intrinsics=pinhole,
+        points_in_recon=points,
+        confidence=confidence,
+        colors=colors,
+        tracks=sparse.tracks,
+        backend=backend,
+        notes=sparse.notes,
+    )
 
 
 def dense_pointmaps(
@@ -27,6 +96,8 @@ def dense_pointmaps(
     `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times. Confidence
     is the plane sweep's, 0 for no estimate.
     """
+    from jcr.reconstruct.planesweep import PlaneSweepOptions, plane_sweep
+
     depth, confidence = plane_sweep(
         colors,
         recon_from_camera,

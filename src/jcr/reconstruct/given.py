@@ -18,12 +18,10 @@ from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.dense import dense_pointmaps
-from jcr.reconstruct.lens import pinhole_inside, undistort_image
+from jcr.reconstruct.dense import SparseModel, with_pointmaps
 from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
-from jcr.reconstruct.views import choose_neighbours, sweep_planes
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 MIN_POINTS = 50
@@ -36,7 +34,7 @@ def reconstruct(
 
     Raises InputError when the model knows fewer than three, NotTrustedError when nothing can be triangulated.
     """
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     reader = colmap_model if cameras.is_dir() else transforms_json
     names, recon_from_camera = reader.read_cameras(cameras)
     row_of = {Path(name).name: row for row, name in enumerate(names)}
@@ -59,31 +57,10 @@ def reconstruct(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated; check "
             "that it belongs to these images, or leave it out (--backend colmap)"
         )
-    pinhole = pinhole_inside(lens, options.pointmap_size_px)
-    colors = np.stack([undistort_image(image, lens, pinhole) for image in images])
-    points, confidence = dense_pointmaps(
-        colors,
-        recon_from_camera,
-        pinhole,
-        choose_neighbours(tracks, recon_from_camera, options.neighbours),
-        sweep_planes(tracks, recon_from_camera),
-        device,
-        report,
-    )
     missing = [name for k, name in enumerate(capture.images) if k not in known]
     notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()
-    return Reconstruction(
-        image_index=np.array(known),
-        recon_from_camera=recon_from_camera,
-        intrinsics=lens,
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points,
-        confidence=confidence,
-        colors=colors,
-        tracks=tracks,
-        backend="given",
-        notes=notes,
-    )
+    sparse = SparseModel(np.array(known), recon_from_camera, lens, tracks, notes)
+    return with_pointmaps(sparse, images, options, report, backend="given")
 
 
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:

@@ -15,9 +15,11 @@ from scipy.optimize import least_squares
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, rotation_log, transform
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
-from jcr.reconstruct.lens import WITHIN_FOLD, fold_distance_px, pinhole_inside, undistort_image
+from jcr.reconstruct.dense import DenseOptions, SparseModel, with_pointmaps
+from jcr.reconstruct.lens import WITHIN_FOLD, fold_distance_px
+from jcr.reconstruct.views import sweep_planes
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 PRINTED = 0.002
@@ -34,19 +36,11 @@ REACH = 0.4
 
 
 @dataclass(frozen=True)
-class MarkerOptions:
+class MarkerOptions(DenseOptions):
     """Camera poses from a board."""
 
     board: str
     """What to look for, as `board.KINDS` has it."""
-    pointmap_size_px: int = 400
-    """Long side of the dense pointmaps."""
-    neighbours: int = 5
-    """Other images that each is compared with for its pointmap."""
-    dense: bool = True
-    """Off: cameras alone, with pointmaps of no confidence."""
-    device: str = "cpu"
-    """Where the plane sweep runs: cpu or cuda."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     Unknown intrinsics are calibrated from the board. Raises InputError for a board that is none, and
     NotTrustedError when fewer than three images show it.
     """
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     readings = boards(options.board)
     images = [read_image(capture.folder / name) for name in capture.images]
     report("board", 0.0)
@@ -93,36 +87,15 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     if len(recon_from_body) > 1:
         cameras, recon_from_body = _refined(cameras, recon_from_body, sightings, lens)
     tracks = _tracks(sightings, recon_from_body)
-    pinhole = pinhole_inside(lens, options.pointmap_size_px)
-    colors = np.stack([undistort_image(images[row], lens, pinhole) for row in rows])
-    points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
-    if options.dense:
-        from jcr.reconstruct.dense import dense_pointmaps
-        from jcr.reconstruct.views import choose_neighbours, sweep_planes
-
-        points, confidence = dense_pointmaps(
-            colors,
-            cameras,
-            pinhole,
-            choose_neighbours(tracks, cameras, options.neighbours),
-            sweep_planes(_raised(tracks, cameras), cameras, count=96),
-            options.device,
-            report,
-        )
-    return Reconstruction(
-        image_index=rows,
-        recon_from_camera=cameras,
-        intrinsics=lens,
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points,
-        confidence=confidence,
-        colors=colors,
-        tracks=tracks,
+    reconstruction = with_pointmaps(
+        SparseModel(rows, cameras, lens, tracks, tuple(notes)),
+        [images[row] for row in rows],
+        options,
+        report,
         backend="marker",
-        is_metric=True,
-        metric_std=PRINTED,
-        notes=tuple(notes),
+        planes=sweep_planes(_raised(tracks, cameras), cameras, count=96),
     )
+    return replace(reconstruction, is_metric=True, metric_std=PRINTED)
 
 
 def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) -> tuple[Intrinsics, list[str]]:

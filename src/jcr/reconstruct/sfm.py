@@ -9,18 +9,18 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 from PIL import Image
 
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
 from jcr.progress import Progress
+from jcr.reconstruct.dense import SparseModel
 from jcr.reconstruct.lens import fold_distance_px, resized
 from jcr.records import Intrinsics, Tracks
 
@@ -28,19 +28,6 @@ HALF_PIXEL = 0.5
 _MIN_REGISTERED = 3
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
-
-
-@dataclass(frozen=True)
-class SparseModel:
-    """Poses and points that structure from motion found."""
-
-    rows: Int[ndarray, " m"]
-    """Of the images given, those that were registered, ascending."""
-    recon_from_camera: Float[ndarray, "m 4 4"]
-    lens: Intrinsics
-    """Of the images given: the one given, or estimated."""
-    tracks: Tracks
-    notes: tuple[str, ...] = ()
 
 
 def structure_from_motion(
