@@ -18,7 +18,7 @@ from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions
 from jcr.represent.rays import NEAR, workspace_box, workspace_rays
 from jcr.represent.scene import SceneMap
-from jcr.represent.seen import HIT, SeenGrid, carve, dilate, halve
+from jcr.represent.seen import HIT, SeenGrid, carve, dilate, halve, without_doubts
 from jcr.represent.train import RECIPES, train
 
 
@@ -88,7 +88,7 @@ def build_scene(
         "carving_s": f"{carved - start:.3f}",
         "training_s": f"{time.perf_counter() - carved:.3f}",
     }
-    return SceneMap(fields, seen, cloud.label_names, history)
+    return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

@@ -92,11 +92,22 @@ def carve(
     for step in (0.0, -cell / 2):
         index, inside = seen.index(points_in_base + step * ray)
         flat[index[inside]] = flat[index[inside]] | HIT
-    # A ray shows its line, not the whole of a cell: next to the unseen, where no surface was found between, the
-    # rest of the cell may belong to a thing that gave no points.
-    unsure = dilate(seen.state == 0, 1) & ~dilate((seen.state & HIT) != 0, 1)
-    seen.state[unsure] = 0
     return seen
+
+
+def without_doubts(seen: SeenGrid) -> SeenGrid:
+    """The seen grid without what its rays leave open: a ray shows its line, not the whole of a cell.
+
+    Next to the unseen, the rest of a crossed cell may belong to a thing that gave no points there, unless a surface
+    was found in this very cell. And where a surface ends beside such a cell, the thing that it belongs to goes on:
+    its cells there can be solid, not free. (Otherwise thirteen times as much of the inside of things is called
+    free, all of it past the ends of what gave points.)
+    """
+    hit, state = (seen.state & HIT) != 0, seen.state.clone()
+    unsure = dilate(state == 0, 1) & ((state & CROSSED) != 0) & ~hit
+    state[unsure] = 0
+    state[dilate(unsure, 1) & hit] = HIT
+    return SeenGrid(seen.lower, seen.cell, state)
 
 
 def _before_nearest(
