@@ -13,8 +13,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jcr import __version__
 from jcr.auto import best_reconstruction
 from jcr.calibrate.calibrate import CalibrateOptions
@@ -220,9 +218,11 @@ def _map(
     if len(added):
         from jcr.reconstruct.added import extend
 
-        reconstruction = extend(reconstruction, result.hand_eye, added, device, progress or silent)
+        reconstruction = extend(
+            reconstruction, result.hand_eye, len(capture), added, device, progress or silent
+        )
         write_added(added, capture)
-    cloud, notes = _cloud(capture, reconstruction, len(added), result.hand_eye, options, progress)
+    cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
     write_cloud(folder / "cloud.ply", cloud)
     scene = build_scene(cloud, options.map, progress, device=device)
     scene.save(folder / "map.safetensors")
@@ -241,22 +241,17 @@ def _map(
 def _cloud(
     capture: Capture,
     reconstruction: Reconstruction,
-    added: int,
     hand_eye: HandEye,
     options: RunOptions,
     progress: Progress | None,
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """The labelled cloud, and what the user should know of its labels; the last `added` images came later."""
-    rows = np.append(
-        reconstruction.image_index[: len(reconstruction.image_index) - added], len(capture) + np.arange(added)
-    )
-    given = image_labels(
-        capture, replace(reconstruction, image_index=rows), hand_eye, options.segment, progress
-    )
+    """The labelled cloud, and what the user should know of its labels."""
+    given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
     cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
     cloud, notes = label_cloud(cloud, options.segment)
-    if added and options.segment.segments in ("auto", "labels") and given is not None:
+    added = reconstruction.image_index >= len(capture)
+    if added.any() and options.segment.segments in ("auto", "labels") and given is not None:
         notes += ("images added later have no label images; --segments tabletop labels what they show, too",)
     return cloud, notes
 

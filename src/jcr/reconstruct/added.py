@@ -34,14 +34,16 @@ LEAST_SHARE = 0.005
 def extend(
     reconstruction: Reconstruction,
     hand_eye: HandEye,
+    capture_size: int,
     added: Capture,
     device: str,
     report: Progress,
 ) -> Reconstruction:
     """The reconstruction with further images, oldest first, whose gripper poses are known.
 
-    Their rows come last; where a later image contradicts an earlier one, the earlier's confidence is 0. Raises
-    InputError for an image that shares no view with the others.
+    Their rows come last, numbered from `capture_size`, the images of the capture; where a later image contradicts
+    an earlier one, the earlier's confidence is 0. Raises InputError for an image that shares no view with the
+    others.
     """
     lens, pinhole = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
     base_from_camera = added.base_from_gripper @ hand_eye.gripper_from_camera
@@ -98,10 +100,9 @@ def extend(
                 pinhole,
             )
             confidence[earlier][gone] = 0.0
-    first = int(reconstruction.image_index.max()) + 1
     return replace(
         reconstruction,
-        image_index=np.concatenate([reconstruction.image_index, first + np.arange(new)]),
+        image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
         recon_from_camera=recon_from_camera,
         points_in_recon=points,
         confidence=confidence,
