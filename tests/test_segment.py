@@ -422,10 +422,11 @@ def tiny_sam(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_segment_anything_gives_distinct_masks_of_the_image(
-    tiny_sam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_sam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
     """A random network is sure of nothing: its masks pass once the thresholds are gone."""
     model = load_sam(str(tiny_sam))
+    assert capfd.readouterr() == ("", "")
     image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
     assert len(image_masks(model, image)) == 0
     monkeypatch.setattr("jcr.segment.sam.LEAST_QUALITY", -np.inf)

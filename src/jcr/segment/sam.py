@@ -43,9 +43,11 @@ OVERLAP = 0.5
 def load_sam(weights: str) -> "Sam2Model":
     """Segment Anything 2 by hub id or path; raises InputError, with the cure, where it cannot be had."""
     try:
-        from transformers import Sam2Model
+        from transformers import Sam2Model, logging
     except ImportError:
         raise InputError("--segments sam: transformers is not installed; pip install 'jcr[sam]'") from None
+    bars = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # loading takes moments, and --quiet means quiet
     try:
         model = Sam2Model.from_pretrained(weights)
     except (OSError, ValueError) as error:
@@ -54,6 +56,9 @@ def load_sam(weights: str) -> "Sam2Model":
         raise InputError(
             f"--sam-weights {weights}: cannot be loaded ({reason}); {hint or 'check the name'}"
         ) from None
+    finally:
+        if bars:
+            logging.enable_progress_bar()
     torch.nn.Module.to(model.eval(), "cuda" if torch.cuda.is_available() else "cpu")
     return model
 
