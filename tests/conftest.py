@@ -1,3 +1,4 @@
+import json
 import signal
 import subprocess
 import sys
@@ -6,12 +7,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
 
 ROOT = Path(__file__).parent.parent
+
+
+def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
+    """The first images of a capture and their poses, in `folder`, reduced to a width in pixels."""
+    (folder / "images").mkdir(parents=True)
+    content = json.loads((source / "capture.json").read_text())
+    frames, lens = content["frames"][:images], content["intrinsics"]
+    for frame in frames:
+        picture = Image.open(source / frame["image"])
+        scale = width / picture.width
+        size = width, round(picture.height * scale)
+        picture.resize(size, Image.Resampling.BOX).save(folder / frame["image"], quality=95)
+    lens = {
+        "fx": lens["fx"] * scale,
+        "fy": lens["fy"] * scale,
+        "cx": (size[0] - 1) / 2,
+        "cy": (size[1] - 1) / 2,
+    }
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    return folder
+
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A job in the background of a shell ignores Ctrl-C, and so would the commands that tests interrupt.
@@ -22,6 +45,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def tabletop() -> Path:
     """The bundled capture."""
     return ROOT / "examples" / "tabletop"
+
+
+@pytest.fixture(scope="session")
+def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
+    """Six pictures of the bundled capture, 200 pixels wide: a whole run takes seconds."""
+    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 6, 200)
 
 
 @pytest.fixture(scope="session")

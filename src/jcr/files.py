@@ -27,6 +27,12 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_unfinished(folder: Path) -> None:
+    """Delete what writers that were killed had begun in a folder."""
+    for begun in folder.glob(".*.????????.part*"):
+        begun.unlink()
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` to `path` whole or not at all."""
     with written_whole(path) as temporary:

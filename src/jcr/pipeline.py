@@ -6,6 +6,8 @@ capture -> reconstruct -> calibrate -> cloud -> map -> report
 import fcntl
 import hashlib
 import json
+import os
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,15 +27,16 @@ from jcr.calibrate.file import (
     read_calibration,
     write_calibration,
 )
+from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import read_cloud, write_cloud
-from jcr.files import write_text
+from jcr.files import remove_unfinished, write_text
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
-from jcr.reconstruct.file import read_reconstruction, write_reconstruction
+from jcr.reconstruct.file import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
@@ -48,6 +51,10 @@ CAPTURE = "capture"
 """In the run folder: images and poses that were read from another format than capture.json."""
 STATE = "run.json"
 """In the run folder: the capture, and what each finished stage was made from."""
+OF_CALIBRATION = ("cloud.ply", "map.safetensors", "report.html")
+"""In the run folder: what holds of one calibration alone."""
+LOCK = ".lock"
+"""In the run folder: held by the run that writes there."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,7 @@ def run(
     that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
-    with _run_folder(Path(out)) as folder:
+    with run_folder(Path(out)) as folder:
         capture = kept(capture, folder / CAPTURE)
         added = read_added(folder, capture)
         result = _calibrate(capture, folder, options, progress)
@@ -94,7 +101,7 @@ def calibrate(
 ) -> RunResult:
     """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
     options = _with_backend(options, backend, capture)
-    with _run_folder(Path(out)) as folder:
+    with run_folder(Path(out)) as folder:
         return _calibrate(kept(capture, folder / CAPTURE), folder, options, progress)
 
 
@@ -103,11 +110,12 @@ def calibrate_poses(
 ) -> PosesResult:
     """calibration.json in the folder `out` from camera poses that were given, without images."""
     start = time.perf_counter()
-    with _run_folder(Path(out)) as folder:
+    with run_folder(Path(out)) as folder:
         hand_eye = calibrate_poses_stage(pairs, options)
         timings = {"calibrate": round(time.perf_counter() - start, 3)}
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
-        write_calibration(folder / "calibration.json", content)
+        _forget_reconstruction(folder)
+        _replace_calibration(folder, content)
         _write_log(folder, content)
         return PosesResult(folder, content, hand_eye)
 
@@ -127,7 +135,7 @@ def build_map(
     not the calibration, and every later map of the folder has them.
     """
     capture = read_capture_of(out)
-    with _run_folder(Path(out)) as folder:
+    with run_folder(Path(out)) as folder:
         options = replace(
             options_of(out),
             cloud=cloud or CloudOptions(),
@@ -177,6 +185,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
             reconstruction = read_reconstruction(folder / "reconstruction.npz")
         else:
             reconstruction = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
+            (folder / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
             write_reconstruction(folder / "reconstruction.npz", reconstruction)
         state = {
             "capture": str(capture.folder.resolve()),
@@ -189,9 +198,11 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         hand_eye = calibrate_stage(capture, reconstruction, options.calibrate)
         report("calibrate", 1.0)
     except NotTrustedError as error:
+        if state.get("reconstruct") != made_from:  # what is there is another capture's, or of other options
+            _forget_reconstruction(folder)
         timings = {"reconstruct": round(time.perf_counter() - start, 3)}
         failed = failed_file(capture, candidates(options.reconstruct)[-1], str(error), timings, __version__)
-        write_calibration(folder / "calibration.json", failed)
+        _replace_calibration(folder, failed)
         _write_log(folder, failed)
         _report_failure(capture, folder, failed)
         raise
@@ -200,7 +211,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         "calibrate": round(time.perf_counter() - reconstructed, 3),
     }
     content = calibration_file(capture, reconstruction, hand_eye, timings, __version__)
-    write_calibration(folder / "calibration.json", content)
+    _replace_calibration(folder, content)
     _write_log(folder, content)
     return RunResult(folder, content, hand_eye, reconstruction)
 
@@ -288,11 +299,15 @@ def _with_backend(options: RunOptions | None, backend: str | None, capture: Capt
 
 
 @contextmanager
-def _run_folder(folder: Path) -> Iterator[Path]:
-    """The folder, made and held, so that a second run on it writes nothing between the first one's files."""
+def run_folder(folder: Path) -> Iterator[Path]:
+    """The folder, made and held, so that a second run on it writes nothing between the first one's files.
+
+    What a killed run had begun to write is removed, and so is a new folder into which nothing came.
+    """
+    new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
+        lock = (folder / LOCK).open("w")
     except (FileExistsError, NotADirectoryError):
         raise InputError(f"{folder}: is a file; name a folder for the results") from None
     except OSError as error:
@@ -304,7 +319,31 @@ def _run_folder(folder: Path) -> Iterator[Path]:
             raise InputError(
                 f"{folder}: another jcr is writing there; wait for it or choose another"
             ) from None
-        yield folder
+        for place in (folder, *(folder / CAPTURE).rglob("."), folder / ADDED):
+            remove_unfinished(place)
+        try:
+            yield folder
+        finally:
+            if new and os.listdir(folder) == [LOCK]:
+                shutil.rmtree(folder)
+
+
+def _forget_reconstruction(folder: Path) -> None:
+    for name in (STATE, "reconstruction.npz"):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _replace_calibration(folder: Path, content: CalibrationFile) -> None:
+    """Write calibration.json; what was made from another one goes first, so that the two are never mixed."""
+    passing = {"timings_s", "warnings", "version"}
+    try:
+        same = read_calibration(folder).model_dump(exclude=passing) == content.model_dump(exclude=passing)
+    except InputError:
+        same = False
+    if not same:
+        for name in OF_CALIBRATION:
+            (folder / name).unlink(missing_ok=True)
+    write_calibration(folder / "calibration.json", content)
 
 
 def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
@@ -321,7 +360,7 @@ def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
         files = sorted(weights.iterdir()) if weights.is_dir() else [weights] if weights.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         options = options | {"weights": states or options["weights"]}
-    digest.update(json.dumps([lens, options, __version__], sort_keys=True).encode())
+    digest.update(json.dumps([lens, options, __version__, FORMAT], sort_keys=True).encode())
     return digest.hexdigest()
 
 

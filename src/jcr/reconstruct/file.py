@@ -13,7 +13,8 @@ from jcr.errors import InputError
 from jcr.files import written_whole
 from jcr.records import CameraEvidence, Intrinsics, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/1"
+FORMAT = "jcr.reconstruction/2"
+"""Changes with what the file holds."""
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -56,7 +57,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             about = json.loads(str(file["about"]))
             if about["format"] != FORMAT:
                 raise InputError(
-                    f"{path}: format {about['format']!r}, not {FORMAT!r}; use the jcr that wrote it"
+                    f"{path}: format {about['format']!r}, not {FORMAT!r}; delete it and run again"
                 )
             return Reconstruction(
                 image_index=file["image_index"],

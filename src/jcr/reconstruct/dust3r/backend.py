@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.errors import NotTrustedError
 from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.alignment import AlignOptions
@@ -59,9 +60,19 @@ def reconstruct(
     images, predictions, notes = predict(capture, options, progress)
     rows = np.arange(len(capture))
     poses = capture.base_from_gripper
-    return reconstruction_from_pairs(
-        images, rows, predictions, poses, options.align, backend=options.model, notes=notes, progress=progress
-    )
+    try:
+        return reconstruction_from_pairs(
+            images,
+            rows,
+            predictions,
+            poses,
+            options.align,
+            backend=options.model,
+            notes=notes,
+            progress=progress,
+        )
+    except NotTrustedError as error:  # what was used, and its licence, are worth knowing all the same
+        raise NotTrustedError("; ".join([str(error), *notes])) from None
 
 
 def reconstruction_from_pairs(

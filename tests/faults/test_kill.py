@@ -1,0 +1,148 @@
+"""A run that is killed at any moment leaves whole files, and the same command ends as if nothing had happened."""
+
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from jcr.calibrate.file import read_calibration
+from jcr.cli import dispatch
+from jcr.export.points import read_cloud
+from jcr.reconstruct.file import read_reconstruction
+from jcr.represent.scene import load_map
+
+KILLS = int(os.environ.get("JCR_TEST_KILLS", "4"))
+WRITES = 8
+"""Files that a run writes, some of them twice."""
+
+
+@dataclass
+class Run:
+    """`jcr run` of a capture as a process of its own."""
+
+    capture: Path
+    out: Path
+    process: subprocess.Popen[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        command = [sys.executable, "-m", "jcr", "run", str(self.capture), str(self.out), "--quiet"]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    def finish(self) -> None:
+        _, told = self.process.communicate(timeout=300)
+        assert self.process.returncode in (0, 3), told
+
+    def wait_for_lock(self) -> None:
+        """Until the run writes; what is killed before has done nothing."""
+        while self.process.poll() is None and not (self.out / ".lock").exists():
+            time.sleep(0.01)
+
+    def kill_after(self, seconds: float) -> bool:
+        """Kill it after so many seconds of work; False where it was done before."""
+        self.wait_for_lock()
+        try:
+            self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._kill()
+        return self._was_killed()
+
+    def kill_while_writing(self, number: int) -> bool:
+        """Kill it while it writes its file of that number; False where it was done before."""
+        seen: set[str] = set()
+        while self.process.poll() is None and len(seen) < number:
+            if self.out.is_dir():
+                seen |= {name for name in os.listdir(self.out) if ".part" in name}
+            time.sleep(2e-4)
+        self._kill()
+        return self._was_killed()
+
+    def _kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def _was_killed(self) -> bool:
+        assert self.process.returncode in (0, 3, -9), self.process.communicate()[1]
+        self.process.communicate()
+        return self.process.returncode == -9
+
+
+READERS = {
+    "calibration.json": read_calibration,
+    "reconstruction.npz": read_reconstruction,
+    "cloud.ply": read_cloud,
+    "map.safetensors": load_map,
+    "run.json": lambda path: json.loads(path.read_text()),
+    "report.html": lambda path: path.read_text().rindex("</html>"),
+    "log.txt": lambda path: path.read_text().rindex("\n"),
+}
+
+
+def check_whole(out: Path) -> None:
+    """Every file of a run folder is what it should be, or is not there; what was begun is beside it."""
+    for path in out.iterdir():
+        if path.name in READERS:
+            READERS[path.name](path)
+        else:
+            assert path.name == ".lock" or ".part" in path.name, path
+
+
+def results(out: Path) -> dict[str, object]:
+    """All that a run found, without the time it took."""
+    with np.load(out / "reconstruction.npz") as arrays:
+        reconstruction = {name: arrays[name].tobytes() for name in arrays.files}
+    calibration = json.loads((out / "calibration.json").read_text())
+    del calibration["timings_s"]
+    return {
+        "calibration": calibration,
+        "reconstruction": reconstruction,
+        "map": {name: array.tobytes() for name, array in load_file(out / "map.safetensors").items()},
+        "cloud": (out / "cloud.ply").read_bytes(),
+        "log": [line for line in (out / "log.txt").read_text().splitlines() if not line.endswith(" s")],
+        "files": sorted(path.name for path in out.iterdir()),
+    }
+
+
+def test_a_killed_run_leaves_whole_files_and_resumes_to_the_same_calibration(
+    small_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """JCR_TEST_KILLS=100 for a hundred; half at a random moment, half while a random file is written."""
+    draw = random.Random(0)
+    undisturbed = Run(small_capture, tmp_path / "undisturbed")
+    undisturbed.wait_for_lock()
+    start = time.monotonic()
+    assert dispatch(["run", str(small_capture), str(undisturbed.out), "--quiet"]) == 2
+    assert "another jcr is writing there; wait for it" in capsys.readouterr().err
+    undisturbed.finish()
+    working_s = time.monotonic() - start
+    expected = results(undisturbed.out)
+    killed = finished = writing = 0
+    out = tmp_path / "out0"
+    while killed < KILLS:
+        run = Run(small_capture, out)
+        while_writing = draw.random() < 0.5
+        if while_writing:
+            died = run.kill_while_writing(draw.randint(1, WRITES))
+        else:
+            died = run.kill_after(draw.uniform(0, working_s))
+        if not died:
+            assert results(out) == expected
+            finished, out = finished + 1, tmp_path / f"out{finished + 1}"
+        elif out.is_dir():
+            killed += 1
+            writing += any(".part" in path.name for path in out.iterdir())
+            check_whole(out)
+    Run(small_capture, out).finish()
+    assert results(out) == expected
+    with capsys.disabled():
+        if KILLS > 10:
+            sys.stdout.write(
+                f"{killed} kills, {writing} of them while a file was written, {finished + 1} ends\n"
+            )
