@@ -49,8 +49,8 @@ def tabletop() -> Path:
 
 @pytest.fixture(scope="session")
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """Six pictures of the bundled capture, 200 pixels wide: a whole run takes seconds."""
-    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 6, 200)
+    """Four pictures of the bundled capture, 200 pixels wide: a whole run takes seconds."""
+    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 4, 200)
 
 
 @pytest.fixture(scope="session")
