@@ -17,6 +17,8 @@ Transforms = Float[ndarray, "*batch 4 4"]
 Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
 
+HUGE = 1e15
+"""No length or reconstruction has larger numbers, and sums of their squares stay far from overflow."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of RᵀR − I accepted as rounding; transforms printed with four digits pass."""
 
@@ -120,8 +122,10 @@ def require_rigid(matrix: Float[ndarray, "4 4"], where: str) -> Float[ndarray, "
 
     `where` begins the message: the file and frame, or the argument, that the matrix came from.
     """
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where}: holds NaN or infinity; record that pose again or drop the frame")
+    if not (np.abs(matrix) < HUGE).all():
+        raise InputError(
+            f"{where}: holds NaN or infinity (or beyond {HUGE:.0e}); record that pose again or drop the frame"
+        )
     if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], atol=1e-9)
         hint = "it is transposed (column-major): transpose it" if transposed else "write 0 0 0 1"

@@ -42,8 +42,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         log_ns, stamp_ns, info = [], [], None
         tree, joint_states = TfTree(), []
         span = max(reader.end_time - reader.start_time, 1)
-        for connection, at, raw in reader.messages([*cameras, *infos[:1], *pose_connections]):
-            message: Any = reader.deserialize(raw, connection.msgtype)
+        for connection, at, message in _messages(reader, [*cameras, *infos[:1], *pose_connections], path):
             if connection.msgtype in TF:
                 tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
             elif connection.msgtype == JOINTS:
@@ -64,8 +63,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
             for row in rows.tolist():
                 at = int(logs[row])
-                for connection, _, raw in reader.messages(cameras, start=at, stop=at + 1):
-                    message: Any = reader.deserialize(raw, connection.msgtype)
+                for _, _, message in _messages(reader, cameras, path, start=at, stop=at + 1):
                     if _stamp(message, at) == stamps[row]:
                         yield row, *picture_of(message, f"{path}: {topic}")
                         break
@@ -95,10 +93,22 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from None
     try:
         yield reader
-    except (highlevel.AnyReaderError, EOFError, AssertionError) as error:
-        raise InputError(f"{path}: damaged ({error}); repair it with the tool that recorded it") from None
     finally:
         reader.close()
+
+
+def _messages(reader: Any, connections: list[Any], path: Path, **span: int) -> Iterator[tuple[Any, int, Any]]:
+    """Connection, time of recording (ns) and content of each message; InputError where the bag is damaged."""
+    recorded = reader.messages(connections, **span)
+    while True:
+        try:
+            connection, at, raw = next(recorded)
+            message = reader.deserialize(raw, connection.msgtype)
+        except StopIteration:
+            return
+        except Exception as error:  # each storage raises its own errors, struct and KeyError among them
+            raise InputError(f"{path}: damaged ({error}); repair it with the tool that recorded it") from None
+        yield connection, at, message
 
 
 def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:

@@ -39,6 +39,8 @@ def lens_of_ros(
 
     Raises InputError for a lens that OpenCV's five coefficients cannot say, or of another resolution.
     """
+    if not all(isinstance(value, Sequence) for value in (matrix, coefficients, calibrated_size)):
+        raise InputError(f"{where}: the camera matrix and the distortion must be lists of numbers")
     if len(matrix) != 9:
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):

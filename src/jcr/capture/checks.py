@@ -47,7 +47,7 @@ def checked_lens(
     try:
         fx, fy, cx, cy = (float(value) for value in focal_and_centre)
         coefficients = [float(k) for k in distortion]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(
             f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null"
         ) from None
@@ -71,7 +71,7 @@ def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
     """A rigid 4x4 from nested lists; InputError saying how far from rigid it is and what it looks like."""
     try:
         matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where}: not a 4x4 matrix of numbers; write four rows of four") from None
     if matrix.shape != (4, 4):
         raise InputError(f"{where}: shape {matrix.shape}, not 4x4; write four rows of four numbers")

@@ -3,6 +3,7 @@
 COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from world.
 """
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +62,14 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
     """The model; InputError when it cannot be read."""
     import pycolmap
 
+    for name, check in (("images.bin", _check_images), ("points3D.bin", _check_points)):
+        if (folder / name).is_file():
+            try:
+                check((folder / name).read_bytes())
+            except (struct.error, ValueError):
+                raise InputError(
+                    f"{folder / name}: cut short or damaged; export the COLMAP model again"
+                ) from None
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     try:
@@ -70,6 +79,30 @@ def read_model(folder: Path) -> "pycolmap.Reconstruction":
         raise InputError(f"{folder}: not a readable COLMAP model ({reason[0]}); export it again") from None
     finally:
         pycolmap.logging.minloglevel = before
+
+
+def _check_images(data: bytes) -> None:
+    """Raise where counts lead past the end: COLMAP would read on for minutes. Layout: colmap.github.io/format."""
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        name = at + 64  # after its number, a rotation, a translation, the camera's number
+        at = data.index(b"\0", name) + 1
+        data[name:at].decode()
+        at += 8 + 24 * struct.unpack_from("<Q", data, at)[0]
+    _check_end(data, at)
+
+
+def _check_points(data: bytes) -> None:
+    """The same of the points with their tracks."""
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+    _check_end(data, at)
+
+
+def _check_end(data: bytes, at: int) -> None:
+    if at != len(data):
+        raise ValueError("counts do not lead to the end")
 
 
 def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:

@@ -45,7 +45,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise
     except Image.DecompressionBombError:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except Exception as error:  # decoders raise whatever a damaged file makes them
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
 
 

@@ -32,7 +32,7 @@ def read(path: Path, options: ReadOptions) -> Capture:
         pose = read_yaml(pose_file)
         try:
             numbers.append([float(pose[key]) for key in _KEYS])
-        except (TypeError, KeyError, ValueError):
+        except (TypeError, KeyError, ValueError, OverflowError):
             raise InputError(f"{pose_file}: needs the numbers {', '.join(_KEYS)}") from None
         images.append(str(entry["image"]))
     rows = np.reshape(np.array(numbers, dtype=np.float64), (-1, 7))

@@ -37,6 +37,8 @@ def read_yaml(file: Path) -> Any:
         raise InputError(f"{file}: not YAML{place}: {problem}; correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply; write it plainly") from None
+    except ValueError as error:  # dates that are none, numbers of thousands of digits
+        raise InputError(f"{file}: a value that cannot be ({error}); correct it there") from None
 
 
 def read_json(file: Path) -> Any:
@@ -57,6 +59,10 @@ def read_json(file: Path) -> Any:
         raise InputError(
             f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         ) from None
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: a number that is none ({error}); correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
     except OSError as error:

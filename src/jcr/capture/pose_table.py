@@ -83,6 +83,8 @@ def stamp_ns(text: str, where: str) -> int:
     try:
         value = Decimal(text)
         size = abs(value)
+        if not size < 10**20:
+            raise ValueError
         return int(
             value * (10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1)
         )

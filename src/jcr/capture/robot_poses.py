@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.capture.options import UnitsName
 from jcr.errors import InputError
-from jcr.geometry import require_rigid, transform
+from jcr.geometry import HUGE, require_rigid, transform
 
 QUATERNION_TOLERANCE = 1e-2
 """On its length; three printed digits pass."""
@@ -84,9 +84,12 @@ def poses_from_numbers(
     Raises InputError on numbers that are no pose, and on units that cannot be meant.
     """
     form = CONVENTIONS[convention]
-    if not np.isfinite(numbers).all():
-        row = int(np.argmax(~np.isfinite(numbers).all(1)))
-        raise InputError(f"{where}: pose {row + 1} holds NaN or infinity; record it again or drop the row")
+    sound = (np.abs(numbers) < HUGE).all(1)
+    if not sound.all():
+        row = int(np.argmin(sound))
+        raise InputError(
+            f"{where}: pose {row + 1} holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
+        )
     position_unit, angle_unit = _units(form, units)
     if form.rotation is None:
         matrices = numbers.reshape(-1, 4, 4)

@@ -82,6 +82,6 @@ def _parts(entry: Any, key: str, where: str) -> Float[ndarray, "4 4"]:
         part = entry[key]
         numbers = [float(part["translation"][axis]) for axis in "xyz"]
         numbers += [float(part["rotation"][axis]) for axis in "xyzw"]
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, OverflowError):
         raise InputError(f"{where}: {key} needs translation x, y, z and rotation x, y, z, w") from None
     return poses_from_numbers(np.array([numbers]), "quat-xyzw", "m-rad", f"{where}: {key}")[0]

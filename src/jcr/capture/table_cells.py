@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -57,10 +56,10 @@ def read_cells(file: Path) -> Cells:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number."""
+    """Whether a cell is a number, as Python's own floats are written."""
     try:
-        Decimal(cell)
-    except InvalidOperation:
+        float(cell)
+    except ValueError:
         return False
     return True
 
@@ -88,7 +87,7 @@ def _array(file: Path) -> tuple[list[str] | None, list[list[str]]]:
     """The same of a NumPy array: a structured one has a header, matrices are rows of their numbers."""
     try:
         array = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # NumPy reads a header with Python's own parser, which has errors of its own
         raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
     if isinstance(array, np.ndarray) and array.dtype.names is not None and array.ndim == 1:
         return list(array.dtype.names), [[str(value) for value in row] for row in array.tolist()]

@@ -76,14 +76,18 @@ def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
     if first.get("k4"):
         raise InputError(f"{file}: a distortion with k4, which jcr does not know; undistort the images")
     width, height = size
-    if (first.get("w", width), first.get("h", height)) != size:
+    made_for = (first.get("w", width), first.get("h", height))
+    if made_for != size:
         raise InputError(
-            f"{file}: w, h are {first['w']}x{first['h']}, the images are {width}x{height}; make it fit"
+            f"{file}: w, h are {made_for[0]}x{made_for[1]}, the images are {width}x{height}; make it fit"
         )
     if "fl_x" not in first and "camera_angle_x" not in first:
         raise InputError(f"{file}: no fl_x, fl_y, cx, cy (or camera_angle_x); add the intrinsics")
-    focal = first.get("fl_x") or width / 2 / math.tan(float(first["camera_angle_x"]) / 2)
-    centre = (first.get("cx", width / 2), first.get("cy", height / 2))
-    numbers = [focal, first.get("fl_y", focal), *(float(value) - HALF_PIXEL for value in centre)]
+    try:
+        focal = first.get("fl_x") or width / 2 / math.tan(float(first["camera_angle_x"]) / 2)
+        centre = (first.get("cx", width / 2), first.get("cy", height / 2))
+        numbers = [focal, first.get("fl_y", focal), *(float(value) - HALF_PIXEL for value in centre)]
+    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError):
+        raise InputError(f"{file}: fl_x, fl_y, cx, cy and camera_angle_x must be numbers") from None
     distortion = [first.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return checked_lens(numbers, distortion, size, str(file))

@@ -60,8 +60,16 @@ def read_cloud(path: Path) -> PointCloud:
     if len(body) % _VERTEX.itemsize:
         raise InputError(f"{path}: the cloud is cut short; make it again with jcr map OUT")
     vertices = np.frombuffer(body, _VERTEX)
-    centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
-    names = tuple(word[3] for word in words if word[:2] == ["comment", "label"])
+    if not all(np.isfinite(vertices[name]).all() for name in _VERTEX.names or ()):
+        raise InputError(
+            f"{path}: the cloud is damaged (a number is not finite); make it again with jcr map OUT"
+        )
+    try:
+        centers = [[float(x) for x in word[3].split()] for word in words if word[:2] == ["comment", "camera"]]
+        names = tuple(word[3] for word in words if word[:2] == ["comment", "label"])
+        camera_centers = np.array(centers, np.float64).reshape(-1, 3)
+    except (ValueError, IndexError):
+        raise InputError(f"{path}: the cloud's header is damaged; make it again with jcr map OUT") from None
     return PointCloud(
         points_in_base=np.stack([vertices[name] for name in "xyz"], 1).astype(np.float64),
         color=np.stack([vertices[name] for name in ("red", "green", "blue")], 1),
@@ -69,6 +77,6 @@ def read_cloud(path: Path) -> PointCloud:
         margin=vertices["margin"].astype(np.float64),
         label=vertices["label"].astype(int),
         image=vertices["image"].astype(int),
-        camera_centers_in_base=np.array(centers).reshape(-1, 3),
+        camera_centers_in_base=camera_centers,
         label_names=names,
     )

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.live.asks import Answer, Ask, pose_of_numbers
@@ -74,10 +76,14 @@ def _served(client: socket.socket, listen: Listen):
     """Requests of one client; returns whether it said that it is done."""
     stream = client.makefile("rb")
     welcome = listen.token is None
+    if not welcome:
+        client.settimeout(ANSWER_S)  # a stranger who says nothing must not keep others waiting
     while True:
         try:
             line = stream.readline(MAX_LINE + 1)
         except TimeoutError:
+            if not welcome:
+                return False
             raise _silence(listen) from None
         except OSError:
             return False
@@ -86,13 +92,14 @@ def _served(client: socket.socket, listen: Listen):
         if len(line) > MAX_LINE:
             _dismiss(client, f"a line of more than {MAX_LINE} bytes")
             return False
-        message = _parsed(line)
+        message = parsed(line)
         if not welcome:
             given = message.get("token") if isinstance(message, dict) else None
             if not hmac.compare_digest(str(given).encode(), str(listen.token).encode()):
                 _dismiss(client, "the first line must be the right token")
                 return False
             welcome = True
+            client.settimeout(listen.timeout_s)
             _answer(client, {"accepted": True})
         elif isinstance(message, dict) and message.get("done") is True:
             return True
@@ -100,12 +107,13 @@ def _served(client: socket.socket, listen: Listen):
             _answer(client, _refusal(message))
         else:
             try:
-                yield _ask(message, client)
+                yield Ask(pose_of(message), lambda answer: _answer(client, answer))
             except InputError as error:
                 _answer(client, _refusal(str(error)))
 
 
-def _parsed(line: bytes) -> dict[str, Any] | str:
+def parsed(line: bytes) -> dict[str, Any] | str:
+    """The object on a line, or what is wrong with it."""
     try:
         message = json.loads(line)
     except (ValueError, RecursionError):
@@ -113,14 +121,15 @@ def _parsed(line: bytes) -> dict[str, Any] | str:
     return message if isinstance(message, dict) else "not a JSON object"
 
 
-def _ask(message: dict[str, Any], client: socket.socket) -> Ask:
+def pose_of(message: dict[str, Any]) -> Float[ndarray, "4 4"]:
+    """base_from_gripper of a message; InputError where it has none."""
     if "base_from_gripper" not in message:
         raise InputError('no "base_from_gripper" in the line; send 4 rows of 4 numbers in metres')
     try:
         numbers = np.array(message["base_from_gripper"], dtype=np.float64).ravel().tolist()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError("base_from_gripper: not numbers; send 4 rows of 4 in metres") from None
-    return Ask(pose_of_numbers(numbers, "base_from_gripper"), lambda answer: _answer(client, answer))
+    return pose_of_numbers(numbers, "base_from_gripper")
 
 
 def _answer(client: socket.socket, answer: Answer) -> None:

@@ -1,7 +1,6 @@
 """reconstruction.npz: a Reconstruction on disk, from which calibration and map can be made again."""
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -82,9 +81,9 @@ def read_reconstruction(path: Path) -> Reconstruction:
             )
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
 
 

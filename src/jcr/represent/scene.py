@@ -3,6 +3,7 @@
 import json
 import threading
 from dataclasses import asdict
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
@@ -230,7 +231,8 @@ class SceneMap:
         tensors = {f"fields.{name}": value for name, value in self.fields.state_dict().items()}
         tensors |= {"seen": self.seen.state, "lower": self.seen.lower}
         tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
-        write_bytes(path, save(tensors, metadata={"format": FORMAT, "about": json.dumps(about)}))
+        metadata = {"format": FORMAT, "about": json.dumps(about), "digest": _digest(tensors)}
+        write_bytes(path, save(tensors, metadata=metadata))
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> SceneMap:
@@ -252,10 +254,22 @@ def load_map(folder: str | Path, device: str = "cpu") -> SceneMap:
     if metadata.get("format") != FORMAT:
         found = metadata.get("format", "no map of jcr")
         raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
+    if metadata.get("digest") != _digest(tensors):
+        raise InputError(
+            f"{path}: the map file is damaged (its numbers changed since it was written); {again}"
+        )
     try:
         return _from_tensors(tensors, json.loads(metadata["about"])).to(device)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
         raise InputError(f"{path}: the map file is damaged ({error!r}); {again}") from None
+
+
+def _digest(tensors: dict[str, Tensor]) -> str:
+    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
+    digest = blake2b(digest_size=16)
+    for name in sorted(tensors):
+        digest.update(name.encode() + tensors[name].numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:

@@ -1,0 +1,51 @@
+"""A coverage-guided fuzzer on one reader: python tests/fuzz/parsers.py poses.csv -max_total_time=600
+
+Needs atheris (pip install atheris). The names are those of tests/fuzz_targets.py, and `line` is the protocol of
+`jcr capture`; further arguments are libFuzzer's. Whatever is neither read nor refused with an InputError is
+written to crash-… in the current folder: make a test of it.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import atheris
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+with atheris.instrument_imports(
+    include=["jcr.capture", "jcr.calibrate.file", "jcr.export.points", "jcr.live", "yaml"]
+):
+    from fuzz_targets import targets
+    from jcr.errors import InputError
+    from jcr.live.line_server import parsed, pose_of
+
+
+def main() -> None:
+    """Fuzz the reader that the first argument names, from its valid file."""
+    name = sys.argv.pop(1)
+    folder = Path(tempfile.mkdtemp(prefix="jcr-fuzz-"))
+    corpus = folder / "corpus"
+    corpus.mkdir()
+    if name == "line":
+        (corpus / "valid").write_bytes(b'{"base_from_gripper": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}\n')
+
+        def feed(data: bytes) -> None:
+            message = parsed(data)
+            if isinstance(message, dict):
+                pose_of(message)
+    else:
+        target = targets(folder / "targets")[name]
+        (corpus / "valid").write_bytes(target.file.read_bytes())
+        feed = target.feed
+
+    def once(data: bytes) -> None:
+        try:
+            feed(data)
+        except InputError:
+            return
+
+    atheris.Setup([*sys.argv, str(corpus), "-timeout=20", "-rss_limit_mb=4096"], once)
+    atheris.Fuzz()
+
+
+main()

@@ -1,0 +1,95 @@
+"""Hostile bytes and hostile numbers: a right reading, an InputError or an honest doubt, and nothing else.
+
+JCR_TEST_FUZZ=20 looks twenty times as long; tests/fuzz has the harness of a coverage-guided fuzzer.
+"""
+
+import os
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fuzz_targets import Target, targets
+from jcr.errors import InputError
+
+LONGER = int(os.environ.get("JCR_TEST_FUZZ", "1"))
+TOKENS = [
+    b"NaN", b"-Infinity", b"1e999", b"1e-999", b"sNaN", b"1e99999999", b"9" * 5000, b"0x10", b"null", b"true", b"{}",
+    b"[]", b"[[", b"}", b'"', b"'", b",", b":", b"\n", b"\t", b"- ", b"&a [*a]", b"*a", b"2001-99-99",
+    b"!!python/name:os", b"? [x]\n: y", b"<<: 1", b"../", b"/etc/passwd", b"\0", b"\xff\xfe",
+    b"\x1f\x8b", b"\xe2\x80\xa8", b"-1", b"0",
+    b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"PK\x03\x04", b"\x93NUMPY\x03\x00",
+]  # fmt: skip
+bounded = settings(
+    max_examples=40 * LONGER,
+    derandomize=LONGER == 1,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@st.composite
+def changes(draw: st.DrawFn) -> list[tuple[float, str, int, bytes]]:
+    """Where in a file (a share of its length), what is done there, to how many bytes, and with which."""
+    what = st.sampled_from(["replace", "insert", "delete", "repeat", "flip", "cut"])
+    new = st.one_of(st.sampled_from(TOKENS), st.binary(min_size=1, max_size=8))
+    where = st.floats(0, 1, exclude_max=True)
+    return draw(st.lists(st.tuples(where, what, st.integers(1, 64), new), min_size=1, max_size=4))
+
+
+def changed(data: bytes, edits: list[tuple[float, str, int, bytes]]) -> bytes:
+    for share, what, length, new in edits:
+        at = int(share * len(data))
+        before, here, after = data[:at], data[at : at + length], data[at + length :]
+        data = {
+            "replace": before + new + data[at + len(new) :],
+            "insert": before + new + data[at:],
+            "delete": before + after,
+            "repeat": before + here * 3 + after,
+            "flip": before + bytes(byte ^ 1 << length % 8 for byte in here[:1]) + data[at + 1 :],
+            "cut": before,
+        }[what]
+    return data
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+    return targets(tmp_path_factory.mktemp("fuzz") / "targets")
+
+
+NAMES = [
+    "calibration.json", "camera_info.yaml", "cal_data.yaml", "cameras.bin", "capture.json", "cloud.ply",
+    "episode.parquet", "images.bin", "map.safetensors", "pairs.npz", "picture.bmp", "picture.gif", "picture.jpg",
+    "picture.png", "picture.tif", "picture.webp", "points.csv", "points.npy", "points.ply", "pose.yaml", "poses.csv",
+    "poses.npy", "poses.tsv", "poses.txt", "reconstruction.npz", "reference.json", "samples.yaml", "scan.bag",
+    "scan.mcap", "transforms.json", "weights.pth", "wrist.samples",
+]  # fmt: skip
+
+
+def test_every_target_reads_as_it_is(readers: dict[str, Target]):
+    assert sorted(readers) == sorted(NAMES)
+    for name, target in readers.items():
+        try:
+            target.read(target.file)
+        except InputError:
+            assert name == "weights.pth"  # of no network
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]):
+    target = readers[name]
+    valid = target.file.read_bytes()
+
+    @bounded
+    @given(changes())
+    def feed(edits: list[tuple[float, str, int, bytes]]) -> None:
+        try:
+            target.feed(changed(valid, edits))
+        except InputError as error:
+            assert "\0" not in str(error)
+
+    try:
+        feed()
+    finally:
+        target.file.write_bytes(valid)
