@@ -4,13 +4,20 @@ JCR_TEST_FUZZ=20 looks twenty times as long; tests/fuzz has the harness of a cov
 """
 
 import os
+from dataclasses import replace
+from typing import get_args
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import jcr
 from fuzz_targets import Target, targets
 from jcr.errors import InputError
+from jcr.geometry import rotation_exp, transform
+from jcr.simulate.poses import Pattern
+from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
 LONGER = int(os.environ.get("JCR_TEST_FUZZ", "1"))
 TOKENS = [
@@ -21,7 +28,7 @@ TOKENS = [
     b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"PK\x03\x04", b"\x93NUMPY\x03\x00",
 ]  # fmt: skip
 bounded = settings(
-    max_examples=40 * LONGER,
+    max_examples=60 * LONGER,
     derandomize=LONGER == 1,
     deadline=None,
     database=None,
@@ -93,3 +100,39 @@ def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]
         feed()
     finally:
         target.file.write_bytes(valid)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> tuple[HandEyeProblem, bool]:
+    """Poses of 2 to 14 images, degenerate, noisy, wrong or doubled as it comes; and whether their unit is true."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    robot = [size * draw(st.sampled_from([0, 1e-3, 0.3, 1, 5])) for size in (1e-3, np.radians(0.3))]
+    camera = [size * draw(st.sampled_from([0, 0.3, 3])) for size in (1e-3, np.radians(0.1))]
+    count = draw(st.integers(2, 14))
+    pattern = draw(st.sampled_from(["varied", *get_args(Pattern)]))
+    deviation = draw(st.sampled_from([0.0, 1e-6, 1e-3, 0.05, 0.3]))
+    problem = hand_eye_problem(rng, count, pattern, (robot[0], robot[1]), (camera[0], camera[1]), deviation)
+    gripper, cameras = problem.base_from_gripper.copy(), problem.recon_from_camera.copy()
+    for wrong in rng.permutation(len(gripper))[: draw(st.integers(0, max(0, (count - 1) // 3)))]:
+        turn = rotation_exp(rng.normal(size=3) * draw(st.sampled_from([0, 0.05, 1])))
+        off = rng.normal(size=3) * draw(st.sampled_from([0.005, 0.05, 0.5]))
+        gripper[wrong] = gripper[wrong] @ transform(turn, off)
+    if draw(st.booleans()):
+        gripper[0], cameras[0] = gripper[-1], cameras[-1]
+    unit = draw(st.sampled_from([1.0, 1.0, 1e-9, 1e9]))
+    cameras[:, :3, 3] *= unit
+    return replace(problem, base_from_gripper=gripper, recon_from_camera=cameras), unit == 1.0
+
+
+@settings(bounded, max_examples=120 * LONGER)
+@given(poses())
+def test_no_poses_make_the_solver_fail_or_trust_what_is_wrong(given_poses: tuple[HandEyeProblem, bool]):
+    problem, unit_is_true = given_poses
+    solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    if solved.converged:
+        off = error(problem, solved.gripper_from_camera, solved.scale)
+        std = np.sqrt(np.diag(solved.covariance))
+        known = slice(None) if unit_is_true else slice(6)
+        assert (np.abs(off) <= 5 * std + 1e-7)[known].all(), off / std
+    else:
+        assert solved.warnings

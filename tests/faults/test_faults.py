@@ -22,6 +22,7 @@ import pytest
 import torch
 from PIL import Image
 
+from jcr import pipeline
 from jcr.calibrate.calibrate import calibrate
 from jcr.calibrate.file import read_calibration
 from jcr.capture.read import read_capture
@@ -32,7 +33,6 @@ from jcr.simulate.problem import hand_eye_problem
 
 SIZE = (96, 72)
 COUNT = 6
-EXECUTED = Path("/tmp/jcr-fault-executed")
 
 
 @dataclass(frozen=True)
@@ -194,11 +194,19 @@ def query(case: Case) -> list[str]:
     return ["query", str(case.done), str(points)]
 
 
+@dataclass(frozen=True)
 class Evil:
     """Unpickling it writes a file."""
 
+    file: Path
+
     def __reduce__(self):
-        return Path.touch, (EXECUTED,)
+        return Path.touch, (self.file,)
+
+
+def executed(beside: Path) -> Path:
+    """What code in a file would leave beside that file."""
+    return beside.with_name("executed")
 
 
 def weights(change: Callable[[Path], Any]) -> Plant:
@@ -221,15 +229,15 @@ def predictions(change: Callable[[Path], Any]) -> Plant:
 
 def pickled_weights(path: Path) -> None:
     with path.open("wb") as stream:
-        pickle.dump({"model": Evil()}, stream)
+        pickle.dump({"model": Evil(executed(path))}, stream)
 
 
 def torch_pickled_weights(path: Path) -> None:
-    torch.save({"model": {"weight": torch.zeros(2)}, "args": Evil()}, path)
+    torch.save({"model": {"weight": torch.zeros(2)}, "args": Evil(executed(path))}, path)
 
 
 def pickled_predictions(path: Path) -> None:
-    np.savez(path, edges=np.array([Evil()], dtype=object))
+    np.savez(path, edges=np.array([Evil(executed(path))], dtype=object))
 
 
 FAULTS: dict[str, tuple[Plant, int, str]] = {
@@ -339,6 +347,7 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         2,
         "weights.pth",
     ),
+    "no such kind of board": (lambda c: [*c.calibrate, "--board", "chess:9x6:0.025"], 2, "--board"),
     "no such weights": (weights(lambda p: None), 2, "weights.pth"),
     "predictions that are a pickle with code": (predictions(pickled_predictions), 2, "pairs.npz"),
     "predictions of noise": (predictions(lambda p: p.write_bytes(b"PK\x03\x04 noise")), 2, "pairs.npz"),
@@ -360,7 +369,6 @@ def test_each_fault_ends_in_one_line_and_harms_nothing(
     case: Case, fault: str, capsys: pytest.CaptureFixture[str]
 ):
     plant, status, words = FAULTS[fault]
-    EXECUTED.unlink(missing_ok=True)
     arguments = plant(case)
     before = state(case.done), case.out.read_bytes() if case.out.is_file() else None
     assert dispatch(arguments) == status
@@ -368,10 +376,10 @@ def test_each_fault_ends_in_one_line_and_harms_nothing(
     assert said.startswith("error: ") and said.count("\n") == 1 and "Traceback" not in said
     assert re.search(words, said), said
     assert (state(case.done), case.out.read_bytes() if case.out.is_file() else None) == before
-    assert not EXECUTED.exists(), "code in the file was run"
+    assert not executed(case.capture).exists(), "code in the file was run"
     assert not list(case.capture.parent.rglob("*.part*"))
-    if case.out.is_dir() and status == 2:  # what a second try starts from, and no result
-        assert {path.name for path in case.out.iterdir()} <= {".lock", "run.json", "capture"}
+    if status == 2:
+        assert not case.out.is_dir(), "a folder that holds nothing was left"
     if status == 3:
         assert json.loads((case.out / "calibration.json").read_text())["converged"] is False
 
@@ -385,6 +393,80 @@ def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(tmp_path:
     said = capsys.readouterr().err
     assert "reconstruction.npz: damaged" in said and said.count("\n") == 1
     assert state(copy) == before
+
+
+def test_the_evil_file_would_be_written_where_it_is_looked_for(tmp_path: Path):
+    pickled_weights(tmp_path / "weights.pth")
+    with (tmp_path / "weights.pth").open("rb") as stream:
+        pickle.load(stream)
+    assert executed(tmp_path / "capture").exists()
+
+
+def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, done: Path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    assert dispatch(["calibrate", str(sound), str(out), "--quiet"]) == 3
+    assert read_calibration(out).gripper_from_camera is None
+    assert {path.name for path in out.iterdir()} == {".lock", "calibration.json", "log.txt", "report.html"}
+    capsys.readouterr()
+    assert dispatch(["map", str(out), "--quiet"]) == 2
+    assert "holds no run" in capsys.readouterr().err
+
+
+def test_another_calibration_takes_the_map_of_the_earlier_one_along(
+    tmp_path: Path, done: Path, tabletop: Path
+):
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    files = {path.name for path in out.iterdir()}
+    same = ["calibrate", str(tabletop), str(out), "--quiet"]
+    assert dispatch(same) == 0 and {path.name for path in out.iterdir()} == files
+    assert dispatch([*same, "--robot-noise", "3", "0.5"]) in (0, 3)
+    assert files - {path.name for path in out.iterdir()} == {"cloud.ply", "map.safetensors", "report.html"}
+
+
+def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
+    tmp_path: Path, done: Path, sound: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Killed between the two files of another capture, the first capture's run would take the wrong one."""
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    monkeypatch.setattr(
+        pipeline, "best_reconstruction", lambda *_: read_reconstruction(done / "reconstruction.npz")
+    )
+    monkeypatch.setattr(pipeline, "write_reconstruction", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.calibrate(read_capture(sound), out)
+    assert not (out / "run.json").exists()
+
+
+ARRAYS = {
+    "jcr.reconstruction/2": {
+        "about", "colors", "confidence", "image_index", "points_in_recon", "recon_from_camera",
+        "track_image", "track_point", "track_points_in_recon", "track_x_px", "tracks_from_pointmaps",
+    }
+}  # fmt: skip
+
+
+def test_a_reconstruction_of_another_version_is_told_apart(
+    tmp_path: Path, done: Path, tabletop: Path, capsys
+):
+    """And the name of the format changes with what it holds."""
+    with np.load(done / "reconstruction.npz") as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays["about"]))
+    assert ARRAYS[about["format"]] == set(arrays)
+    assert set(about) == {
+        "format", "backend", "is_metric", "metric_std", "notes", "intrinsics", "pointmap_intrinsics"
+    }  # fmt: skip
+    out = tmp_path / "out"
+    shutil.copytree(done, out)
+    del about["metric_std"]
+    old = json.dumps(about | {"format": "jcr.reconstruction/1"})
+    np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
+    assert dispatch(["map", str(out), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/2'; delete it and run again" in said
 
 
 def in_degrees(pose: np.ndarray) -> np.ndarray:
