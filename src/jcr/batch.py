@@ -143,7 +143,7 @@ def _finished(task: Task, made_from: str) -> Row | None:
     try:
         state = json.loads((task.out / STATE).read_text())
         row = Row(**state["row"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return row if state.get("made_from") == made_from else None
 

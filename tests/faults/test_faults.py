@@ -318,6 +318,8 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         "not UTF-8",
     ),
     "NUL in a path": (image_named("images/0\0.png"), 2, "no path inside"),
+    "half a surrogate in a path": (image_named("images/\ud800.png"), 2, "no path inside"),
+    "a name of 300 letters": (image_named("images/" + "x" * 300), 2, "no path inside"),
     "../ in a path": (image_named("../secret.png"), 2, "leads out"),
     "absolute path": (image_named("/etc/hostname"), 2, "no path inside"),
     "link out of the folder": (written(linked_out), 2, "leads out"),

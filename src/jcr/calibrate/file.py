@@ -288,7 +288,7 @@ def read_calibration(path: Path) -> CalibrationFile:
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
     try:
         content = json.loads(file.read_bytes().decode())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({error}); run the calibration again") from None
     kind = content.get("format") if isinstance(content, dict) else None
     if kind != FORMAT:

@@ -6,6 +6,9 @@ from typing import Any
 
 from jcr.errors import InputError
 
+LONGEST = 255
+"""Bytes of a file's name that file systems take."""
+
 
 def read_text(file: Path) -> str:
     """The text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
@@ -70,8 +73,12 @@ def read_json(file: Path) -> Any:
 
 
 def contained(folder: Path, name: str, where: str) -> Path:
-    """`folder/name`, or InputError when the name is absolute, has a NUL, or leads out of the folder."""
-    if "\0" in name or not name or Path(name).is_absolute():
+    """`folder/name`, or InputError when the name is absolute, no name of a file, or leads out of the folder."""
+    try:
+        longest = max(len(part.encode()) for part in Path(name).parts)
+    except ValueError:  # an empty name, or half of a surrogate pair
+        longest = LONGEST + 1
+    if "\0" in name or longest > LONGEST or Path(name).is_absolute():
         raise InputError(f"{where}: {name!r} is no path inside the capture; use one relative to {folder}")
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):

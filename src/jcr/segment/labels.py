@@ -85,5 +85,5 @@ def _read_names(path: Path) -> dict[int, str]:
         named = json.loads(path.read_text()).items()
         # One line each: the header of cloud.ply names them.
         return {int(label): " ".join(str(name).split()) or label for label, name in named}
-    except (ValueError, AttributeError):
+    except (ValueError, AttributeError, RecursionError):
         raise InputError(f'{path}: expected {{"1": "mug", "2": "box"}}') from None
