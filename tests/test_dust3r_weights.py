@@ -264,7 +264,7 @@ def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(
 
 def test_jcr_models_lists_licences_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:
     assert dispatch(["models", "--json"]) == 0
-    rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)}
+    rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)["models"]}
     assert rows["colmap", ""]["present"] == "yes"
     mast3r = rows["mast3r", CHECKPOINTS["mast3r"].hub_id]
     assert mast3r["scale"] == "metres" and "non-commercial" in mast3r["licence"]

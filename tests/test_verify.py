@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import jcr
 from jcr.calibrate.calibrate import CalibrateOptions, calibrate
@@ -202,6 +203,18 @@ def test_the_command_is_content_with_what_has_not_moved(
     assert "still true" in capsys.readouterr().out
 
 
+def test_the_new_images_may_come_with_a_table_of_poses(out: Path, capture: Capture, tmp_path: Path, capsys):
+    today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10, 11])
+    (today.folder / "capture.json").unlink()
+    rows = ["image,x,y,z,qx,qy,qz,qw"]
+    for name, pose in zip(today.images, today.base_from_gripper, strict=True):
+        quat_xyzw = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append(",".join([name, *(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw))]))
+    (today.folder / "poses.csv").write_text("\n".join(rows))
+    assert dispatch(["verify", str(out), str(today.folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"] == list(today.images)
+
+
 def test_the_command_finds_a_bump_from_one_image_and_says_what_to_do(
     out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, capsys
 ):
@@ -224,4 +237,4 @@ def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, 
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 3
     assert "cannot tell" in capsys.readouterr().err
     assert dispatch(["verify", str(out), str(tmp_path / "nothing"), "--quiet"]) == 2
-    assert "jcr capture" in capsys.readouterr().err
+    assert "no such capture" in capsys.readouterr().err

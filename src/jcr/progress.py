@@ -1,8 +1,11 @@
 """What a user sees while something runs: one bar a stage on stderr, with the time left."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 Progress = Callable[[str, float], None]
 """Told the stage's name and the fraction of it that is done."""
@@ -12,10 +15,18 @@ def silent(stage: str, fraction: float) -> None:
     """Progress that nobody watches."""
 
 
+def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:
+    """The items one by one, their share of the stage reported before and after each."""
+    for k, item in enumerate(items):
+        progress(stage, k / len(items))
+        yield item
+    progress(stage, 1.0)
+
+
 @contextmanager
-def progress_bars(quiet: bool = False) -> Iterator[Progress]:
-    """Yield the callable that stages report to; bars are drawn on a terminal, unless `quiet`."""
-    if quiet or not sys.stderr.isatty():
+def progress_bars() -> Iterator[Progress]:
+    """Yield the callable that stages report to; bars are drawn where stderr is a terminal."""
+    if not sys.stderr.isatty():
         yield silent
         return
     from rich.console import Console

@@ -15,7 +15,6 @@ from jcr.calibrate.pose_fit import PoseFit, fit_poses
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_log
-from jcr.live.folder import LiveFolder
 from jcr.pipeline import options_of, read_capture_of
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -58,9 +57,9 @@ class Verification:
 
 
 def verify(
-    out: Path, today: Path, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
+    out: Path, new: Capture, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
 ) -> Verification:
-    """Hold the calibration in the run folder `out` against the few images in the capture folder `today`.
+    """Hold the calibration in the run folder `out` against the few images of `new`.
 
     Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
     when the images show too little of the old scene, or too few of another, to tell.
@@ -76,10 +75,9 @@ def verify(
     capture, reconstruction = read_capture_of(out), read_reconstruction(out / "reconstruction.npz")
     if [image.image for image in calibration.images] != list(capture.images):
         raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")
-    new = read_few(today)
     if new.image_size != capture.image_size:
         raise InputError(
-            f"{today}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
+            f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
             f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
         )
     report("find the old scene", 0.0)
@@ -108,14 +106,6 @@ def verify(
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
     return _by_recalibration(calibration, new, options_of(out).reconstruct, options, progress)
-
-
-def read_few(folder: Path) -> Capture:
-    """A capture folder, however few its images."""
-    live = LiveFolder(folder)
-    if not live.names or live.size is None:
-        raise InputError(f"{folder}: holds no capture.json with images; take one or two (jcr capture)")
-    return Capture(folder, tuple(live.names), np.stack(live.poses), live.size)
 
 
 def fitted(

@@ -25,10 +25,10 @@ def checked_capture(
 ) -> Capture:
     """A capture of `images` in `folder`, without intrinsics; InputError as `jcr.read_capture` has it.
 
-    `where` begins the messages: the file that names the images.
+    `where` begins the messages: the file that names the images. One image will do here.
     """
-    if len(images) < MIN_FRAMES:
-        raise InputError(f"{where}: {len(images)} frames; at least {MIN_FRAMES} are needed, 8 to 12 are good")
+    if not images:
+        require_frames(0, where)
     for name in images:
         contained(folder, name, where)
     twice = {name for name in images if images.count(name) > 1}
@@ -38,6 +38,12 @@ def checked_capture(
         )
     check_metres(base_from_gripper, where)
     return Capture(folder, tuple(images), base_from_gripper, _common_size(folder, images))
+
+
+def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
+    """Raises InputError where there are fewer frames than a calibration, or whatever else, needs."""
+    if count < at_least:
+        raise InputError(f"{where}: {count} frames; at least {at_least} are needed, 8 to 12 are good")
 
 
 def checked_lens(

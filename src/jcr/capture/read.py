@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
+from jcr.capture.checks import MIN_FRAMES, require_frames
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
@@ -74,6 +75,7 @@ def read_source(
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
+    at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
     """As `read_capture`, and poses of cameras without images where that is what the file holds."""
     path, options = Path(path), options or ReadOptions()
@@ -87,7 +89,10 @@ def read_source(
     module, function = row.reader.split(":")
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
-        return reader(path, options)
+        found = reader(path, options)
+        if isinstance(found, Capture):
+            require_frames(len(found), str(path), at_least)
+        return found
     if into is None:
         raise InputError(
             f"{path}: its images lie inside of it; say where to put the chosen ones: into=FOLDER"

@@ -2,7 +2,8 @@
 
 A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
 field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
-status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug.
+status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug. Each has an `output` (output.py): with
+--json its result is one JSON object on stdout, with --quiet nothing but an error comes on stderr.
 """
 
 import contextlib
@@ -47,6 +48,7 @@ the metric scale, and a map in the robot's base frame.
 
 jcr COMMAND --help    arguments and examples of one command
 jcr --version         the version
+jcr --completion bash a script that completes commands, options and files; also zsh, fish
 
 examples:
   jcr run captures/table out/table
@@ -82,6 +84,14 @@ def dispatch(arguments: Sequence[str]) -> int:
         from jcr import __version__
 
         sys.stdout.write(f"jcr {__version__}\n")
+        return 0
+    if name == "--completion":
+        from jcr.cli.completion import script
+
+        try:
+            sys.stdout.write(script(" ".join(rest)))
+        except InputError as error:
+            return _fail(2, str(error))
         return 0
     if name not in COMMANDS:
         return _fail(2, f"{name!r} is no command of jcr; there are {', '.join(COMMANDS)} (jcr --help)")
@@ -131,7 +141,10 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
         if not stop.code:
             return 0
         return _fail(2, f"{_flatten(complaint.getvalue())} ({program} --help)")
-    return command.main(parsed)
+    with contextlib.ExitStack() as silence:
+        if parsed.output.quiet:
+            silence.enter_context(contextlib.redirect_stderr(silence.enter_context(open(os.devnull, "w"))))
+        return command.main(parsed)
 
 
 def _flatten(box: str) -> str:

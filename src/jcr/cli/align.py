@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.reconstruct.dust3r.alignment import AlignOptions
 
 
@@ -29,16 +30,11 @@ class Arguments:
     result: Annotated[Path, tyro.conf.Positional]
     """Alignment to write."""
     options: AlignOptions = field(default_factory=AlignOptions)
-    json: bool = False
-    """Print time, residuals and notes as JSON on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Read, align, write."""
-    import json
-
     import numpy as np
 
     from jcr.files import written_whole
@@ -47,7 +43,7 @@ def main(arguments: Arguments) -> int:
     from jcr.reconstruct.dust3r.pairs import read_pairs
 
     predictions = read_pairs(arguments.pairs)
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         alignment = align(predictions, arguments.options, progress)
     with written_whole(arguments.result) as temporary, open(temporary, "wb") as stream:
         np.savez(
@@ -63,8 +59,10 @@ def main(arguments: Arguments) -> int:
     for note in alignment.notes:
         sys.stderr.write(f"note: {note}\n")
     residual = float(np.median(alignment.pair_residual))
-    if arguments.json:
-        facts = {
+    arguments.output.result(
+        f"{arguments.result}: {len(alignment.depth)} images from {len(alignment.pair_scale)} pairs in "
+        f"{alignment.seconds:.2f} s, residual of the middle pair {100 * residual:.2g} % of the distance\n",
+        {
             "result": str(arguments.result),
             "method": alignment.method,
             "seconds": alignment.seconds,
@@ -72,11 +70,6 @@ def main(arguments: Arguments) -> int:
             "pairs": len(alignment.pair_scale),
             "pair_residual": residual,
             "notes": list(alignment.notes),
-        }
-        sys.stdout.write(json.dumps(facts) + "\n")
-    else:
-        sys.stdout.write(
-            f"{arguments.result}: {len(alignment.depth)} images from {len(alignment.pair_scale)} pairs in "
-            f"{alignment.seconds:.2f} s, residual of the middle pair {100 * residual:.2g} % of the distance\n"
-        )
+        },
+    )
     return 0

@@ -1,18 +1,20 @@
 """`jcr batch`: many captures, on this machine or a Ray cluster."""
 
-import json
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jcr.batch import BatchOptions
 from jcr.calibrate.calibrate import CalibrateOptions
+from jcr.cli.output import Output
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
+
+if TYPE_CHECKING:
+    from jcr.batch import Row
 
 
 @dataclass(frozen=True)
@@ -35,16 +37,13 @@ class Arguments:
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
-    json: bool = False
-    """Print the table as JSON on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Run all and print the table."""
     from jcr.batch import batch
-    from jcr.errors import InputError
+    from jcr.errors import InputError, NotTrustedError
     from jcr.pipeline import RunOptions
     from jcr.progress import progress_bars
 
@@ -52,25 +51,24 @@ def main(arguments: Arguments) -> int:
         raise InputError("batch: name one capture or more, then the folder for the results")
     options = RunOptions(arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map)
     *captures, out = arguments.paths
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         rows = batch(captures, out, options, arguments.batch, progress)
-    if arguments.json:
-        sys.stdout.write(json.dumps([asdict(row) for row in rows]) + "\n")
-    else:
-        for rank, row in enumerate(rows, start=1):
-            std = (
-                "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
-            )
-            name = Path(row.out).name
-            line = (
-                f"{rank:3d}  {name:<24} {row.status:<12} {row.used:3d}/{row.images:<3d} {std}  {row.reason}"
-            )
-            sys.stdout.write(line.rstrip() + "\n")
-        sys.stdout.write(f"table: {out / 'summary.html'}\n")
+    arguments.output.result(
+        _table(rows) + f"table: {out / 'summary.html'}\n", {"captures": [asdict(row) for row in rows]}
+    )
     doubtful = sum(row.status != "done" for row in rows)
     if doubtful:
-        sys.stderr.write(
-            f"error: {doubtful} of {len(rows)} captures failed or are not to be trusted; see the table\n"
+        raise NotTrustedError(
+            f"{doubtful} of {len(rows)} captures failed or are not to be trusted; see {out / 'summary.html'}"
         )
-        return 3
     return 0
+
+
+def _table(rows: "list[Row]") -> str:
+    lines = ""
+    for rank, row in enumerate(rows, start=1):
+        std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
+        used = f"{row.used:3d}/{row.images:<3d}"
+        line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<12} {used} {std}  {row.reason}"
+        lines += line.rstrip() + "\n"
+    return lines

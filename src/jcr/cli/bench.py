@@ -2,19 +2,22 @@
 
 import os
 import platform
-import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.errors import InputError
 
-BENCHES = {
+BenchName = Literal[
+    "align", "bag", "calibrate", "limits", "map", "pairs", "predictions", "real", "run", "table1", "table2"
+]
+BENCHES: dict[BenchName, str] = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
@@ -39,21 +42,19 @@ class Arguments:
       jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
     """
 
-    name: Annotated[str, tyro.conf.Positional]
-    """align, bag, calibrate, limits, map, pairs, predictions, real, run, table1 or table2."""
+    name: Annotated[BenchName, tyro.conf.Positional]
+    """What to measure."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
     """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Run one bench."""
-    if arguments.name not in BENCHES:
-        names = ", ".join(f"{name} ({what})" for name, what in BENCHES.items())
-        raise InputError(f"bench {arguments.name}: no such bench; there are {names}")
     from jcr.files import write_text
 
     bench = import_module(f"jcr.bench.{arguments.name}")
@@ -64,7 +65,7 @@ def main(arguments: Arguments) -> int:
     else:
         found = bench.run(arguments.captures, arguments.boards)
     table = heading(arguments.name) + found
-    sys.stdout.write(table)
+    arguments.output.result(table, {"bench": arguments.name, "markdown": table})
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", table)
     return 0

@@ -8,7 +8,8 @@ import tyro
 
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.capture.options import ReadOptions
-from jcr.cli.result import show, show_poses
+from jcr.cli.output import Output
+from jcr.cli.result import show
 from jcr.cli.source import source
 from jcr.reconstruct.backends import ReconstructOptions
 
@@ -32,22 +33,24 @@ class Arguments:
     read: ReadOptions = field(default_factory=ReadOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
-    json: bool = False
-    """Print calibration.json on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
+    from jcr.calibrate.calibrate import is_one
     from jcr.pipeline import RunOptions, calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
     options = RunOptions(arguments.reconstruct, arguments.calibrate)
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):
-            return show_poses(calibrate_poses(capture, arguments.out, arguments.calibrate), arguments.json)
+            found = calibrate_poses(capture, arguments.out, arguments.calibrate)
+            at_one = found.converged and is_one(found.hand_eye)
+            return show(
+                found, arguments.output, "the scale is 1, as the marker's size says\n" if at_one else ""
+            )
         result = calibrate(capture, arguments.out, options, progress=progress)
-    return show(result, arguments.json)
+    return show(result, arguments.output)

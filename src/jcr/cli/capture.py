@@ -1,6 +1,5 @@
 """`jcr capture`: a capture taken live, picture by picture, with advice while one works."""
 
-import json
 import os
 import sys
 from dataclasses import dataclass, field
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.live.collect import CollectOptions
 
 if TYPE_CHECKING:
@@ -46,10 +46,7 @@ class Arguments:
     intrinsics_from: Path | None = None
     """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else estimated."""
     collect: CollectOptions = field(default_factory=CollectOptions)
-    json: bool = False
-    """Print a JSON line per picture on stdout."""
-    quiet: bool = False
-    """Say nothing on stderr but errors."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -58,27 +55,30 @@ def main(arguments: Arguments) -> int:
     from jcr.live.collect import collect
     from jcr.live.folder import LiveFolder
 
-    def say(text: str) -> None:
-        if not arguments.quiet:
-            sys.stderr.write(text + "\n")
-            sys.stderr.flush()
+    answers: list[Answer] = []
 
     def tell(answer: "Answer", lines: list[str]) -> None:
-        if arguments.json:
-            sys.stdout.write(json.dumps(answer) + "\n")
-            sys.stdout.flush()
-        say("\n".join(lines))
+        answers.append(answer)
+        _say("\n".join(lines))
 
     live = LiveFolder(arguments.out, _lens(arguments.intrinsics_from))
-    say(f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
+    _say(f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
     with opened(arguments.camera) as frames:
-        collect(live, frames, _asks(arguments, say), arguments.collect, tell)
+        collect(live, frames, _asks(arguments), arguments.collect, tell)
     more = "" if len(live.names) >= 3 else "; three or more are needed, the same command goes on"
-    say(f"{len(live.names)} pictures in {arguments.out}{more}; next: jcr check {arguments.out}")
+    arguments.output.result(
+        f"{len(live.names)} pictures in {arguments.out}{more}; next: jcr check {arguments.out}\n",
+        {"capture": str(arguments.out), "images": live.names, "answers": answers},
+    )
     return 0
 
 
-def _asks(arguments: Arguments, say: Any) -> "Iterator[Ask]":
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
+
+
+def _asks(arguments: Arguments) -> "Iterator[Ask]":
     from jcr.errors import InputError
     from jcr.live.line_server import Listen, bound, served_poses
     from jcr.live.typed import typed_poses
@@ -86,15 +86,15 @@ def _asks(arguments: Arguments, say: Any) -> "Iterator[Ask]":
 
     kind, _, address = arguments.poses.partition(":")
     if kind == "typed" and not address:
-        yield from typed_poses(sys.stdin, say)
+        yield from typed_poses(sys.stdin, _say)
     elif kind == "ur" and address:
-        yield from ur_poses(*_address(address, 30003, "--poses ur:"), say)
+        yield from ur_poses(*_address(address, 30003, "--poses ur:"), _say)
     elif kind == "tcp" and not address:
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
         listen = Listen(host, port, token, arguments.timeout)
         with bound(listen) as server:
-            say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
+            _say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
     else:
         raise InputError(f"--poses {arguments.poses}: give tcp, ur:HOST or typed")

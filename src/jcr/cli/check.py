@@ -1,7 +1,5 @@
 """`jcr check`: reads and judges a capture before any heavy work."""
 
-import json
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +8,7 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
+from jcr.cli.output import Output
 from jcr.cli.source import looked_at
 
 if TYPE_CHECKING:
@@ -44,16 +43,13 @@ class Arguments:
     """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
     seed: int = 0
     """Seed of the registration and of the proposals."""
-    json: bool = False
-    """Print the findings as JSON."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
     from jcr.check import check
-    from jcr.errors import InputError
+    from jcr.errors import InputError, NotTrustedError
     from jcr.progress import progress_bars
 
     if arguments.suggest < 0:
@@ -62,7 +58,7 @@ def main(arguments: Arguments) -> int:
     if noise is not None and min(noise) <= 0:
         raise InputError(f"--robot-noise {noise[0]} {noise[1]}: give two positive numbers, mm and degrees")
     with (
-        progress_bars(arguments.quiet) as progress,
+        progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress) as capture,
     ):
         found = check(
@@ -74,13 +70,9 @@ def main(arguments: Arguments) -> int:
             arguments.seed,
             progress,
         )
-    if arguments.json:
-        sys.stdout.write(json.dumps(_as_json(capture, found)) + "\n")
-    else:
-        sys.stdout.write(_as_text(capture, found))
+    arguments.output.result(_as_text(capture, found), _as_json(capture, found))
     if found.faults:
-        sys.stderr.write(f"error: {found.faults[0]}\n")
-        return 3
+        raise NotTrustedError(found.faults[0])
     return 0
 
 

@@ -1,13 +1,13 @@
 """`jcr compare`: how far apart two calibrations are."""
 
-import json
-import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
+
+from jcr.cli.output import Output
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,7 @@ class Arguments:
     """The calibration to judge."""
     reference: Annotated[Path, tyro.conf.Positional]
     """What to hold it against."""
-    json: bool = False
-    """Print the result as JSON."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -49,5 +48,5 @@ def main(arguments: Arguments) -> int:
         sigmas = (np.abs(error) / np.sqrt(np.diag(covariance)[:6])).tolist()
         result["sigmas"] = sigmas
         text += f"; at most {max(sigmas):.1f} of its reported standard deviations on any axis"
-    sys.stdout.write((json.dumps(result) if arguments.json else text) + "\n")
+    arguments.output.result(text + "\n", result)
     return 0

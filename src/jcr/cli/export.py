@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,7 +11,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from jcr.errors import InputError
+from jcr.cli.output import Output
+from jcr.errors import InputError, NotTrustedError
 from jcr.export import ros
 from jcr.export.provenance import Provenance
 from jcr.files import write_text
@@ -22,6 +23,11 @@ if TYPE_CHECKING:
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
     from jcr.represent.scene import SceneMap
+
+FormatName = Literal[
+    "ros2", "moveit", "urdf", "xacro", "easy_handeye2", "covariance", "camera_info", "ply", "glb", "octomap",
+    "esdf", "spheres", "nerfstudio", "colmap", "rerun",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,9 +45,8 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    format: Annotated[str | None, tyro.conf.Positional] = None
-    """ros2, moveit, urdf, xacro, easy_handeye2, covariance, camera_info, ply, glb, octomap, esdf, spheres, nerfstudio,
-    colmap or rerun."""
+    format: Annotated[FormatName | None, tyro.conf.Positional] = None
+    """Whose; left out: all are listed with what they hold."""
     path: Annotated[Path | None, tyro.conf.Positional] = None
     """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
     parent_frame: str = "tool0"
@@ -65,13 +70,14 @@ class Arguments:
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""
+    output: Output = field(default_factory=Output)
 
 
 @dataclass(frozen=True)
 class Format:
     """One row of the table."""
 
-    name: str
+    name: FormatName
     file: str
     """In OUT/export, where the user names none; ends with / for a folder."""
     about: str
@@ -80,12 +86,10 @@ class Format:
 
 def main(arguments: Arguments) -> int:
     """Write the file, say where, and warn where the calibration is not to be trusted: exit status 0 or 3."""
-    formats = {row.name: row for row in FORMATS}
-    if arguments.format not in formats:
-        wrong = "no format is named" if arguments.format is None else f"{arguments.format!r} is no format"
+    if arguments.format is None:
         listed = "; ".join(f"{row.name} ({row.about})" for row in FORMATS)
-        raise InputError(f"{wrong}; take one of: {listed}")
-    row = formats[arguments.format]
+        raise InputError(f"no format is named; take one of: {listed}")
+    row = next(row for row in FORMATS if row.name == arguments.format)
     if arguments.root_from_optical and not arguments.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is told in")
     run = Run(arguments)
@@ -94,9 +98,14 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
     row.write(run, path)
     sys.stderr.write(f"wrote {path}: {row.about}\n")
+    line, facts = "", {"file": str(path), "format": row.name, "about": row.about}
+    if row.name == "ros2":
+        mount = run.mount
+        line = ros.static_transform_publisher(mount.parent, mount.child, mount.parent_from_child)
+        facts["line"] = line
+    arguments.output.result(line and line + "\n", facts)
     if run.doubt is not None:
-        sys.stderr.write(f"error: not to be trusted, and the file says so: {run.doubt}\n")
-        return 3
+        raise NotTrustedError(f"not to be trusted, and the file says so: {run.doubt}")
     return 0
 
 
@@ -210,11 +219,7 @@ def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], N
 
 
 def _ros2(run: Run, path: Path) -> None:
-    mount = run.mount
-    write_text(path, ros.ros2_launch(mount))
-    sys.stdout.write(
-        ros.static_transform_publisher(mount.parent, mount.child, mount.parent_from_child) + "\n"
-    )
+    write_text(path, ros.ros2_launch(run.mount))
 
 
 def _easy_handeye2(run: Run, path: Path) -> None:

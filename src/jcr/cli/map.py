@@ -1,12 +1,12 @@
 """`jcr map`: the map of a calibrated run, made again."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
 from jcr.segment.options import SegmentOptions
@@ -32,8 +32,7 @@ class Arguments:
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -41,7 +40,7 @@ def main(arguments: Arguments) -> int:
     from jcr.pipeline import build_map
     from jcr.progress import progress_bars
 
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         result = build_map(
             arguments.out,
             arguments.cloud,
@@ -50,5 +49,6 @@ def main(arguments: Arguments) -> int:
             add=arguments.add,
             progress=progress,
         )
-    sys.stdout.write(f"map: {result.out / 'map.safetensors'}\nreport: {result.out / 'report.html'}\n")
+    map, report = result.out / "map.safetensors", result.out / "report.html"
+    arguments.output.result(f"map: {map}\nreport: {report}\n", {"map": str(map), "report": str(report)})
     return 0

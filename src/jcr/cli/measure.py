@@ -1,12 +1,12 @@
 """`jcr measure`: the sizes of what stands on the table."""
 
-import json
-import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from jcr.cli.output import Output
 
 if TYPE_CHECKING:
     from jcr.segment.measure import Measured
@@ -25,21 +25,20 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    json: bool = False
-    """Print the result as JSON: metres, base frame."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is not to be trusted."""
     from jcr.calibrate.file import read_calibration
+    from jcr.errors import NotTrustedError
     from jcr.pipeline import measure
 
     measured = measure(arguments.out)
-    sys.stdout.write(json.dumps(content(measured)) + "\n" if arguments.json else table(measured))
+    arguments.output.result(table(measured), content(measured))
     calibration = read_calibration(arguments.out)
     if not calibration.converged:
-        sys.stderr.write(f"error: sizes not to be trusted: {calibration.warnings[0]}\n")
-        return 3
+        raise NotTrustedError(f"sizes not to be trusted: {calibration.warnings[0]}")
     return 0
 
 

@@ -1,9 +1,8 @@
 """`jcr models`: back ends, weights present or not, licences."""
 
-import json
-import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
+from jcr.cli.output import Output
 from jcr.reconstruct.backends import BACKENDS
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 
@@ -19,8 +18,7 @@ class Arguments:
       jcr models --json
     """
 
-    json: bool = False
-    """Print the list as JSON on stdout."""
+    output: Output = field(default_factory=Output)
 
 
 @dataclass(frozen=True)
@@ -69,11 +67,11 @@ def models() -> list[Model]:
 def main(arguments: Arguments) -> int:
     """Print the list."""
     rows = models()
-    if arguments.json:
-        sys.stdout.write(json.dumps([asdict(row) for row in rows]) + "\n")
-        return 0
-    for row in rows:
-        sys.stdout.write(f"{row.backend:<12} {row.weights or 'no weights needed'}\n")
-        sys.stdout.write(f"{'':<12} scale: {row.scale}; present: {row.present}\n")
-        sys.stdout.write(f"{'':<12} licence: {row.licence}\n")
+    text = "".join(
+        f"{row.backend:<12} {row.weights or 'no weights needed'}\n"
+        f"{'':<12} scale: {row.scale}; present: {row.present}\n"
+        f"{'':<12} licence: {row.licence}\n"
+        for row in rows
+    )
+    arguments.output.result(text, {"models": [asdict(row) for row in rows]})
     return 0

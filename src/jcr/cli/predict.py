@@ -1,6 +1,5 @@
 """`jcr predict`: pairwise pointmaps of a network, as a file."""
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.reconstruct.dust3r.pairs import PairOptions
 
 
@@ -32,10 +32,7 @@ class Arguments:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the network runs."""
     pairs: PairOptions = field(default_factory=PairOptions)
-    json: bool = False
-    """Print the result as JSON on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -56,15 +53,15 @@ def main(arguments: Arguments) -> int:
         device_of(ReconstructOptions(device=arguments.device)),
         arguments.pairs,
     )
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         _, predictions, notes = predict(capture, options, progress)
     write_pairs(arguments.out, predictions)
     count, height, width = predictions.conf.shape
     for note in notes:
         sys.stderr.write(f"{note}\n")
-    if arguments.json:
-        result = {"file": str(arguments.out), "pairs": count, "width": width, "height": height}
-        sys.stdout.write(json.dumps(result | {"metric": predictions.is_metric, "notes": notes}) + "\n")
-    else:
-        sys.stdout.write(f"{arguments.out}: {count} pairs of {width}x{height} pixels\n")
+    result = {"file": str(arguments.out), "pairs": count, "width": width, "height": height}
+    arguments.output.result(
+        f"{arguments.out}: {count} pairs of {width}x{height} pixels\n",
+        result | {"metric": predictions.is_metric, "notes": notes},
+    )
     return 0

@@ -1,16 +1,16 @@
 """`jcr query`: what the map knows at points."""
 
-import json
-import sys
-from dataclasses import dataclass
+import io
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 
@@ -34,11 +34,11 @@ class Arguments:
     points: Annotated[Path, tyro.conf.Positional]
     """.csv (three columns, a header line is fine), .npy of shape (n, 3), or .ply."""
     write: Path | None = None
-    """.csv or .npy (a structured array) to write; by default points.answers.csv beside the points."""
+    """.csv or .npy (a structured array) to write; by default points.answers.csv beside the points, and nothing with
+    --json, which prints the answers."""
     unknown: Literal["occupied", "free", "report"] = "report"
     """How places count that nobody has seen: solid, empty, or as occupancy one half."""
-    json: bool = False
-    """Print the answers on stdout as JSON instead of writing a file."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -53,16 +53,21 @@ def main(arguments: Arguments) -> int:
     columns = (*x_in_base.T, sample.occupancy, sample.unknown, sample.distance, *sample.gradient.T)
     columns = (*columns, red, green, blue, sample.label)
     rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
-    if arguments.json:
-        answers = {name: _finite(rows[name]) for name in _COLUMNS.split(",")} | {
-            "label_names": list(scene.label_names)
-        }
-        sys.stdout.write(json.dumps(answers) + "\n")
-        return 0
-    path = arguments.write or arguments.points.with_suffix(".answers.csv")
-    if path.suffix == ".npy":
-        import io
+    unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(rows) else "none"
+    told = f"{len(rows)} points, {unseen}\n"
+    answers: dict[str, object] = {"label_names": list(scene.label_names)}
+    if arguments.output.json:
+        answers |= {name: _finite(rows[name]) for name in _COLUMNS.split(",")}
+    if arguments.write or not arguments.output.json:
+        path = arguments.write or arguments.points.with_suffix(".answers.csv")
+        _write(path, rows)
+        told = f"wrote {path}: {told}"
+    arguments.output.result(told, answers)
+    return 0
 
+
+def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:
+    if path.suffix == ".npy":
         buffer = io.BytesIO()
         np.save(buffer, np.asarray(rows))
         write_bytes(path, buffer.getvalue())
@@ -72,9 +77,6 @@ def main(arguments: Arguments) -> int:
         write_text(path, f"{_COLUMNS}\n{lines}\n")
     else:
         raise InputError(f"{path}: answers are written as .csv or .npy")
-    unknown = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(rows) else "none"
-    sys.stderr.write(f"wrote {path}: {len(rows)} points, {unknown}\n")
-    return 0
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:

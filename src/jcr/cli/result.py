@@ -1,39 +1,30 @@
 """How a calibration is told on the terminal, the same for every command that ends with one."""
 
-import json
 import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jcr.cli.output import Output
+from jcr.errors import NotTrustedError
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
     from jcr.results import PosesResult, RunResult
 
 
-def show(result: "RunResult | PosesResult", as_json: bool) -> int:
-    """Print the calibration on stdout and its doubts on stderr; the exit status, 0 or 3."""
+def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> int:
+    """Print the calibration, its doubts on stderr, and for people what comes after it.
+
+    Returns exit status 0, or raises NotTrustedError.
+    """
     content = result.calibration
-    if as_json:
-        sys.stdout.write(json.dumps(content.model_dump()) + "\n")
-    else:
-        sys.stdout.write(summary(result))
+    output.result(summary(result) + after, content.model_dump())
     for warning in content.warnings[0 if content.converged else 1 :]:
         sys.stderr.write(f"warning: {warning}\n")
     if not content.converged:
-        sys.stderr.write(f"error: not to be trusted: {content.warnings[0]}\n")
-        return 3
+        raise NotTrustedError(f"not to be trusted: {content.warnings[0]}")
     return 0
-
-
-def show_poses(result: "PosesResult", as_json: bool) -> int:
-    """The same for camera poses that were given; what their scale says of the marker goes with it."""
-    from jcr.calibrate.calibrate import is_one
-
-    if not as_json and result.converged and is_one(result.hand_eye):
-        sys.stdout.write("the scale is 1, as the marker's size says\n")
-    return show(result, as_json)
 
 
 def summary(result: "RunResult | PosesResult") -> str:

@@ -1,6 +1,5 @@
 """`jcr run`: everything, from a capture to a calibrated camera and a map."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ import tyro
 
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.capture.options import ReadOptions
+from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.cli.source import source
 from jcr.reconstruct.backends import ReconstructOptions
@@ -42,10 +42,7 @@ class Arguments:
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
-    json: bool = False
-    """Print calibration.json on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -58,14 +55,11 @@ def main(arguments: Arguments) -> int:
     options = RunOptions(
         arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map, arguments.segment
     )
-    with progress_bars(arguments.quiet) as progress:
+    with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):
             raise InputError(
                 f"{arguments.capture}: gives poses and no images, nothing to map; use `jcr calibrate`"
             )
         result = run(capture, arguments.out, options, progress=progress)
-    status = show(result, arguments.json)
-    if not arguments.json:
-        sys.stdout.write(f"report: {result.out / 'report.html'}\n")
-    return status
+    return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")

@@ -1,13 +1,12 @@
 """`jcr simulate`: a simulated capture with ground truth."""
 
-import json
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from jcr.cli.output import Output
 from jcr.simulate.capture import SimulateOptions, simulate
 
 
@@ -28,15 +27,14 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """New folder to write."""
     simulate: SimulateOptions = field(default_factory=SimulateOptions)
-    json: bool = False
-    """Print the result as JSON on stdout."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Write the capture and say where."""
-    out = simulate(arguments.out, arguments.simulate)
-    if arguments.json:
-        sys.stdout.write(json.dumps({"capture": str(out)}) + "\n")
-    else:
-        sys.stderr.write(f"wrote {out}\n")
+    from jcr.progress import progress_bars
+
+    with progress_bars() as progress:
+        out = simulate(arguments.out, arguments.simulate, progress)
+    arguments.output.result(f"capture: {out}\n", {"capture": str(out)})
     return 0

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jcr.capture.checks import MIN_FRAMES
 from jcr.capture.options import ReadOptions
 
 if TYPE_CHECKING:
@@ -27,9 +28,11 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
 
 
 @contextmanager
-def looked_at(path: Path, options: ReadOptions, progress: "Progress") -> "Iterator[Capture | PosePairs]":
+def looked_at(
+    path: Path, options: ReadOptions, progress: "Progress", at_least: int = MIN_FRAMES
+) -> "Iterator[Capture | PosePairs]":
     """What lies at a path, a recording's frames put where they vanish afterwards."""
     from jcr.capture.read import read_source
 
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:
-        yield read_source(path, options, into=scratch, progress=progress)
+        yield read_source(path, options, into=scratch, progress=progress, at_least=at_least)

@@ -1,6 +1,5 @@
 """`jcr verify`: is yesterday's calibration still true of today's few images?"""
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from jcr.capture.options import ReadOptions
+from jcr.cli.output import Output
+from jcr.cli.source import looked_at
 from jcr.verify import VerifyOptions
 
 if TYPE_CHECKING:
@@ -19,9 +21,9 @@ if TYPE_CHECKING:
 class Arguments:
     """Hold a calibration against new images: has the camera moved on the gripper since?
 
-    OUT is the run folder of the calibration, whose capture must still be where it was; CAPTURE a capture folder
-    with one or more new images of the same scene (two or three tell a moved camera from a moved table), or five
-    or more of another. Exit status 3 when something has moved, or when the images cannot tell.
+    OUT is the run folder of the calibration, whose capture must still be where it was; CAPTURE a capture of any
+    format with one or more new images of the same scene (two or three tell a moved camera from a moved table),
+    or five or more of another. Exit status 3 when something has moved, or when the images cannot tell.
 
     examples:
       jcr verify out/table captures/this-morning
@@ -31,27 +33,31 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the run that calibrated the camera."""
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the new images, with capture.json."""
+    """The new images and their poses: a capture folder, or another format (docs/captures.md)."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
-    json: bool = False
-    """Print the verdict as JSON on stdout."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Verify and say what to do."""
+    from jcr.errors import InputError, NotTrustedError
     from jcr.progress import progress_bars
+    from jcr.records import PosePairs
     from jcr.verify import verify
 
-    with progress_bars(arguments.quiet) as progress:
-        found = verify(arguments.out, arguments.capture, arguments.verify, progress)
-    sys.stdout.write(json.dumps(_as_json(found)) + "\n" if arguments.json else _as_text(found))
+    with (
+        progress_bars() as progress,
+        looked_at(arguments.capture, arguments.read, progress, at_least=1) as new,
+    ):
+        if isinstance(new, PosePairs):
+            raise InputError(f"{arguments.capture}: gives poses and no images, which verify needs")
+        found = verify(arguments.out, new, arguments.verify, progress)
+    arguments.output.result(_as_text(found), _as_json(found))
     for note in found.notes:
         sys.stderr.write(f"warning: {note}\n")
     if found.moved:
-        sys.stderr.write(f"error: {_advice(found)}\n")
-        return 3
+        raise NotTrustedError(_advice(found))
     return 0
 
 

@@ -2,11 +2,13 @@
 
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from jcr.cli.output import Output
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,7 @@ class Arguments:
     """Address to listen on. Beyond 127.0.0.1 whoever reaches it sees the run: the page has no password."""
     port: int = 8080
     """Port to listen on; 0 takes a free one."""
-    quiet: bool = False
-    """No progress on stderr."""
+    output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
@@ -69,7 +70,7 @@ def main(arguments: Arguments) -> int:
             values = solve_joints(robot, arguments.tip, run.base_from_gripper)
     server = open_server(arguments.host, arguments.port, f"jcr · {run.name}")
     try:
-        with progress_bars(arguments.quiet) as progress:
+        with progress_bars() as progress:
             Viewer(server, run, robot, values, progress)
         address = f"http://{arguments.host}:{server.get_port()}"
         if not is_loopback(arguments.host):
@@ -78,8 +79,7 @@ def main(arguments: Arguments) -> int:
                 "and no encryption; from another machine rather use ssh -L "
                 f"{server.get_port()}:127.0.0.1:{server.get_port()} and the default --host\n"
             )
-        sys.stdout.write(f"{address} (Ctrl-C ends it)\n")
-        sys.stdout.flush()
+        arguments.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
         threading.Event().wait()
     except KeyboardInterrupt:
         return 0

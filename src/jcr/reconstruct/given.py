@@ -82,8 +82,7 @@ def _triangulated(
     """Points of matched features, with lens and cameras held."""
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        report("features", 0.0)
-        cameras = extract(database, images, [lens], True, options.working_size_px)
+        cameras = extract(database, images, [lens], True, options.working_size_px, report)
         report("matching", 0.0)
         match(database, options.seed)
         model = pycolmap.Reconstruction()

@@ -6,6 +6,7 @@ Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 """
 
 import math
+import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -19,7 +20,7 @@ from PIL import Image
 
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
-from jcr.progress import Progress
+from jcr.progress import Progress, steps
 from jcr.reconstruct.dense import SparseModel
 from jcr.reconstruct.lens import fold_distance_px, resized
 from jcr.records import Intrinsics, Tracks
@@ -47,8 +48,7 @@ def structure_from_motion(
     """
     with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        report("features", 0.0)
-        cameras = extract(database, images, lenses, known, working_size_px)
+        cameras = extract(database, images, lenses, known, working_size_px, report)
         report("matching", 0.0)
         match(database, seed)
         report("mapping", 0.0)
@@ -76,6 +76,7 @@ def extract(
     lenses: Sequence[Intrinsics],
     known: bool,
     working_size_px: int,
+    report: Progress,
 ) -> list[pycolmap.Camera]:
     """Features of every image, at the working size, in a new database; and the lenses as COLMAP's cameras."""
     width, height = lenses[0].width, lenses[0].height
@@ -98,7 +99,10 @@ def extract(
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
     cpu = pycolmap.Device.cpu
-    pycolmap.extract_features(database, database.parent, names, pycolmap.CameraMode.SINGLE, device=cpu)
+    at_once = 4 * (os.cpu_count() or 1)  # fewer would leave threads idle at every end
+    for start in steps(report, "features", range(0, len(names), at_once)):
+        few = names[start : start + at_once]
+        pycolmap.extract_features(database, database.parent, few, pycolmap.CameraMode.SINGLE, device=cpu)
     return cameras
 
 

@@ -13,6 +13,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import rotation_exp
+from jcr.progress import Progress, silent, steps
 from jcr.records import Intrinsics
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 from jcr.simulate.render import render
@@ -58,7 +59,7 @@ class SimulateOptions:
     """Write truth/ with depth and labels of every image, or with scene.json alone."""
 
 
-def simulate(out: Path, options: SimulateOptions = SimulateOptions()) -> Path:
+def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: Progress = silent) -> Path:
     """Write a capture folder with reference.json and truth/ to `out`, and return `out`.
 
     The same options give the same capture.json and truth/scene.json, and on one machine the same images.
@@ -91,7 +92,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions()) -> Path:
     views = render(
         scene, truth.intrinsics, truth.base_from_camera, options.texture, with_truth=options.truth == "full"
     )
-    for k, view in enumerate(views):
+    for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
         image = _degraded(view.image, options, np.random.default_rng([options.seed, 7, k]))
         write_bytes(out / truth.images[k], _encoded(image, options.jpeg_quality))
         if view.depth is not None and view.label is not None:
