@@ -5,11 +5,17 @@ result = jcr.run(capture, "out/table")
 scene = jcr.load_map("out/table")
 """
 
+import sys
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from jcr.errors import InputError, NotTrustedError
+
+# Pillow's PNG writer binds to another zlib, and crashes, where pycolmap was loaded before it.
+if "pycolmap" in sys.modules and "PIL._imaging" not in sys.modules:
+    raise ImportError("import jcr (or PIL.Image) before pycolmap: in the other order writing a PNG crashes")
+import PIL._imaging  # noqa: E402, F401
 
 if TYPE_CHECKING:
     from jcr.calibrate.hand_eye import solve_hand_eye
