@@ -14,6 +14,7 @@ LAYERS = [
     {"represent", "segment"},
     {"export"},
     {"simulate", "results"},
+    {"train"},
     {"report"},
     {"auto", "check", "live"},
     {"pipeline"},
@@ -23,7 +24,7 @@ LAYERS = [
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-TORCH_ROOMS = {"reconstruct", "represent", "segment", "bench"}
+TORCH_ROOMS = {"reconstruct", "represent", "segment", "bench", "train"}
 
 
 def imports(file: Path) -> list[str]:

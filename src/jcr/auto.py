@@ -19,12 +19,16 @@ def best_reconstruction(
 
     `auto` runs the best back end whose weights are on this machine, and the next one when that gives nothing or
     its calibration is not to be trusted for another reason than the motion. Of two results a trusted one is kept,
-    else the one with the smaller held-out error. Raises as `reconstruct` does for the last one that was tried.
+    else the one with the smaller held-out error. The network in this package, which is far less accurate than
+    COLMAP, runs only where COLMAP has no camera poses to give. Raises as `reconstruct` does for the last one
+    that was tried.
     """
     names = candidates(options)[:2]
     if len(names) == 1:
         return reconstruct(capture, replace(options, backend=names[0]), progress)
     first = replace(options, backend=names[0])
+    if names == ("colmap", "compact"):
+        return _compact_without_colmap(capture, options, progress)
     # Weights that the user named are the first one's.
     second = replace(options, backend=names[1], weights=None)
     chose = f"back end {names[0]}, the best whose weights are on this machine"
@@ -46,6 +50,19 @@ def best_reconstruction(
         return other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
     kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
     return kept.noted(f"{doubt}, nor is {names[1]}; {kept.told()} was used and not {left.told()}")
+
+
+def _compact_without_colmap(
+    capture: Capture, options: ReconstructOptions, progress: Progress | None
+) -> Reconstruction:
+    try:
+        return reconstruct(capture, replace(options, backend="colmap"), progress)
+    except NotTrustedError as error:
+        found = reconstruct(capture, replace(options, backend="compact"), progress)
+        note = (
+            f"back end colmap gave nothing ({error}); the far less accurate network in this package was used"
+        )
+        return replace(found, notes=(note, *found.notes))
 
 
 @dataclass(frozen=True)

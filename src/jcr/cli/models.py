@@ -28,11 +28,13 @@ class Model:
     backend: str
     """For --backend."""
     weights: str
-    """Hub id; empty where none are needed."""
+    """Hub id or folder; empty where none are needed."""
     licence: str
     scale: str
     present: str
     """yes, or what is missing."""
+    accuracy: str = ""
+    """As measured (jcr bench compact); empty: not measured here."""
 
 
 OTHERS = {
@@ -56,7 +58,7 @@ def models() -> list[Model]:
         present = "yes" if checkpoint.is_cached() else "no: downloaded on first use"
         if not BACKENDS[name].is_installed():
             present = "no: its package is missing"
-        rows.append(Model(name, checkpoint.hub_id, checkpoint.licence, scale, present))
+        rows.append(Model(name, checkpoint.hub_id, checkpoint.licence, scale, present, checkpoint.accuracy()))
     rows.append(Model("predictions", "", "your network's", "your file's is_metric", "yes"))
     for hub_id, (licence, direction) in OTHERS.items():
         how = f"run its own package; poses are {direction}"
@@ -71,6 +73,7 @@ def main(arguments: Arguments) -> int:
         f"{row.backend:<12} {row.weights or 'no weights needed'}\n"
         f"{'':<12} scale: {row.scale}; present: {row.present}\n"
         f"{'':<12} licence: {row.licence}\n"
+        + (f"{'':<12} accuracy: {row.accuracy}\n" if row.accuracy else "")
         for row in rows
     )
     arguments.output.result(text, {"models": [asdict(row) for row in rows]})

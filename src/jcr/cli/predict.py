@@ -25,7 +25,7 @@ class Arguments:
     """Folder of the capture."""
     out: Annotated[Path, tyro.conf.Positional]
     """npz file to write (docs/predictions.md)."""
-    backend: Literal["dust3r", "mast3r"] = "dust3r"
+    backend: Literal["compact", "dust3r", "mast3r"] = "dust3r"
     """Whose weights, where --weights names none."""
     weights: str | None = None
     """Path or hub id."""

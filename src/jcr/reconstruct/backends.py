@@ -16,7 +16,9 @@ from jcr.progress import Progress
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
-BackendName = Literal["auto", "colmap", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"]
+BackendName = Literal[
+    "auto", "colmap", "compact", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"
+]
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,8 @@ class ReconstructOptions:
     """What turns images into camera poses and pointmaps."""
 
     backend: BackendName = "auto"
-    """auto takes the best one whose weights are on this machine, and colmap besides where it is not to be
-    trusted."""
+    """auto takes the best one whose weights are on this machine (without downloaded ones: colmap), and a second
+    one, colmap or compact, where that is not to be trusted."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks and dense matching run."""
     seed: int = 0
@@ -74,6 +76,7 @@ BACKENDS = {
     row.name: row
     for row in (
         Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),
+        Backend("compact", CHECKPOINTS["compact"].licence, False, "jcr.reconstruct.backends:_dust3r"),
         Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
         Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
         Backend(
@@ -141,7 +144,8 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """What `auto` stands for here, the best first, or the one back end that was asked for.
 
     Networks whose uncertainty is known come before the one whose is not, metric ones before others; only those
-    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not.
+    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not. The
+    compact network comes last: it is far less accurate than COLMAP, where COLMAP finds anything.
     """
     if options.backend != "auto":
         return (options.backend,)
@@ -153,6 +157,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     return (
         *(name for name in ranking if CHECKPOINTS[name].is_cached() and BACKENDS[name].is_installed()),
         "colmap",
+        *(("compact",) if CHECKPOINTS["compact"].is_cached() else ()),
     )
 
 
@@ -178,7 +183,7 @@ def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | 
     from jcr.reconstruct.dust3r.pairs import PairOptions
 
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
-    model = "mast3r" if options.backend == "mast3r" else "dust3r"
+    model = options.backend if options.backend in ("compact", "mast3r") else "dust3r"
     return reconstruct(capture, Dust3rOptions(model, options.weights, device_of(options), pairs), progress)
 
 

@@ -24,7 +24,7 @@ class TrainOptions:
     scene: SceneOptions = field(default_factory=SceneOptions)
     embed: int = 192
     """Channels of a token."""
-    heads: int = 3
+    heads: int = 6
     encoder_depth: int = 4
     decoder_depth: int = 4
     textures: int = 96
@@ -40,10 +40,12 @@ class TrainOptions:
     """Steps over which the learning rates rise."""
     alpha: float = 0.2
     """How much the loss rewards confidence."""
-    attention: float = 0.1
+    attention: float = 0.5
     """Weight of the supervision of cross-attention; 0: none."""
-    attention_block: int = 1
-    """Decoder block whose cross-attention is supervised."""
+    attention_blocks: tuple[int, ...] = (0, 1)
+    """Decoder blocks whose cross-attention is supervised."""
+    widen: float = 0.4
+    """Share of the steps over which the views of a scene grow apart, from a third of their range to all of it."""
     ema: float = 0.999
     """Decay of the averaged weights, which are what is validated and saved for use; less in the first steps."""
     seed: int = 0

@@ -7,7 +7,7 @@ Shapes: b scenes of v views each, n = b·v views (the views of a scene follow on
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -49,8 +49,20 @@ class SceneOptions:
     """Share of surfaces of one colour."""
     least_overlap: float = 0.2
     """Of each view of a pair, the share that the other sees too."""
-    views_at_once: int = 1
-    """Rendered together: one fits the cache of a CPU core, a GPU wants hundreds."""
+    views_at_once: int | None = None
+    """Rendered together; unset: one on a CPU, whose cache it fits, 128 on a GPU."""
+
+
+def narrowed(options: SceneOptions, share: float) -> SceneOptions:
+    """The same world with views only that far apart, of how far they may be."""
+    low, high = options.elevation_deg
+    near, far = options.azimuth_spread_deg
+    return replace(
+        options,
+        elevation_deg=(high - share * (high - low), high),
+        azimuth_spread_deg=(share * near, share * far),
+        roll_deg=share * options.roll_deg,
+    )
 
 
 class Views(NamedTuple):
@@ -102,10 +114,10 @@ class _Draw:
     def __init__(self, generator: torch.Generator) -> None:
         self.generator = generator
 
-    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
+    def uniform(self, low: float | int, high: float | int, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=self.generator, device=self.generator.device)
 
-    def log_uniform(self, low: float, high: float, *shape: int) -> Tensor:
+    def log_uniform(self, low: float | int, high: float | int, *shape: int) -> Tensor:
         return self.uniform(math.log(low), math.log(high), *shape).exp()
 
     def chance(self, share: float, *shape: int) -> Tensor:
@@ -128,9 +140,10 @@ def draw_views(
     surfaces = _surfaces(draw, scenes, sum(counts) + 1, len(textures) // TEXELS, options.plain)
     lamps = _lamps(draw, scenes)
     world_from_camera, focal_px = _cameras(draw, scenes, options)
+    at_once = options.views_at_once or (1 if generator.device.type == "cpu" else 128)
     of_view = torch.arange(scenes, device=generator.device).repeat_interleave(options.views)
     parts = []
-    for rows in torch.arange(len(of_view), device=generator.device).split(options.views_at_once):
+    for rows in torch.arange(len(of_view), device=generator.device).split(at_once):
         scene = of_view[rows]
         parts.append(
             render(
@@ -230,9 +243,7 @@ def seen_by(
     pixel = torch.stack([focal * x / ahead + (width - 1) / 2, focal * y / ahead + (height - 1) / 2], -1)
     column, row = pixel.round().long().unbind(-1)
     inside = (z > 1e-3) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    there = views.depth[
-        second[:, None, None], row.clamp(0, height - 1), column.clamp(0, width - 1)
-    ]
+    there = views.depth[second[:, None, None], row.clamp(0, height - 1), column.clamp(0, width - 1)]
     return inside & ((there - z).abs() < tolerance * z), pixel
 
 
@@ -241,7 +252,9 @@ def pairs_of(views: Views, options: SceneOptions) -> tuple[Tensor, Tensor]:
     n, v = len(views.depth), options.views
     grid = torch.arange(n, device=views.depth.device).view(-1, v)
     first, second = grid[:, :, None].expand(-1, v, v), grid[:, None].expand(-1, v, v)
-    share = seen_by(views, first.flatten(), second.flatten(), stride=4, tolerance=0.03)[0].float().mean((1, 2))
+    share = (
+        seen_by(views, first.flatten(), second.flatten(), stride=4, tolerance=0.03)[0].float().mean((1, 2))
+    )
     share = share.view(-1, v, v)
     keep = (torch.minimum(share, share.mT) >= options.least_overlap) & (first != second)
     return first[keep], second[keep]
@@ -265,7 +278,9 @@ def degrade(light: Float[Tensor, "n 3 h w"], views: int, draw: _Draw) -> Float[T
     around = F.avg_pool2d(F.pad(light, (1, 1, 1, 1), mode="replicate"), 3, 1)
     light = light + of_scene(draw.uniform(-0.3, 0.6, b)) * (around - light)
     y, x = torch.meshgrid(
-        torch.linspace(-1, 1, height, device=device), torch.linspace(-1, 1, width, device=device), indexing="ij"
+        torch.linspace(-1, 1, height, device=device),
+        torch.linspace(-1, 1, width, device=device),
+        indexing="ij",
     )
     light = light * (1 - of_scene(draw.uniform(0, 0.3, b)) * 0.5 * (x * x + y * y))
     image = light.clamp(0, 1) ** of_scene(draw.uniform(0.45, 1.0, b))
@@ -289,7 +304,8 @@ def _solids(draw: _Draw, b: int, options: SceneOptions) -> Solids:
     present = draw.uniform(0, 1, b, things) < draw.uniform(0.4, 1.0, b, 1)
     at = torch.stack([radius * around.cos(), radius * around.sin(), torch.where(present, 0.0, -1e3)], -1)
     # Table: often larger than the picture.
-    size[:, 0] = torch.stack([draw.log_uniform(0.3, 1.2, b), draw.log_uniform(0.3, 1.2, b), size.new_full((b,), 0.02)], -1)
+    size[:, 0, :2] = draw.log_uniform(0.3, 1.2, b, 2)
+    size[:, 0, 2] = 0.02
     origin[:, 0] = torch.cat([draw.uniform(-0.15, 0.15, b, 2), size.new_full((b, 1), -0.02)], -1)
     boxes = slice(1, 1 + loose)
     size[:, boxes] = torch.cat(
@@ -323,7 +339,9 @@ def _solids(draw: _Draw, b: int, options: SceneOptions) -> Solids:
     return Solids(_turned_upright(draw, b, k, loose, options), origin, size, shape)
 
 
-def _turned_upright(draw: _Draw, b: int, k: int, loose: int, options: SceneOptions) -> Float[Tensor, "b k 3 3"]:
+def _turned_upright(
+    draw: _Draw, b: int, k: int, loose: int, options: SceneOptions
+) -> Float[Tensor, "b k 3 3"]:
     """Rotations about z, with some of the boxes and superquadrics fallen over; the room's is the world's."""
     yaw = draw.uniform(0, 2 * math.pi, b, k)
     yaw[:, 0] = draw.normal(b) * 0.2
@@ -361,7 +379,9 @@ def _surfaces(draw: _Draw, b: int, k: int, textures: int, plain: float) -> Surfa
         ],
         -1,
     )
-    return Surfaces(draw.whole(textures, b, k), tile, draw.uniform(0, 2 * math.pi, b, k), color, contrast, gloss)
+    return Surfaces(
+        draw.whole(textures, b, k), tile, draw.uniform(0, 2 * math.pi, b, k), color, contrast, gloss
+    )
 
 
 def _lamps(draw: _Draw, b: int) -> Lamps:
@@ -389,7 +409,8 @@ def _cameras(draw: _Draw, b: int, options: SceneOptions) -> tuple[Tensor, Tensor
     target[..., 2] = target[..., 2].abs()
     # The top of the image: the way that most cameras look along the table, or up.
     along = torch.stack([-mean_azimuth.cos(), -mean_azimuth.sin(), torch.zeros_like(mean_azimuth)], -1)
-    top = torch.where(draw.chance(options.wrist_like, b, 1, 1), along, torch.tensor([0.0, 0.0, 1.0], device=distance.device))
+    up = along.new_tensor([0.0, 0.0, 1.0])
+    top = torch.where(draw.chance(options.wrist_like, b, 1, 1), along, up)
     z = -away
     x = F.normalize(torch.linalg.cross(z, top.expand_as(z)), dim=-1)
     roll = torch.deg2rad(options.roll_deg * draw.normal(b, v, 1))

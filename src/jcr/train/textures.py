@@ -19,7 +19,7 @@ def make_textures(count: int, generator: torch.Generator) -> Float[Tensor, "m 3"
     """RGB in [-1, 1], of mean 0, of `count` textures that tile: texels of all levels, one texture after another."""
     device = generator.device
 
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
+    def uniform(low: float | int, high: float | int, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=generator, device=device)
 
     axis = (torch.arange(SIDE, device=device) + 0.5) / SIDE
@@ -53,7 +53,9 @@ def make_textures(count: int, generator: torch.Generator) -> Float[Tensor, "m 3"
                 center, half = uniform(0, 1, 2), uniform(0.02, 0.25, 2)
                 # The nearest copy of the blob, so that it tiles.
                 du, dv = (((x - c + 0.5) % 1 - 0.5) / h for x, c, h in zip((u, v), center, half, strict=True))
-                inside = du * du + dv * dv < 1 if uniform(0, 1) < 0.5 else torch.maximum(du.abs(), dv.abs()) < 1
+                inside = (
+                    du * du + dv * dv < 1 if uniform(0, 1) < 0.5 else torch.maximum(du.abs(), dv.abs()) < 1
+                )
                 image = torch.where(inside, uniform(-1, 1, 3)[:, None, None], image)
         else:  # speckles
             speckle = _noise(generator, 1, 0.0) - float(uniform(0.5, 1.5))

@@ -1,10 +1,12 @@
 """The training loop: scenes drawn, pairs predicted, weights moved; the step's number decides all that is random."""
 
 import json
+import math
 import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +17,7 @@ from jcr.files import write_text, written_whole
 from jcr.reconstruct.dust3r.network import Dust3r, Features
 from jcr.train.loss import attention_miss, confident_regression, true_attention
 from jcr.train.options import TrainOptions
-from jcr.train.scenes import Views, draw_views, pairs_of, points_in_camera, seen_by
+from jcr.train.scenes import Views, draw_views, narrowed, pairs_of, points_in_camera, seen_by
 from jcr.train.textures import make_textures
 from jcr.train.validate import capture_views, pair_errors, summary
 
@@ -64,8 +66,11 @@ class Training:
         views = self.views(self.step)
         first, second = pairs_of(views, options.scene)
         self._set_rates()
+        decoders = (self.network.dec_blocks, self.network.dec_blocks2)
         attended = [
-            block[options.attention_block].cross_attn for block in (self.network.dec_blocks, self.network.dec_blocks2)
+            decoder.get_submodule(f"{block}.cross_attn")
+            for block in options.attention_blocks
+            for decoder in decoders
         ]
         inputs: list[tuple[Tensor, ...]] = []
         hooks = [a.register_forward_pre_hook(lambda _, args: inputs.append(args)) for a in attended]
@@ -100,7 +105,8 @@ class Training:
         if self.bank is None or self.bank[0] != number:
             self.bank = number, make_textures(options.textures, self._generator(2 * number + 1))
         count = scenes or options.scenes_per_step
-        return draw_views(count, options.scene, self.bank[1], self._generator(2 * step))
+        width = min(1.0, (1 + 2 * step / max(1.0, options.widen * options.steps)) / 3)
+        return draw_views(count, narrowed(options.scene, width), self.bank[1], self._generator(2 * step))
 
     def averaged_network(self) -> Dust3r:
         """The network with the averaged weights."""
@@ -152,7 +158,9 @@ class Training:
 
     def _generator(self, number: int) -> torch.Generator:
         """For one purpose at one step of one seed."""
-        return torch.Generator(self.device).manual_seed((self.options.seed * 100_003_001 + number) % HELD_OUT_SEED)
+        return torch.Generator(self.device).manual_seed(
+            (self.options.seed * 100_003_001 + number) % HELD_OUT_SEED
+        )
 
     def _set_rates(self) -> None:
         """Up over the first steps, then down along a cosine to 0."""
@@ -168,10 +176,9 @@ class Training:
         there, back = (
             true_attention(*seen_by(views, a, b, SAMPLE), size) for a, b in ((first, second), (second, first))
         )
-        misses = [
-            attention_miss(a, x, true) for a, x, true in zip(attended, inputs, (there, back), strict=True)
-        ]
-        return (misses[0] + misses[1]) / 2
+        trues = (there, back) * len(self.options.attention_blocks)
+        misses = [attention_miss(a, x, true) for a, x, true in zip(attended, inputs, trues, strict=True)]
+        return torch.stack(misses).mean()
 
 
 def train(options: TrainOptions) -> None:
@@ -205,19 +212,19 @@ def train(options: TrainOptions) -> None:
 
 def new_network(options: TrainOptions) -> Dust3r:
     """An untrained network whose points all lie a unit ahead of the camera."""
-    network = Dust3r(**configuration(options))  # type: ignore[arg-type]
+    network = Dust3r(**configuration(options))
     for module in network.modules():
         if isinstance(module, nn.Linear):
             nn.init.trunc_normal_(module.weight, std=0.02)
             nn.init.zeros_(module.bias)
     for head in (network.downstream_head1, network.downstream_head2):
         # Channels x, y, z and confidence of a token's pixels, one after another; exp(log 2) - 1 = 1.
-        head.proj.bias.data.view(4, -1)[2] = torch.log(torch.tensor(2.0))
+        head.get_parameter("proj.bias").data.view(4, -1)[2] = math.log(2)
     return network
 
 
-def configuration(options: TrainOptions) -> dict[str, object]:
-    """The network's fields, as they stand in config.json."""
+def configuration(options: TrainOptions) -> dict[str, Any]:
+    """The network's fields."""
     return {
         "enc_embed_dim": options.embed,
         "enc_depth": options.encoder_depth,
@@ -226,7 +233,7 @@ def configuration(options: TrainOptions) -> dict[str, object]:
         "dec_depth": options.decoder_depth,
         "dec_num_heads": options.heads,
         "head_type": "linear",
-        "img_size": [options.scene.width, options.scene.height],
+        "pos_embed": "RoPE100+cosine",
     }
 
 
@@ -237,7 +244,8 @@ def write_weights(folder: Path, state: dict[str, Tensor], options: TrainOptions)
     half = {key: value.detach().to("cpu", torch.float16).contiguous() for key, value in state.items()}
     with written_whole(folder / "model.safetensors") as temporary:
         save_file(half, temporary)
-    content = configuration(options) | {"licence": options.licence}
+    size = [options.scene.width, options.scene.height]
+    content = configuration(options) | {"only_size": size, "licence": options.licence}
     write_text(folder / "config.json", json.dumps(content, indent=1) + "\n")
 
 

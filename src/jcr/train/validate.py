@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -51,7 +50,9 @@ def pair_errors(network: Dust3r, views: Views, first: torch.Tensor, second: torc
         length = np.linalg.norm(truth, axis=1)
         scale = np.median(length / np.linalg.norm(found, axis=1))
         pose, _ = fit_similarity(points2[e], points1[row[j, i]])
-        direction = pose[:3, 3] @ i_from_j[:3, 3] / np.linalg.norm(pose[:3, 3]) / np.linalg.norm(i_from_j[:3, 3])
+        direction = (
+            pose[:3, 3] @ i_from_j[:3, 3] / np.linalg.norm(pose[:3, 3]) / np.linalg.norm(i_from_j[:3, 3])
+        )
         errors[e] = (
             np.median(np.linalg.norm(scale * found - truth, axis=1) / length),
             rotation_between_deg(pose[:3, :3], i_from_j[:3, :3]),
@@ -86,12 +87,12 @@ def capture_views(folder: Path, size: tuple[int, int]) -> Views:
     camera = truth.intrinsics
     grid = cover_grid((camera.width, camera.height), size)
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    at = grid.original_from_grid(np.stack([x, y], -1).astype(np.float64)).astype(np.float32)
+    column, row = grid.original_from_grid(np.stack([x, y], -1)).round().astype(int).transpose(2, 0, 1)
     images, depths = [], []
     for k, name in enumerate(truth.images):
         image = np.asarray(Image.open(folder / name).convert("RGB"))
         images.append(torch.from_numpy(resize_and_crop(image, grid).copy()).permute(2, 0, 1) / 127.5 - 1)
-        depths.append(torch.from_numpy(cv2.remap(true_depth(truth, k).astype(np.float32), at, None, cv2.INTER_NEAREST)))
+        depths.append(torch.from_numpy(true_depth(truth, k)[row, column].astype(np.float32)))
     focal = grid.grid_intrinsics(camera).fx
     return Views(
         torch.stack(images),

@@ -14,7 +14,13 @@ from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.matches import tracks_from_pairs
 from jcr.reconstruct.dust3r.pairs import PairOptions, PairPredictions
 from jcr.reconstruct.dust3r.predict import predict_pairs
-from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid, prepare_images
+from jcr.reconstruct.dust3r.preprocess import (
+    ImageGrid,
+    PreparedImages,
+    cover_grid,
+    image_grid,
+    prepare_images,
+)
 from jcr.reconstruct.dust3r.robot_align import align_with_robot
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -24,7 +30,7 @@ from jcr.records import Capture, Intrinsics, Reconstruction
 class Dust3rOptions:
     """Pairwise pointmaps of a network, aligned."""
 
-    model: Literal["dust3r", "mast3r"] = "dust3r"
+    model: Literal["compact", "dust3r", "mast3r"] = "dust3r"
     weights: str | None = None
     """File, folder or hub id; unset: the published ones of the model."""
     device: str = "cpu"
@@ -42,7 +48,11 @@ def predict(
     """
     loaded = load_weights(options.weights or CHECKPOINTS[options.model].hub_id, options.device)
     size = options.pairs.image_size
-    images = prepare_images(capture, lambda original: image_grid(original, size))
+
+    def grid(original: tuple[int, int]) -> ImageGrid:
+        return cover_grid(original, loaded.size) if loaded.size else image_grid(original, size)
+
+    images = prepare_images(capture, grid)
     predictions, notes = predict_pairs(
         loaded, images, capture.images, capture.base_from_gripper, options.pairs, progress
     )

@@ -71,9 +71,9 @@ class Dust3r(nn.Module):
     ) -> None:
         """The last four say how the published network was trained and change nothing here."""
         super().__init__()
-        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", pos_embed)
+        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)(\+cosine)?", pos_embed)
         expected = {
-            "pos_embed": (pos_embed, frequency, "RoPE100"),
+            "pos_embed": (pos_embed, frequency, "RoPE100 or RoPE100+cosine"),
             "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
             "patch_size": (patch_size, patch_size == PATCH, PATCH),
             "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
@@ -90,6 +90,8 @@ class Dust3r(nn.Module):
                 raise ValueError(f"{name} = {value!r} is not covered; it must be {cure}")
         assert frequency is not None
         self.rope_base = float(frequency[1])
+        self.absolute_position = frequency[2] is not None
+        """Tokens are told where they are, and not only where from each other: learnt sooner, but at one size."""
         self.head_dims = (enc_embed_dim // enc_num_heads, dec_embed_dim // dec_num_heads)
         self.mixed_precision: bool | None = None
         """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
@@ -153,6 +155,8 @@ class Dust3r(nn.Module):
             rotary = rotary_embedding(grid_positions(grid, images.device), self.head_dims[0], self.rope_base)
             # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
             x = self.patch_embed(images).float()
+            if self.absolute_position:
+                x = x + position_code(grid, x.shape[-1], images.device)
             for block in self.enc_blocks:
                 x = block(x, rotary)
             tokens = self.enc_norm(x)
@@ -200,6 +204,13 @@ def grid_positions(grid: tuple[int, int], device: torch.device) -> Int[Tensor, "
     """Row and column of each token, row by row."""
     rows, columns = (torch.arange(size, device=device) for size in grid)
     return torch.cartesian_prod(rows, columns)
+
+
+def position_code(grid: tuple[int, int], dim: int, device: torch.device) -> Float[Tensor, "n c"]:
+    """Sines and cosines of each token's row and column, a quarter of the channels each (ViT in MAE, He et al. 2022)."""
+    frequency = 10_000.0 ** -(torch.arange(dim // 4, device=device) / (dim // 4))
+    angle = grid_positions(grid, device)[..., None] * frequency
+    return torch.cat([angle.sin(), angle.cos()], -1).flatten(1)
 
 
 def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -> Rotary:

@@ -33,6 +33,8 @@ class LoadedNetwork:
     licence: str
     is_metric: bool
     """Its points are meant to be in metres."""
+    size: tuple[int, int] | None = None
+    """Width and height of the images that it was trained on, where it knows no others."""
 
 
 def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
@@ -52,6 +54,9 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
     if path.suffix not in _READERS:
         raise InputError(f"{path}: weights are .pth, .pt or .safetensors, not {path.suffix or 'this'}")
     config, state = _READERS[path.suffix](path)
+    licence = str(config.pop("licence", None) or licence_of(str(source)))
+    size = _only_size(config)
+    config.pop("accuracy", None)
     # MASt3R is this network with one more head, for matching, which we do without; its points are metric.
     mast3r = [key for key in state if ".head_local_features." in key]
     network = _build(config, {key: state[key] for key in state if key not in mast3r}, path)
@@ -60,9 +65,16 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
-    licence = licence_of(str(source))
     _announce(str(source), licence)
-    return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r))
+    return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r), size=size)
+
+
+def _only_size(config: dict[str, object]) -> tuple[int, int] | None:
+    """What stands in config.json as the one size, [width, height], that a network was trained on."""
+    size = config.pop("only_size", None)
+    if not isinstance(size, list) or len(size) != 2:
+        return None
+    return int(size[0]), int(size[1])
 
 
 def fingerprint(network: Dust3r) -> str:
