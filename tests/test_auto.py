@@ -54,6 +54,8 @@ def test_the_best_whose_weights_are_here_comes_first(present: set[str], monkeypa
     assert candidates(ReconstructOptions())[0] == "mast3r"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
     assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap")
+    present.add("compact")
+    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "compact")
     assert candidates(ReconstructOptions("colmap")) == ("colmap",)
     assert candidates(ReconstructOptions(weights="pairs.npz")) == ("predictions",)
     assert candidates(ReconstructOptions(board="chessboard:9x6:0.025")) == ("marker",)
@@ -143,6 +145,22 @@ def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
         kept, tried = auto_result(problem, answers, monkeypatch)
         assert tried == ["dust3r", "colmap"] and kept.backend == name
         assert f"nor is colmap; {name} (held-out error" in kept.notes[0]
+
+
+def test_the_network_in_this_package_runs_only_where_colmap_has_nothing(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("compact")
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good = problem.recon_from_camera
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    kept, tried = auto_result(problem, {"colmap": shuffled, "compact": good}, monkeypatch)
+    assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
+    nothing = NotTrustedError("0 of 8 images registered")
+    kept, tried = auto_result(problem, {"colmap": nothing, "compact": good}, monkeypatch)
+    assert tried == ["colmap", "compact"] and kept.backend == "compact"
+    assert "colmap gave nothing (0 of 8 images registered)" in kept.notes[0]
+    assert "far less accurate" in kept.notes[0]
 
 
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(

@@ -43,7 +43,7 @@ class Calibrated:
     seconds: float = 0.0
 
 
-def run(captures: Path | None = None, boards: tuple[str, ...] = (), weights: str = str(COMPACT)) -> str:
+def run(captures: Path | None = None, weights: str = str(COMPACT)) -> str:
     """Markdown: pairs, then calibrations, on simulated captures, and on the real ones below `captures`."""
     loaded = load_weights(weights)
     assert loaded.size is not None

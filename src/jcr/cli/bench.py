@@ -15,12 +15,24 @@ from jcr.cli.output import Output
 from jcr.errors import InputError
 
 BenchName = Literal[
-    "align", "bag", "calibrate", "limits", "map", "pairs", "predictions", "real", "run", "table1", "table2"
+    "align",
+    "bag",
+    "calibrate",
+    "compact",
+    "limits",
+    "map",
+    "pairs",
+    "predictions",
+    "real",
+    "run",
+    "table1",
+    "table2",
 ]
 BENCHES: dict[BenchName, str] = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
+    "compact": "the network in this package, and COLMAP, on simulated captures (and on those in DIR)",
     "limits": "where it breaks: one thing made worse at a time",
     "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
     "pairs": "predicting pairs with every image encoded once, or with every pair",
@@ -45,7 +57,7 @@ class Arguments:
     name: Annotated[BenchName, tyro.conf.Positional]
     """What to measure."""
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
-    """For real: the folder that holds capture folders, each with a reference.json."""
+    """For real and compact: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
     """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -58,7 +70,9 @@ def main(arguments: Arguments) -> int:
     from jcr.files import write_text
 
     bench = import_module(f"jcr.bench.{arguments.name}")
-    if arguments.name != "real":
+    if arguments.name == "compact":
+        found = bench.run(arguments.captures)
+    elif arguments.name != "real":
         found = bench.run()
     elif arguments.captures is None:
         raise InputError("bench real: name the folder that holds the captures, as in jcr bench real captures")

@@ -256,7 +256,9 @@ def pairs_of(views: Views, options: SceneOptions) -> tuple[Tensor, Tensor]:
         seen_by(views, first.flatten(), second.flatten(), stride=4, tolerance=0.03)[0].float().mean((1, 2))
     )
     share = share.view(-1, v, v)
-    keep = (torch.minimum(share, share.mT) >= options.least_overlap) & (first != second)
+    common = torch.minimum(share, share.mT).where(first != second, -1.0)
+    # The best pair stays in any case: a step needs one.
+    keep = common >= common.amax().clamp(max=options.least_overlap)
     return first[keep], second[keep]
 
 

@@ -87,7 +87,9 @@ def capture_views(folder: Path, size: tuple[int, int]) -> Views:
     camera = truth.intrinsics
     grid = cover_grid((camera.width, camera.height), size)
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    column, row = grid.original_from_grid(np.stack([x, y], -1)).round().astype(int).transpose(2, 0, 1)
+    column, row = (
+        grid.original_from_grid(np.stack([x, y], -1).astype(float)).round().astype(int).transpose(2, 0, 1)
+    )
     images, depths = [], []
     for k, name in enumerate(truth.images):
         image = np.asarray(Image.open(folder / name).convert("RGB"))
