@@ -3,6 +3,7 @@
 import argparse
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from jcr.errors import InputError
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.network import Dust3r
 from jcr.reconstruct.dust3r.pairs import read_pairs
+from jcr.reconstruct.dust3r.preprocess import cover_grid
 from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
+from jcr.train.options import TrainOptions
+from jcr.train.train import new_network, write_weights
 
 CONFIG = {
     "head_type": "dpt",
@@ -269,3 +273,28 @@ def test_jcr_models_lists_licences_scale_and_what_is_present(capsys: pytest.Capt
     mast3r = rows["mast3r", CHECKPOINTS["mast3r"].hub_id]
     assert mast3r["scale"] == "metres" and "non-commercial" in mast3r["licence"]
     assert rows["mapanything", CHECKPOINTS["mapanything"].hub_id]["licence"] == "Apache-2.0"
+
+
+def test_the_weights_in_a_folder_say_their_licence_size_and_accuracy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = TrainOptions(tmp_path, embed=48, encoder_depth=1, decoder_depth=1, licence="MIT")
+    write_weights(tmp_path, new_network(options).state_dict(), options)
+    loaded = load_weights(tmp_path)
+    assert loaded.licence == "MIT" and loaded.size == (128, 96) and loaded.network.absolute_position
+    checkpoint = replace(CHECKPOINTS["compact"], hub_id=str(tmp_path))
+    monkeypatch.setitem(CHECKPOINTS, "compact", checkpoint)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"accuracy": "9 mm"}))
+    assert checkpoint.is_cached() and load_weights(tmp_path).size == (128, 96)
+    assert dispatch(["models"]) == 0
+    assert f"compact      {tmp_path}" in (listed := capsys.readouterr().out) and "accuracy: 9 mm" in listed
+    (tmp_path / "model.safetensors").unlink()
+    assert not checkpoint.is_cached()
+
+
+def test_a_wide_image_is_cropped_to_the_one_size_that_weights_know() -> None:
+    grid = cover_grid((1280, 720), (64, 48))
+    assert grid.resized_size == (85, 48) and grid.crop_corner == (10, 0) and grid.size == (64, 48)
+    middle = grid.original_from_grid(np.array([31.5, 23.5]))
+    np.testing.assert_allclose(middle, (639.5, 359.5), atol=8)

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from jcr.errors import InputError
 from jcr.reconstruct.dust3r.network import Dust3r, Features, Pointmap
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.simulate.capture import SimulateOptions, simulate
+from jcr.train import curves
 from jcr.train import train as training
 from jcr.train.loss import attention_miss, confident_regression, true_attention
 from jcr.train.options import TrainOptions
@@ -309,6 +311,9 @@ def test_twenty_steps_lower_the_loss_and_leave_weights_that_jcr_reads(tmp_path: 
         torch.testing.assert_close(value, after.averaged[key], atol=2e-3, rtol=2e-3)
     lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
     assert '"step": 20' in lines[-1] and "held-out scenes" in lines[-1]
+    curves.draw(tmp_path / "curves.png", [tmp_path / "run"])
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width > 1000
     # From shipped weights, in a new folder.
     going_on = Training(replace(options, out=tmp_path / "on", from_weights=tmp_path / "run" / "weights"))
     assert held_out(going_on) < 0.9 * held_out(before)

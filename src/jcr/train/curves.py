@@ -27,13 +27,15 @@ def draw(png: Path, folders: list[Path]) -> None:
             axes.plot(pairs, _smooth(np.array([row[name] for row in rows])), f"C{number}", label=folder.name)
         looks = [(x, row["validation"]) for x, row in zip(pairs, rows, strict=True) if "validation" in row]
         for name, style in (("held-out scenes", "-"), ("captures", ":")):
-            medians = [
-                np.median(
-                    [v["rotation_deg"] for k, v in look.items() if (k == "held-out scenes") == (style == "-")]
-                )
+            found = [
+                [v["rotation_deg"] for k, v in look.items() if (k == "held-out scenes") == (style == "-")]
                 for _, look in looks
             ]
-            rotation.plot([x for x, _ in looks], medians, f"C{number}{style}", label=f"{folder.name}, {name}")
+            if all(found):
+                medians = [np.median(values) for values in found]
+                rotation.plot(
+                    [x for x, _ in looks], medians, f"C{number}{style}", label=f"{folder.name}, {name}"
+                )
     losses.set(title="distance from the truth, in units of the pair", yscale="log")
     attention.set(title="attention's cross-entropy, nats")
     rotation.set(title="median relative rotation error, degrees", ylim=(0, None))

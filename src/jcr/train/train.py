@@ -80,7 +80,8 @@ class Training:
             predicted = predict(self.network, views.images, first, second)
             for hook in hooks:
                 hook.remove()
-            loss, distance = confident_regression(predicted, true_points(views, first, second), options.alpha)
+            true = true_points(views, first, second)
+            loss, distance = confident_regression(predicted, true, options.alpha)
             log = {"loss": loss, "distance": distance}
             if options.attention:
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=options.precision == "bf16"):
