@@ -17,6 +17,7 @@ from jcr.represent.build import build_scene
 from jcr.represent.options import MapOptions
 from jcr.represent.rays import workspace_rays
 from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap, load_map
+from jcr.represent.seen import CLEAR, CROSSED
 
 OPTIONS = MapOptions(workspace=WORKSPACE)
 INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
@@ -104,6 +105,15 @@ def test_free_space_that_was_seen_is_not_called_solid(scene: SceneMap):
     assert ((sample.occupancy >= 0.5) & ~sample.unknown).mean() < 0.002
 
 
+def test_cells_called_clear_are_free_all_over(scene: SceneMap):
+    clear = (scene.seen.state & CLEAR) != 0
+    assert clear.sum() > 0.5 * ((scene.seen.state & CROSSED) != 0).sum()
+    x = torch.tensor(uniform(200_000), dtype=torch.float32)
+    x = x[(scene.seen.at(x) & CLEAR) != 0]
+    assert scene.fields(x, ("occupancy",))["occupancy"].sigmoid().max() < 0.001
+    assert (scene.query(x).occupancy == 0).all()
+
+
 # Distance
 
 
@@ -188,7 +198,7 @@ def test_colours_labels_and_further_values_are_learnt(scene: SceneMap, cloud: Po
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_the_papers_networks_learn_all_three(cloud: PointCloud, joint: bool):
-    scene = build_scene(cloud, replace(OPTIONS, preset="paper", joint=joint, max_seconds=3.0))
+    scene = build_scene(cloud, replace(OPTIONS, preset="paper", joint=joint, max_seconds=6.0))
     x = uniform(100_000)
     surface, free = cloud.points_in_base[:20_000], x[signed_distance(x) > 0.03]
     known = ~scene.query(free).unknown

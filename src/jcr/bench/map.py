@@ -114,6 +114,7 @@ def run() -> str:
         return "\n".join(
             [
                 *_accuracy(rows, scenes),
+                *_things(scenes["calibrated, COLMAP", "default"], places, truth.labels),
                 *_geometric(clouds),
                 *trained,
                 *_speed(scenes["true poses and depth", "default"], folder),
@@ -144,6 +145,26 @@ def _accuracy(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str
             + f" | {s.color_psnr:.1f} dB | {s.label_iou:.3f} | {100 * s.unknown:.0f} |"
         )
     return [*lines, ""]
+
+
+def _things(scene: SceneMap, places: Places, names: tuple[str, ...]) -> list[str]:
+    """How much of each thing's shown surface the map on calibrated poses knows, and how well it is labelled there."""
+    surface = places.surface
+    known = ~scene.query(surface.x_in_base).unknown
+    found = scene.query(surface.x_in_base[known]).label
+    things = np.unique(surface.label).tolist()
+    mapped = [100 * known[surface.label == k].mean() for k in things]
+    iou = [
+        mean_iou(found, surface.label[known], (k,)) if (surface.label[known] == k).any() else np.nan
+        for k in things
+    ]
+    return [
+        f"| calibrated, default preset | {' | '.join(names[k] for k in things)} |",
+        "|---" * (len(things) + 1) + "|",
+        f"| of the shown surface in the map, % | {' | '.join(f'{share:.0f}' for share in mapped)} |",
+        f"| label IoU there | {' | '.join(f'{share:.3f}' for share in iou)} |",
+        "",
+    ]
 
 
 def _geometric(clouds: dict[str, PointCloud]) -> list[str]:

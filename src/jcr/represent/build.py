@@ -14,6 +14,7 @@ from jcr.errors import InputError
 from jcr.progress import Progress
 from jcr.records import PointCloud
 from jcr.represent.chunks import threads_of_one_core
+from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions
 from jcr.represent.rays import NEAR, workspace_box, workspace_rays
@@ -88,7 +89,9 @@ def build_scene(
         "carving_s": f"{carved - start:.3f}",
         "training_s": f"{time.perf_counter() - carved:.3f}",
     }
-    return SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+    fields.spread("occupancy")
+    seen = with_clear_cells(without_doubts(seen), fields.field_of("occupancy"))
+    return SceneMap(fields, seen, cloud.label_names, history)
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

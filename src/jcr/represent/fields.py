@@ -191,11 +191,15 @@ class Field(nn.Module):
             target = targets[name]
             standard.copy_(torch.stack([target.mean(0), target.std(0).clamp(min=1e-6)]))
 
-    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
-        """Outputs (n, outputs) of every head at points (n,3)."""
+    def before_relu(self, x_in_base: Float[Tensor, "n 3"]) -> Float[Tensor, "hidden n"]:
+        """Inputs of the hidden units at points (n,3)."""
         # Features first: with so few of them, this product and its gradients take half the time.
         features = (self.spread or self.encoding)(x_in_base)
-        hidden = F.relu(torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features))
+        return torch.addmm(self.hidden.bias[:, None], self.hidden.weight, features)
+
+    def forward(self, x_in_base: Float[Tensor, "n 3"]) -> dict[str, Tensor]:
+        """Outputs (n, outputs) of every head at points (n,3)."""
+        hidden = F.relu(self.before_relu(x_in_base))
         outputs = {}
         for name, head in self.heads.items():
             outputs[name] = torch.addmm(head.bias[:, None], head.weight, hidden).T  # pyright: ignore[reportArgumentType, reportIndexIssue]
@@ -223,6 +227,10 @@ class Fields(nn.Module):
             if not shape.heads.keys().isdisjoint(names):
                 out |= field(x_in_base)
         return {name: out[name] for name in names}
+
+    def field_of(self, name: str) -> Field:
+        """The field that has the head."""
+        return next(f for shape, f in zip(self.shapes, self.of, strict=True) if name in shape.heads)  # pyright: ignore[reportReturnType]
 
     def spread(self, name: str) -> None:
         """Make the field of that head answer faster, at the cost of memory; for maps that are trained."""

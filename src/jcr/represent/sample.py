@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from jcr.represent.chunks import in_chunks
-from jcr.represent.seen import CROSSED
+from jcr.represent.seen import CLEAR, CROSSED
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
@@ -25,7 +25,10 @@ class Sample:
 
     @property
     def occupancy(self) -> Any:
-        """Probability (n,) that the place is solid; one half where nobody has looked, unless told otherwise."""
+        """Probability (n,) that the place is solid; one half where nobody has looked, unless told otherwise.
+
+        Where it is below 0.0009 in a whole cell, arrays are answered with 0.
+        """
         return self._occupancy_unknown[0]
 
     @property
@@ -73,9 +76,11 @@ class Sample:
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
             state = scene.seen.at(x)
-            # Most of a workspace is unseen, where the field need not be asked.
-            (seen,) = state.nonzero(as_tuple=True)
-            occupancy, unknown = torch.full_like(x[:, 0], unseen), torch.ones_like(state, dtype=torch.bool)
+            # Most of a workspace is unseen or clear, where the field need not be asked, but for gradients.
+            unknown = state == 0
+            occupancy = torch.where(unknown, unseen, 0.0)
+            asked = ~unknown if x.requires_grad else ~unknown & ((state & CLEAR) == 0)
+            (seen,) = asked.nonzero(as_tuple=True)
             if len(seen) == 0:
                 return occupancy, unknown
             inner = scene.fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()

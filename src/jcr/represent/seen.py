@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-CROSSED, HIT = 1, 2
-"""Bits of a cell's state; 0 = unseen."""
+CROSSED, HIT, CLEAR = 1, 2, 4
+"""Bits of a cell's state; 0 = unseen. CLEAR: crossed, and the map's field is sure that the whole cell is free."""
 
 NEAR = 0.06
 """Metres before each point in which its own ray is followed; farther off, the camera's depth image is asked."""
