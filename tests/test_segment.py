@@ -12,6 +12,7 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.cli.measure import table as sizes_table
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import (
@@ -224,6 +225,22 @@ def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator)
     assert np.mean(stated) < 3 * np.std(misses)
     scaled = measure(label_tabletop(cloud), scale_std=0.05).objects[0].height_std
     assert scaled == pytest.approx(0.05 * 0.06, rel=0.1)
+
+
+def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.random.Generator):
+    cloud = cloud_of(
+        rng, table(rng), box(rng, (0.05, 0.05, 0.08), (-0.1, 0)), box(rng, (0.04, 0.04, 0.06), (0.1, 0))
+    )
+    x = cloud.points_in_base
+    top = (x[:, 0] < 0) & (x[:, 2] > 0.05)
+    seen, hidden = (
+        {size.height > 0.07: size for size in measure(label_tabletop(cloud)).objects}
+        for cloud in (cloud, replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1))))
+    )
+    assert seen[True].top_seen and seen[False].top_seen
+    assert not hidden[True].top_seen and hidden[False].top_seen
+    measured = measure(label_tabletop(replace(cloud, image=np.where(top, 0, np.maximum(cloud.image, 1)))))
+    assert sizes_table(measured).count("≥") == 1
 
 
 def test_options_say_what_counts_as_an_object(rng: np.random.Generator):

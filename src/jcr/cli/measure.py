@@ -58,6 +58,7 @@ def content(measured: "Measured") -> dict[str, object]:
                 "points": size.points,
                 "height": size.height,
                 "height_std": size.height_std,
+                "top_seen": size.top_seen,
                 "footprint_in_base": size.footprint_in_base.tolist(),
                 "base_from_box": size.base_from_box.tolist(),
                 "box_size": size.box_size.tolist(),
@@ -88,6 +89,7 @@ def table(measured: "Measured") -> str:
             f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
             for value, std in zip(size.box_size, size.box_std, strict=True)
         )
+        height = height if size.top_seen else f"≥ {1e3 * size.height:.1f}"
         x, y = size.base_from_box[:2, 3]
         lines.append(f"{size.name:<{width}}  {height:>14}  {length:>14}  {across:>14}  {x:.3f}, {y:.3f}")
     return "\n".join(lines) + "\n"

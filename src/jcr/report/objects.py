@@ -16,6 +16,8 @@ def objects_section(measured: Measured, label_names: tuple[str, ...]) -> str:
             f"<td>{1e3 * value:.1f} ± {1e3 * std:.1f}</td>"
             for value, std in zip(size.box_size, size.box_std, strict=True)
         )
+        if not size.top_seen:
+            height = f"<td>at least {1e3 * size.height:.1f}</td>"
         x, y = size.base_from_box[:2, 3]
         red, green, blue = colors[size.label]
         swatch = f'<i class="swatch" style="background:rgb({red},{green},{blue})"></i>'
