@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: env demo test lint
+.PHONY: env demo test lint audit
 env: .venv/ready
 
 # torch first and pinned: an open range pulls several GB of CUDA packages.
@@ -22,3 +22,7 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+audit: .venv/ready
+	$(BIN)/bandit --quiet --recursive src --configfile pyproject.toml --severity-level medium
+	$(BIN)/python .ci/audit.py

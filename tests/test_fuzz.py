@@ -102,6 +102,19 @@ def test_changed_bytes_are_read_or_refused(name: str, readers: dict[str, Target]
         target.file.write_bytes(valid)
 
 
+@pytest.mark.parametrize("shape", [(4, 0, 4), (0, 0, 4), (0, 16)])
+def test_a_table_without_numbers_is_refused(shape: tuple[int, ...], readers: dict[str, Target]):
+    """The coverage-guided fuzzer found the first of these."""
+    target = readers["poses.npy"]
+    valid = target.file.read_bytes()
+    np.save(target.file, np.zeros(shape))
+    try:
+        with pytest.raises(InputError, match="no table of numbers"):
+            target.read(target.file)
+    finally:
+        target.file.write_bytes(valid)
+
+
 @st.composite
 def poses(draw: st.DrawFn) -> tuple[HandEyeProblem, bool]:
     """Poses of 2 to 14 images, degenerate, noisy, wrong or doubled as it comes; and whether their unit is true."""

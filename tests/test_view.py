@@ -16,6 +16,7 @@ from chromium import Chromium
 from jcr.errors import InputError
 from jcr.simulate.truth import Truth, read_truth
 from jcr.view import layers
+from jcr.view.gate import Gate
 from jcr.view.layers import level_slice
 from jcr.view.robot import read_joints, read_urdf, solve_joints
 from jcr.view.run import read_run
@@ -208,6 +209,38 @@ def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
             served.kill()  # or the test would wait for it for ever
             raise
         assert served.returncode == 0 and out == "" and err == ""
+
+
+def test_others_need_the_token_of_the_address(done: Path):
+    server = open_server("127.0.0.1", 0, "")
+    gate = Gate("127.0.0.1", 0, server.get_port())
+
+    def asked(request: str, more: str = "") -> str:
+        with socket.create_connection(("127.0.0.1", gate.port), timeout=10) as client:
+            client.sendall(f"{request} HTTP/1.1\r\nHost: x\r\n{more}Connection: close\r\n\r\n".encode())
+            return client.recv(1000).decode(errors="replace")
+
+    upgrade = (
+        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n"
+    )
+    try:
+        for request, more in (
+            ("GET /", ""),
+            ("GET /?token=wrong", ""),
+            ("GET /?token=%ff", ""),
+            ("GET //[", ""),
+            ("GET", ""),
+            ("GET /", "Cookie: jcr=wrong\r\n"),
+            ("GET /", upgrade.replace("Upgrade:", "Connection: Upgrade\r\nUpgrade:")),
+        ):
+            assert asked(request, more).startswith("HTTP/1.1 403"), request
+        assert asked("GET /", f"X: {'x' * 20_000}\r\n") == ""  # too long a head is not read to its end
+        welcome = asked(f"GET /?token={gate.token}")
+        assert welcome.startswith("HTTP/1.1 303") and f"jcr={gate.token}; HttpOnly" in welcome
+        assert asked("GET /", f"Cookie: a=b; jcr={gate.token}\r\n").startswith("HTTP/1.1 200")
+    finally:
+        gate.stop()
+        server.stop()
 
 
 def test_in_a_browser(viewer: Viewer, tmp_path: Path):

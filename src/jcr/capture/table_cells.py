@@ -91,7 +91,12 @@ def _array(file: Path) -> tuple[list[str] | None, list[list[str]]]:
         raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
     if isinstance(array, np.ndarray) and array.dtype.names is not None and array.ndim == 1:
         return list(array.dtype.names), [[str(value) for value in row] for row in array.tolist()]
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.ndim not in (2, 3):
+    if (
+        not isinstance(array, np.ndarray)
+        or array.dtype.kind not in "fiu"
+        or array.ndim not in (2, 3)
+        or not array.size
+    ):
         raise InputError(f"{file}: no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save")
     return None, [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
 

@@ -15,7 +15,8 @@ from jcr.cli.output import Output
 class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
-    The page is served to this machine alone, until Ctrl-C. Needs viser: pip install 'jcr[view]'.
+    The page is served until Ctrl-C, to this machine alone unless --host says otherwise. Needs viser: pip
+    install 'jcr[view]'.
 
     examples:
       jcr view out/table
@@ -33,7 +34,8 @@ class Arguments:
     tip: str | None = None
     """The URDF's link whose poses the capture has."""
     host: str = "127.0.0.1"
-    """Address to listen on. Beyond 127.0.0.1 whoever reaches it sees the run: the page has no password."""
+    """Address to listen on. Beyond 127.0.0.1 the address that is printed carries a token, without which nobody gets
+    in; there is no encryption."""
     port: int = 8080
     """Port to listen on; 0 takes a free one."""
     output: Output = field(default_factory=Output)
@@ -45,6 +47,7 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
 
     try:
+        from jcr.view.gate import Gate
         from jcr.view.server import is_loopback, open_server
         from jcr.view.viewer import Viewer
     except ModuleNotFoundError as error:
@@ -68,21 +71,27 @@ def main(arguments: Arguments) -> int:
             values = read_joints(arguments.joints, robot, len(run.calibration.images))[run.gripper_image]
         elif arguments.tip is not None:
             values = solve_joints(robot, arguments.tip, run.base_from_gripper)
-    server = open_server(arguments.host, arguments.port, f"jcr · {run.name}")
+    local = is_loopback(arguments.host)
+    host, port = (arguments.host, arguments.port) if local else ("127.0.0.1", 0)
+    server = open_server(host, port, f"jcr · {run.name}")
+    gate = None
     try:
         with progress_bars() as progress:
             Viewer(server, run, robot, values, progress)
         address = f"http://{arguments.host}:{server.get_port()}"
-        if not is_loopback(arguments.host):
+        if not local:
+            gate = Gate(arguments.host, arguments.port, server.get_port())
+            address = f"http://{arguments.host}:{gate.port}/?token={gate.token}"
             sys.stderr.write(
-                f"warning: whoever reaches {address} sees this run and may move what is shown: there is no password "
-                "and no encryption; from another machine rather use ssh -L "
-                f"{server.get_port()}:127.0.0.1:{server.get_port()} and the default --host\n"
+                "warning: whoever has this address sees the run, and on the way it is not encrypted; from another "
+                "machine rather use ssh -L 8080:127.0.0.1:8080 and the default --host\n"
             )
         arguments.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
         threading.Event().wait()
     except KeyboardInterrupt:
         return 0
     finally:
+        if gate is not None:
+            gate.stop()
         server.stop()
     return 0
