@@ -75,7 +75,7 @@ def test_each_pair_is_what_the_network_says_of_its_two_images(
 
 
 def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
-    loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     encoded, decoded = [], []
     encode, decode = loaded.network.encode, loaded.network.decode
@@ -93,8 +93,11 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
     content[1000] ^= 1
     flipped.write_bytes(content)
     cut.write_bytes(cut.read_bytes()[:-1])
-    third = predicted(loaded, images, options(tmp_path))
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    third, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))
     assert sum(decoded) == 14
+    assert notes == (f"2 of the pairs in the cache {tmp_path} were damaged: predicted again",)
+    assert "GB beside the program itself; the budget is 8 GB" in capsys.readouterr().err
     np.testing.assert_array_equal(first.conf2, third.conf2)
 
     other = dataclasses.replace(images, colors=images.colors.copy())

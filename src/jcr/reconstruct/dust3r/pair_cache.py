@@ -25,7 +25,7 @@ class PairCache:
     limit_bytes: int
 
     def read(self, key: str, shapes: tuple[tuple[int, ...], ...]) -> list[ndarray] | None:
-        """The arrays of a key, or None where they are missing or damaged."""
+        """The arrays of a key, or None where they are missing; ValueError where the file is damaged."""
         path = self.folder / key
         try:
             content = path.read_bytes()
@@ -35,7 +35,7 @@ class PairCache:
         sizes = [int(np.prod(shape)) for shape in shapes]
         values, digest = content[:-DIGEST_BYTES], content[-DIGEST_BYTES:]
         if len(values) != 4 * sum(sizes) or blake2b(values, digest_size=DIGEST_BYTES).digest() != digest:
-            return None
+            raise ValueError(f"{path}: not what was written")
         parts = np.split(np.frombuffer(values, np.float32), np.cumsum(sizes)[:-1])
         return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 

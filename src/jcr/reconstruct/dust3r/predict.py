@@ -1,6 +1,7 @@
 """Pairwise pointmaps of a capture: an encoder per image, a decoder per ordered pair, a memory budget."""
 
 import logging
+import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -145,18 +146,27 @@ class _Predictor:
         shapes = ((height, width, 3), (height, width)) * 2
         arrays = [_new_array((len(edges), *shape), in_memory) for shape in shapes]
         rows = {} if known is None else {tuple(edge): row for row, edge in enumerate(known.edges.tolist())}
-        missing = []
+        missing, damaged = [], 0
         for e, edge in enumerate(edges.tolist()):
             found = None
             if known is not None and (row := rows.get(tuple(edge))) is not None:
                 found = [known.pts3d[row], known.conf[row], known.pts3d_in_other_view[row], known.conf2[row]]
             elif self.cache is not None:
-                found = self.cache.read(self._pair_key(edge), shapes)
+                try:
+                    found = self.cache.read(self._pair_key(edge), shapes)
+                except ValueError:
+                    damaged += 1
             if found is None:
                 missing.append(e)
             else:
                 for array, values in zip(arrays, found, strict=True):
                     array[e] = values
+        if damaged and self.cache is not None:
+            self._say(
+                f"{damaged} of the pairs in the cache {self.cache.folder} were damaged: predicted again"
+            )
+        if missing:
+            self._announce(estimate, in_memory)
         needed = np.setdiff1d(edges[missing], list(self.features))
         self._in_batches("encode images", needed, self._encode)
         self._in_batches(
@@ -172,6 +182,16 @@ class _Predictor:
             intrinsics=self.images.intrinsics,
             grid=self.images.grid,
             is_metric=self.loaded.is_metric,
+        )
+
+    def _announce(self, estimate: MemoryEstimate, in_memory: bool) -> None:
+        """What memory the work will take, before it starts."""
+        taken = estimate.weights + estimate.features + self.batch * estimate.per_pair
+        taken += estimate.pointmaps if in_memory else 0
+        where = "" if in_memory else f", and {estimate.pointmaps / GB:.2g} GB of pointmaps in a file"
+        sys.stderr.write(
+            f"memory: about {taken / GB:.2g} GB beside the program itself{where}; the budget is "
+            f"{self.budget / GB:.2g} GB\n"
         )
 
     def _pair_key(self, edge: list[int]) -> str:
