@@ -17,6 +17,7 @@ from jcr.errors import InputError
 BenchName = Literal[
     "align",
     "bag",
+    "batch",
     "calibrate",
     "compact",
     "limits",
@@ -31,6 +32,7 @@ BenchName = Literal[
 BENCHES: dict[BenchName, str] = {
     "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
     "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
+    "batch": "many small captures by one process and by two: time, and memory while they run",
     "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
     "compact": "the network in this package, and COLMAP, on simulated captures (and on those in DIR)",
     "limits": "where it breaks: one thing made worse at a time",
