@@ -18,8 +18,8 @@ from jcr.reconstruct.lens import rays
 from jcr.records import Intrinsics
 from jcr.simulate.problem import hand_eye_problem
 
-CAPTURES, IMAGES = 12, 8
-LENS = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
+CAPTURES, IMAGES = 200, 6
+LENS = Intrinsics(30.0, 30.0, 15.5, 11.5, 32, 24)
 
 
 def run() -> str:
