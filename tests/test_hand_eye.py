@@ -124,6 +124,17 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
     assert (inside / runs >= 0.90).all() and (inside / runs <= 0.98).all()
 
 
+def test_three_images_do_not_promise_too_much():
+    """Five degrees of freedom tell how noisy the robot is, and this one's noises are in no usual relation."""
+    inside, runs = 0, 120
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([7, seed]), 3, robot_noise=(3e-4, np.radians(0.02)))
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        missed = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
+    assert inside / runs >= 0.85
+
+
 def test_covariance_matches_a_jackknife_over_images():
     problem = hand_eye_problem(np.random.default_rng(8), 30, robot_noise=NOISE)
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera

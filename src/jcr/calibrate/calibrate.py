@@ -193,6 +193,9 @@ def _investigated(
     found = better_reading(gripper, camera)
     if found is None:
         return hand_eye
+    if not hand_eye.observability.observable:
+        # Of motions that show too little, another reading may fit by chance: what is missing comes first.
+        return replace(hand_eye, warnings=(*hand_eye.warnings, explained(found)))
     return replace(hand_eye, warnings=(explained(found), *hand_eye.warnings))
 
 

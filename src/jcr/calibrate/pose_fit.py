@@ -80,9 +80,10 @@ def widening(degrees_of_freedom: tuple[float, float]) -> float:
     """Factor on a 7×7 covariance whose two variances were estimated with so many degrees of freedom.
 
     A squared Mahalanobis distance then follows 7·F(7, ν), not χ²(7); the factor makes the 95 % ellipsoid that
-    users draw from a covariance hold 95 %. The tie between the variances adds its own observations to ν.
+    users draw from a covariance hold 95 %. The tie between the variances adds nothing to ν: it tells their ratio,
+    and of how large both are the residuals alone speak.
     """
-    nu = sum(degrees_of_freedom) + 2 * REACH_WEIGHT
+    nu = sum(degrees_of_freedom)
     return 1.0 if np.isinf(nu) else float(7 * f.ppf(0.95, 7, nu) / chi2.ppf(0.95, 7))
 
 
