@@ -47,7 +47,7 @@ def run(captures: Path | None = None, weights: str = str(COMPACT)) -> str:
     """Markdown: pairs, then calibrations, on simulated captures, and on the real ones below `captures`."""
     loaded = load_weights(weights)
     assert loaded.size is not None
-    pair_rows, rows = [], []
+    pair_rows, rows, said = [], [], []
     with tempfile.TemporaryDirectory() as name:
         for texture in (True, False):
             surface = "textured" if texture else "untextured"
@@ -65,10 +65,16 @@ def run(captures: Path | None = None, weights: str = str(COMPACT)) -> str:
             pairs = PairErrors(*(np.concatenate(values) for values in zip(*errors, strict=True)))
             pair_rows.append(f"| {surface} | " + " | ".join(str(v) for v in summary(pairs).values()) + " |")
             for backend, of_backend in found.items():
-                rows.append(_line(f"**{surface}, median**", backend, _median(of_backend)))
+                middle = _median(of_backend)
+                rows.append(_line(f"**{surface}, median**", backend, middle))
+                found_all = np.isfinite(middle.mm)
+                off = f"{middle.mm:.1f} mm and {middle.deg:.2f}° off" if found_all else "nothing"
+                said.append(f"{backend} on {surface} scenes {off}")
     real = _real(captures, weights) if captures is not None else []
     return "\n".join(
         [
+            f"> {IMAGES} simulated images (medians of {len(SEEDS)} scenes): {'; '.join(said)}.",
+            "",
             f"`jcr simulate --images {IMAGES}`, scenes of seeds {SEEDS[0]} to {SEEDS[-1]}, every ordered pair.",
             "",
             "| captures | points % | rotation ° | direction ° | AUC@5° | AUC@15° |",

@@ -2,19 +2,24 @@
 
 import json
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+from numpy import ndarray
 
+from jcr.bench.figure import png
 from jcr.calibrate.calibrate import calibrate
 from jcr.calibrate.hand_eye import solve_hand_eye
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import NotTrustedError
+from jcr.files import write_bytes
 from jcr.geometry import transform
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import HandEye
@@ -32,6 +37,10 @@ WRONG_MM, WRONG_DEG = 20.0, 2.0
 """Beyond this an answer is wrong; wrong and trusted is the worst fault there is."""
 POSE_TRIALS = 15
 """Simulated pose sets behind a line without pictures."""
+ROTATIONS = (0.0, 1.0, 3.0, 6.0, 12.0, 25.0)
+"""Degrees."""
+SURPRISE = 3.0
+"""Reported standard deviations beyond which a trusted answer is a silent fault."""
 PICTURE = (213, 160)
 """Pixels of an example in the figure."""
 
@@ -62,7 +71,7 @@ def trials() -> list[Trial]:
             Trial("pixel noise", f"σ {sigma:g} of 255", replace(plain, noise=sigma))
             for sigma in (5.0, 15.0, 40.0)
         ),
-        *(Trial("focal length given", f"x {factor:g}", plain, _focal(factor)) for factor in (0.95, 1.2)),
+        *(Trial("focal length given", f"x {factor:g}", plain, _focal(factor)) for factor in (0.95, 0.8, 1.2)),
         Trial("focal length given", "none", replace(plain, unknown_intrinsics=True)),
         *(
             Trial("robot noise", f"{mm:g} mm, {mm / 5:g}°", replace(plain, robot_noise=(mm, mm / 5)))
@@ -70,40 +79,98 @@ def trials() -> list[Trial]:
         ),
         *(Trial("objects moved midway", f"{n}", plain, _redrawn(_moved(n), COUNT // 2)) for n in (1, 3, 8)),
         Trial("glossy table", "shine 1", plain, _redrawn(_glossy, 0)),
+        Trial("path of the wrist", "turntable", replace(plain, pattern="one-axis")),
+        Trial("path of the wrist", "orbit at one radius", replace(plain, pattern="orbit")),
+        Trial("path of the wrist", "no rotation", replace(plain, pattern="translation")),
     ]
 
 
-def run() -> str:
-    """Markdown, with what is made worse down the page; `figure` draws its examples."""
+@dataclass(frozen=True)
+class Verdict:
+    """What came of one trial."""
+
+    trial: Trial
+    picture: UInt8[ndarray, "h w 3"]
+    """One of its images, small."""
+    used: int = 0
+    mm: float = np.nan
+    deg: float = np.nan
+    sigmas: float = np.nan
+    """Largest error on an axis of offset and orientation in reported standard deviations."""
+    std_mm: float = np.nan
+    status: int = 3
+    """Of `jcr calibrate`: 3 where the answer is not to be trusted."""
+    reason: str = ""
+
+    @property
+    def wrong(self) -> bool:
+        """Off by more than what counts as wrong."""
+        return self.mm > WRONG_MM or self.deg > WRONG_DEG
+
+    @property
+    def silent(self) -> bool:
+        """Trusted, and farther off than it says: the one thing that must not happen."""
+        return self.status == 0 and self.sigmas > SURPRISE
+
+    @property
+    def answer(self) -> str:
+        """In words."""
+        if np.isnan(self.mm):
+            return "refused"
+        words = "trusted" if self.status == 0 else "not trusted"
+        return words + (", wrong" if self.wrong else "") + (", **silent wrong**" if self.silent else "")
+
+
+def run(out: Path | None = None) -> str:
+    """Markdown, with what is made worse down the page; what the camera saw goes to limits.png in `out`."""
+    verdicts = [_verdict(trial) for trial in trials()]
+    if out is not None:
+        write_bytes(out / "limits.png", _sheet(verdicts))
+    rotations = [_rotation(degrees) for degrees in ROTATIONS]
+    silent = [f"{v.trial.what} {v.trial.level}" for v in verdicts if v.silent]
+    wrong = [v for v in verdicts if v.wrong and v.status == 0]
     lines = [
-        f"{COUNT} images of the simulated tabletop (seed {SEED}), COLMAP back end, robot noise {NOISE[0]:g} mm and "
-        f"{NOISE[1]:g}° unless named. **wrong** is more than {WRONG_MM:g} mm or {WRONG_DEG:g}° off; wrong and trusted "
-        "at once is what must not happen.",
+        f"> Of {len(verdicts)} captures made worse in one way each, {sum(v.status == 0 for v in verdicts)} are trusted; "
+        f"{len(wrong)} of these are off by more than {WRONG_MM:g} mm or {WRONG_DEG:g}°, and "
+        + (
+            f"{len(silent)} by more than {SURPRISE:g} reported standard deviations on an axis: {', '.join(silent)}."
+            if silent
+            else f"none by more than {SURPRISE:g} reported standard deviations on any axis."
+        ),
         "",
-        "| made worse | to | images used | answer | off: mm | ° | error / σ | reason given |",
-        "|---" * 8 + "|",
-        *(_line(trial) for trial in trials()),
+        f"{COUNT} images of the simulated tabletop (seed {SEED}), COLMAP back end, robot noise {NOISE[0]:g} mm and "
+        f"{NOISE[1]:g}° unless named. *wrong*: more than {WRONG_MM:g} mm or {WRONG_DEG:g}° off. **silent wrong**: "
+        f"exit status 0 and an error of more than {SURPRISE:g} reported standard deviations on an axis (σ), the one "
+        "thing that must not happen.",
+        "",
+        "![what the camera saw](limits.png)",
+        "",
+        "| made worse | to | images used | exit status | answer | off: mm | ° | σ | reported ±: mm | reason given |",
+        "|---" * 10 + "|",
+        *map(_line, verdicts),
         "",
         f"Least rotation: views that turn by so much about random axes, {COUNT} poses, no pictures, "
         f"{POSE_TRIALS} draws.",
         "",
-        "| turned by | trusted | of those wrong | median off when trusted: mm | median ±σ: mm |",
-        "|---" * 5 + "|",
-        *_rotation_lines(),
+        "| turned by | trusted | of those wrong | silent wrong | median off when trusted: mm | median ±σ: mm |",
+        "|---" * 6 + "|",
+        *rotations,
     ]
     return "\n".join(lines) + "\n"
 
 
-def _line(trial: Trial) -> str:
+def _verdict(trial: Trial) -> Verdict:
     with tempfile.TemporaryDirectory() as folder:
         made = simulate(Path(folder) / "capture", trial.options)
         trial.change(made)
         capture, truth = read_capture(made), read_truth(made)
+        # The last one: what happens midway has happened.
+        picture = cv2.resize(read_image(_pictures(made)[-1]), PICTURE, interpolation=cv2.INTER_AREA)
         try:
             reconstruction = reconstruct(capture, ColmapOptions(dense=False))
             found = calibrate(capture, reconstruction)
         except NotTrustedError as refusal:
-            return f"| {trial.what} | {trial.level} | 0 | refused | | | | {_short(str(refusal))} |"
+            return Verdict(trial, np.asarray(picture, np.uint8), reason=_short(str(refusal)))
     problem = HandEyeProblem(
         capture.base_from_gripper,
         reconstruction.recon_from_camera,
@@ -111,49 +178,84 @@ def _line(trial: Trial) -> str:
         found.scale,  # the unit of structure from motion is nobody's: its error is not counted
         truth.base_from_gripper,
     )
-    mm, deg, sigmas = _off(problem, found)
-    says = "trusted" if found.converged else "not trusted"
-    wrong = ", **wrong**" if mm > WRONG_MM or deg > WRONG_DEG else ""
-    reason = "" if found.converged else _short(found.warnings[0])
-    return (
-        f"| {trial.what} | {trial.level} | {found.inliers.sum()} | {says}{wrong} | {mm:.2f} | {deg:.3f} | "
-        f"{sigmas:.1f} | {reason} |"
+    return Verdict(
+        trial,
+        np.asarray(picture, np.uint8),
+        int(found.inliers.sum()),
+        *_off(problem, found),
+        0 if found.converged else 3,
+        "" if found.converged else _short(found.warnings[0]),
     )
 
 
-def _off(problem: HandEyeProblem, found: HandEye) -> tuple[float, float, float]:
-    """mm, degrees, and the root mean square of the six errors in reported standard deviations."""
+def _line(v: Verdict) -> str:
+    numbers = "| | | " if np.isnan(v.mm) else f"{v.mm:.2f} | {v.deg:.3f} | {v.sigmas:.1f} | {v.std_mm:.1f}"
+    return (
+        f"| {v.trial.what} | {v.trial.level} | {v.used} | {v.status} | {v.answer} | {numbers} | {v.reason} |"
+    )
+
+
+def _off(problem: HandEyeProblem, found: HandEye) -> tuple[float, float, float, float]:
+    """mm, degrees, the largest of the six errors in reported standard deviations, and the largest of these in mm."""
     off = error(problem, found.gripper_from_camera, found.scale)[:6]
-    sigmas = float(np.sqrt(off @ np.linalg.solve(found.covariance[:6, :6], off) / 6))
-    return 1e3 * float(np.linalg.norm(off[:3])), float(np.degrees(np.linalg.norm(off[3:]))), sigmas
+    std = np.sqrt(np.diag(found.covariance)[:6])
+    return (
+        1e3 * float(np.linalg.norm(off[:3])),
+        float(np.degrees(np.linalg.norm(off[3:]))),
+        float(np.abs(off / std).max()),
+        1e3 * float(std[:3].max()),
+    )
 
 
 def _short(text: str) -> str:
     return text.split(";")[0].split(" (")[0]
 
 
-def _rotation_lines() -> Iterable[str]:
-    for degrees in (0.0, 1.0, 3.0, 6.0, 12.0, 25.0):
-        trusted, wrong, off, std = 0, 0, [], []
-        for seed in range(POSE_TRIALS):
-            problem = hand_eye_problem(
-                np.random.default_rng(seed),
-                COUNT,
-                "translation",
-                robot_noise=(NOISE[0] / 1e3, float(np.radians(NOISE[1]))),
-                camera_noise=(2e-4, float(np.radians(0.02))),
-                deviation=float(np.radians(degrees)),
-            )
-            found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-            if not found.converged:
-                continue
-            mm, deg, _ = _off(problem, found)
-            trusted += 1
-            wrong += mm > WRONG_MM or deg > WRONG_DEG
-            off.append(mm)
-            std.append(1e3 * np.sqrt(np.diag(found.covariance)[:3].max()))
-        middle = f"{np.median(off):.1f} | {np.median(std):.1f}" if off else "| "
-        yield f"| {degrees:g}° | {trusted} of {POSE_TRIALS} | {wrong} | {middle} |"
+def _sheet(verdicts: Sequence[Verdict]) -> bytes:
+    """PNG: a row for each thing that is made worse, a picture for each level, framed by what came of it."""
+    kinds = list(dict.fromkeys(v.trial.what for v in verdicts))
+    across = max(sum(v.trial.what == kind for v in verdicts) for kind in kinds)
+    figure = Figure(figsize=(2.3 * across, 2.0 * len(kinds)), layout="constrained")
+    axes = figure.subplots(len(kinds), across, squeeze=False)
+    for row, kind in zip(axes, kinds, strict=True):
+        chosen = [v for v in verdicts if v.trial.what == kind]
+        for axis in row[len(chosen) :]:
+            axis.set_visible(False)
+        for axis, v in zip(row, chosen, strict=False):
+            axis.imshow(v.picture)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            color = "tab:red" if v.silent else "tab:green" if v.status == 0 else "tab:orange"
+            for spine in axis.spines.values():
+                spine.set(color=color, linewidth=3)
+            off = "" if np.isnan(v.mm) else f", {v.mm:.1f} mm"
+            axis.set_title(f"{kind}: {v.trial.level}", fontsize=7)
+            axis.set_xlabel(f"{v.answer.replace('**', '')}{off}", fontsize=7)
+    return png(figure, 90)
+
+
+def _rotation(degrees: float) -> str:
+    trusted, wrong, silent, off, std = 0, 0, 0, [], []
+    for seed in range(POSE_TRIALS):
+        problem = hand_eye_problem(
+            np.random.default_rng(seed),
+            COUNT,
+            "translation",
+            robot_noise=(NOISE[0] / 1e3, float(np.radians(NOISE[1]))),
+            camera_noise=(2e-4, float(np.radians(0.02))),
+            deviation=float(np.radians(degrees)),
+        )
+        found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        if not found.converged:
+            continue
+        mm, deg, sigmas, std_mm = _off(problem, found)
+        trusted += 1
+        wrong += mm > WRONG_MM or deg > WRONG_DEG
+        silent += sigmas > SURPRISE
+        off.append(mm)
+        std.append(std_mm)
+    middle = f"{np.median(off):.1f} | {np.median(std):.1f}" if off else "| "
+    return f"| {degrees:g}° | {trusted} of {POSE_TRIALS} | {wrong} | {silent} | {middle} |"
 
 
 def _pictures(folder: Path) -> list[Path]:

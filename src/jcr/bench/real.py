@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.bench.peers import opencv
+from jcr.calibrate.calibrate import calibrate as calibrate_stage
 from jcr.calibrate.file import HeldOutError, read_hand_eye
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import rotation_between_deg, rotation_log
+from jcr.geometry import (
+    Transforms,
+    inverse,
+    nearest_rotation,
+    rotation_between_deg,
+    rotation_log,
+    transform,
+)
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.marker import MarkerOptions, reconstruct
 from jcr.records import Capture
 
 
@@ -57,8 +66,11 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         if folder.name in board_of:
             rows += _rows(folder, board_of[folder.name])
     lines = [
+        *_claims(rows),
+        "",
         "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
-        "own. σ: the largest reported standard deviation of an axis.",
+        "own. σ: the largest reported standard deviation of an axis. Held out: each gripper pose predicted by the other "
+        "images; where two calibrations predict alike, the pictures cannot tell which is the better one.",
         "",
         "| capture | from | images used | off: mm | ° | in σ | ±σ: mm | ° | held out: mm / ° | trusted | s |",
         "|---" * 11 + "|",
@@ -67,6 +79,17 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         *(f"- {row.capture}, {row.how}: {row.says}" for row in rows if row.says),
     ]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _claims(rows: Sequence[Row]) -> list[str]:
+    said = [
+        f"{row.capture} {row.off_mm:.1f} mm and {row.off_deg:.2f}° from its reference ({row.how})"
+        for row in rows
+        if row.trusted and row.off_mm is not None and row.off_deg is not None
+    ]
+    refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
+    told = f" Not trusted, and said so: {', '.join(refused)}." if refused else ""
+    return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}"]
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:
@@ -105,14 +128,61 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     if board is None:
         return [row]
     rows = result.reconstruction.image_index
-    park = _park(capture, rows, result.reconstruction.recon_from_camera)
-    off_mm, off_deg = _off(park, reference)
-    return [row, Row(folder.name, f"{how}, OpenCV's Park", f"{len(rows)} of {len(capture)}", off_mm, off_deg)]
+    gripper, camera = capture.base_from_gripper[rows], result.reconstruction.recon_from_camera
+    off_mm, off_deg = _off(_park(gripper, camera), reference)
+    park = Row(folder.name, f"{how}, OpenCV's Park", f"{len(rows)} of {len(capture)}", off_mm, off_deg)
+    return [
+        row,
+        replace(park, held_out=_park_held_out(gripper, camera)),
+        *_lens_row(capture, board, reference),
+    ]
 
 
-def _park(capture: Capture, rows: ndarray, recon_from_camera: Float[ndarray, "m 4 4"]) -> ndarray:
+def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) -> list[Row]:
+    """The same with the lens found from the board: how much of the distance the stored lens may explain."""
+    if capture.intrinsics is None:
+        return []
+    blind = replace(capture, intrinsics=None)
+    try:
+        found = reconstruct(blind, MarkerOptions(board, dense=False))
+        hand_eye = calibrate_stage(blind, found)
+    except NotTrustedError:
+        return []
+    off_mm, off_deg = _off(hand_eye.gripper_from_camera, reference)
+    how = f"`{board}`, its lens ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
+    held = hand_eye.held_out
+    told = (
+        None
+        if held is None
+        else HeldOutError(
+            translation_mm=held.translation_mm,
+            rotation_deg=held.rotation_deg,
+            reprojection_px=None,
+            how=held.how,
+        )
+    )
+    images = f"{hand_eye.inliers.sum()} of {len(capture)}"
+    return [Row(capture.folder.name, how, images, off_mm, off_deg, held_out=told)]
+
+
+def _park(gripper: Transforms, camera: Transforms) -> Float[ndarray, "4 4"]:
     """What the references were made with, on the board's poses that we found."""
-    return opencv("Park", capture.base_from_gripper[rows], recon_from_camera, 1.0)[0]
+    return opencv("Park", gripper, camera, 1.0)[0]
+
+
+def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOutError:
+    """Each gripper pose predicted by Park's method from the others, as `held_out` of a calibration has it."""
+    missed = []
+    for k in range(len(gripper)):
+        others = np.arange(len(gripper)) != k
+        x = _park(gripper[others], camera[others])
+        base_from_board = gripper[others] @ x @ inverse(camera[others])
+        middle = transform(
+            nearest_rotation(base_from_board[:, :3, :3].mean(0)), base_from_board[:, :3, 3].mean(0)
+        )
+        missed.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
+    mm, deg = np.mean(missed, axis=0)
+    return HeldOutError(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
 
 
 def _off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:

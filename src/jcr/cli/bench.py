@@ -2,6 +2,8 @@
 
 import os
 import platform
+import shlex
+import sys
 from dataclasses import dataclass, field
 from datetime import date
 from importlib import import_module
@@ -15,11 +17,13 @@ from jcr.cli.output import Output
 from jcr.errors import InputError
 
 BenchName = Literal[
+    "all",
     "align",
     "bag",
     "batch",
     "calibrate",
     "compact",
+    "density",
     "limits",
     "map",
     "pairs",
@@ -29,20 +33,46 @@ BenchName = Literal[
     "table1",
     "table2",
 ]
-BENCHES: dict[BenchName, str] = {
-    "align": "global alignment: fast against adam, kinematic against free, in error, time and memory",
-    "bag": "frames chosen from a minute of a robot's MCAP: which, time and memory",
-    "batch": "many small captures by one process and by two: time, and memory while they run",
-    "calibrate": "hand-eye solvers on the same simulated poses, for accuracy and time",
-    "compact": "the network in this package, and COLMAP, on simulated captures (and on those in DIR)",
-    "limits": "where it breaks: one thing made worse at a time",
-    "map": "the map: accuracy of both presets, training, queries, distances, and spheres beside python-fcl",
-    "pairs": "predicting pairs with every image encoded once, or with every pair",
-    "predictions": "the whole job from pointmaps with a network's errors: error, honesty, map, time",
-    "real": "real captures in DIR, against the references stored beside them",
-    "run": "the whole job on the bundled capture: time and memory of each stage",
-    "table1": "hand-eye calibration from few images of three scenes, by the paper and by ours",
-    "table2": "heights of objects in simulated scenes, from 8 and 10 images",
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A row of the table of benches."""
+
+    what: str
+    timed: bool = False
+    """Measures time, so that nothing else may run beside it."""
+    draws: bool = False
+    """Writes pictures beside its page."""
+
+
+BENCHES: dict[BenchName, Bench] = {
+    "run": Bench("the whole job on the bundled capture: error, time and memory", True),
+    "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
+    "real": Bench("real captures in DIR, against the references stored beside them", True),
+    "calibrate": Bench(
+        "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
+    ),
+    "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
+    "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
+    "density": Bench(
+        "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
+    ),
+    "map": Bench(
+        "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
+    ),
+    "predictions": Bench(
+        "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
+    ),
+    "align": Bench(
+        "global alignment: fast against adam, kinematic against free, in error, time and memory", True
+    ),
+    "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
+    "compact": Bench(
+        "the network in this package, and COLMAP, on simulated captures (and on those in DIR)", True
+    ),
+    "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
+    "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
 }
 
 
@@ -54,6 +84,7 @@ class Arguments:
       jcr bench calibrate
       jcr bench run --out docs/results
       jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
+      jcr bench all captures --out docs/results --readme README.md
     """
 
     name: Annotated[BenchName, tyro.conf.Positional]
@@ -63,35 +94,97 @@ class Arguments:
     boards: tuple[str, ...] = ()
     """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md in this folder."""
+    """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
+    resume: bool = False
+    """For all: leave out the benches whose page is newer than the program's source files."""
+    readme: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """For all: a README in which the claims are put between its two marks."""
     output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
-    """Run one bench."""
+    """Run one bench, or all of them."""
+    if arguments.name == "all":
+        return _all(arguments)
     from jcr.files import write_text
 
     bench = import_module(f"jcr.bench.{arguments.name}")
-    if arguments.name == "compact":
-        found = bench.run(arguments.captures)
-    elif arguments.name != "real":
-        found = bench.run()
-    elif arguments.captures is None:
-        raise InputError("bench real: name the folder that holds the captures, as in jcr bench real captures")
-    else:
+    if arguments.name == "real":
+        if arguments.captures is None:
+            raise InputError(
+                "bench real: name the folder that holds the captures, as in jcr bench real captures"
+            )
         found = bench.run(arguments.captures, arguments.boards)
-    table = heading(arguments.name) + found
+    elif arguments.name == "compact":
+        found = bench.run(arguments.captures)
+    elif BENCHES[arguments.name].draws:
+        found = bench.run(arguments.out)
+    else:
+        found = bench.run()
+    table = heading(arguments) + found
     arguments.output.result(table, {"bench": arguments.name, "markdown": table})
     if arguments.out is not None:
         write_text(arguments.out / f"{arguments.name}.md", table)
     return 0
 
 
-def heading(name: str) -> str:
+def _all(arguments: Arguments) -> int:
+    """Every bench; 1 when one of them failed."""
+    if arguments.out is None:
+        raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
+    from jcr.bench.suite import Outcome, absent_networks, between_marks, run, write_index
+    from jcr.files import write_text
+
+    names: dict[str, bool] = {name: bench.timed for name, bench in BENCHES.items()}
+    given: dict[str, list[str]] = {}
+    absent = absent_networks()
+    if arguments.captures is None:
+        del names["real"]
+        absent.append("real captures: no folder of them was named")
+    else:
+        boards = ["--boards", *arguments.boards] if arguments.boards else []
+        given["real"] = [str(arguments.captures), *boards]
+        given["compact"] = [str(arguments.captures)]
+
+    def report(outcome: Outcome) -> None:
+        if not arguments.output.quiet:
+            sys.stderr.write(f"{outcome.name}: {outcome.trouble or 'done'}, {outcome.seconds or 0.0:.0f} s\n")
+
+    outcomes = run(names, arguments.out, given, arguments.resume, report)
+    command = " ".join(["jcr bench all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"])
+    write_index(outcomes, arguments.out, command, machine(), absent)
+    if arguments.readme is not None:
+        link = os.path.relpath(arguments.out, arguments.readme.parent)
+        text = between_marks(arguments.readme.read_text(), arguments.out, list(names), link)
+        write_text(arguments.readme, text)
+    index = arguments.out / "README.md"
+    facts = {outcome.name: {"seconds": outcome.seconds, "trouble": outcome.trouble} for outcome in outcomes}
+    arguments.output.result(index.read_text(), {"bench": "all", "benches": facts})
+    return int(any(outcome.trouble for outcome in outcomes))
+
+
+def heading(arguments: Arguments) -> str:
     """What a reader needs to judge and repeat the numbers."""
-    versions = ", ".join(f"{name} {version(name)}" for name in ("jcr", "numpy", "scipy", "torch", "pycolmap"))
+    command = ["jcr", "bench", arguments.name]
+    if arguments.captures is not None:
+        # Where they lie is the machine's own affair.
+        command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
     return (
-        f"# jcr bench {name}\n\n"
-        f"{date.today().isoformat()}, {platform.machine()}, {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}, {versions}\n\n"
+        f"# jcr bench {arguments.name}\n\n{BENCHES[arguments.name].what}\n\n"
+        f"    {shlex.join(command)}\n\n{date.today().isoformat()}. {machine()}\n\n"
     )
+
+
+def machine() -> str:
+    """Processor, cores and versions in a sentence."""
+    versions = ", ".join(f"{name} {version(name)}" for name in ("jcr", "numpy", "scipy", "torch", "pycolmap"))
+    return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()

@@ -1,0 +1,144 @@
+"""`jcr bench all`: every bench in a process of its own, and an index with one line per claim."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import jcr
+from jcr.errors import InputError
+from jcr.files import write_text
+from jcr.reconstruct.checkpoints import CHECKPOINTS
+
+CLAIM = "> "
+"""Begins the lines of a bench's page that say in a sentence what was found."""
+MARKS = ("<!-- jcr bench all: begin -->", "<!-- jcr bench all: end -->")
+"""Lines of a README between which the claims go."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one bench."""
+
+    name: str
+    seconds: float | None = None
+    """None: not run."""
+    trouble: str = ""
+    """Why there is no new page."""
+
+
+def run(
+    benches: dict[str, bool],
+    out: Path,
+    arguments: dict[str, list[str]],
+    resume: bool,
+    report: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Run the benches, those that are not timed two at a time and then the timed ones alone, and write the index.
+
+    `benches` tells of each name whether it is timed; `arguments` holds what else each is given. With `resume`
+    those are left out whose page is newer than every source file. A bench that fails loses no other one's page.
+    """
+    fresh = {name for name in benches if resume and _is_newer(out / f"{name}.md")}
+    todo = [name for name in benches if name not in fresh]
+    outcomes = {name: Outcome(name) for name in fresh}
+
+    def measured(name: str, threads: int) -> None:
+        outcomes[name] = _measured(name, out, arguments.get(name, []), threads)
+        report(outcomes[name])
+
+    with ThreadPoolExecutor(2) as two:
+        list(two.map(lambda name: measured(name, 1), [name for name in todo if not benches[name]]))
+    for name in todo:
+        if benches[name]:
+            measured(name, os.cpu_count() or 1)
+    return [outcomes[name] for name in benches]
+
+
+def _measured(name: str, out: Path, arguments: Sequence[str], threads: int) -> Outcome:
+    begun = time.perf_counter()
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
+    command = [sys.executable, "-m", "jcr", "bench", name, *arguments, "--out", str(out)]
+    done = subprocess.run(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    seconds = time.perf_counter() - begun
+    said = done.stderr.strip().splitlines() or [""]
+    return Outcome(
+        name, seconds, f"ended with status {done.returncode}: {said[-1]}" if done.returncode else ""
+    )
+
+
+def _is_newer(page: Path) -> bool:
+    sources = Path(jcr.__file__).parent.rglob("*.py")
+    return page.is_file() and page.stat().st_mtime > max(path.stat().st_mtime for path in sources)
+
+
+def claims(page: Path) -> list[str]:
+    """What a bench's page says in a sentence each."""
+    if not page.is_file():
+        return []
+    return [line.removeprefix(CLAIM) for line in page.read_text().splitlines() if line.startswith(CLAIM)]
+
+
+def write_index(
+    outcomes: Sequence[Outcome], out: Path, command: str, machine: str, absent: Sequence[str]
+) -> None:
+    """README.md in `out`: the claims of every page, what failed, and what is `absent` and why."""
+    ran = [outcome for outcome in outcomes if outcome.seconds is not None]
+    whole = sum(outcome.seconds or 0.0 for outcome in ran)
+    lines = [
+        "# Results",
+        "",
+        f"Written by `{command}`, {date.today().isoformat()}. {machine} {len(ran)} of {len(outcomes)} benches were "
+        f"run this time, {whole / 60:.0f} minutes of them together, those that are not timed two at a time. Each "
+        "page says above its tables which command writes them.",
+        "",
+        *(
+            f"- {claim} ([{outcome.name}]({outcome.name}.md))"
+            for outcome in outcomes
+            for claim in claims(out / f"{outcome.name}.md")
+            if not outcome.trouble
+        ),
+        "",
+        "Not here:",
+        "",
+        *(f"- {what}" for what in absent),
+        *(f"- **{outcome.name}** {outcome.trouble}" for outcome in outcomes if outcome.trouble),
+        "",
+        "| bench | s |",
+        "|---|---|",
+        *(f"| [{outcome.name}]({outcome.name}.md) | {outcome.seconds:.0f} |" for outcome in ran),
+    ]
+    write_text(out / "README.md", "\n".join(lines) + "\n")
+
+
+def absent_networks() -> list[str]:
+    """The foundation models whose weights are not on this machine, so that no table has a line of theirs."""
+    return [
+        f"`{name}`: its weights ({row.licence}) are not on this machine; with them, table1 has lines of its own for it"
+        for name, row in CHECKPOINTS.items()
+        if not row.is_cached()
+    ]
+
+
+def between_marks(readme: str, out: Path, names: Sequence[str], link: str) -> str:
+    """A README's text with the claims of every page between its marks; `link` is where it finds `out`.
+
+    Raises InputError where the text has no marks.
+    """
+    before, begin, rest = readme.partition(MARKS[0])
+    _, end, after = rest.partition(MARKS[1])
+    if not (begin and end):
+        raise InputError(f"the README has no lines {MARKS[0]} and {MARKS[1]} to put the claims between")
+    rows = [
+        f"- {claim} ([`jcr bench {name}`]({link}/{name}.md))"
+        for name in names
+        for claim in claims(out / f"{name}.md")
+    ]
+    return "\n".join([before + begin, *rows, end]) + after
