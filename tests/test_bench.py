@@ -74,9 +74,8 @@ def test_claims_go_between_the_marks_and_a_readme_without_them_is_refused(tmp_pa
     (tmp_path / "map.md").write_text(f"# map\n{CLAIM}1 mm off\n{CLAIM}2 s long\n")
     readme = f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n"
     written = between_marks(readme, tmp_path, ["map", "limits"], "results")
-    assert (
-        written == f"before\n{MARKS[0]}\n- 1 mm off ([`jcr bench map`](results/map.md))\n{MARKS[1]}\nafter\n"
-    )
+    link = "([`jcr bench map`](results/map.md))"
+    assert written == f"before\n{MARKS[0]}\n- 1 mm off {link}\n- 2 s long {link}\n{MARKS[1]}\nafter\n"
     with pytest.raises(InputError, match="marks|lines"):
         between_marks("no marks", tmp_path, ["map"], "results")
 
