@@ -30,6 +30,8 @@ def run() -> str:
         rows = {processes: _measured(captures, folder / f"out{processes}", processes) for processes in (1, 2)}
     seconds = {processes: row[0] for processes, row in rows.items()}
     lines = [
+        f"> {CAPTURES} small captures take {seconds[1]:.0f} s by one process and {seconds[2]:.0f} s by two.",
+        "",
         f"{CAPTURES} captures of {IMAGES} images of {LENS.width}x{LENS.height} with pointmaps given (`--backend "
         "predictions --calibrate-only`); memory is the resident set of the command and of its workers together",
         "",
