@@ -81,20 +81,20 @@ def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> str:
     left, top, right, bottom = 46.0, 48.0, 12.0, 40.0
     zoom = min((WIDTH - left - right) / (high[0] - low[0]), 1.3 * HEIGHT / (high[1] - low[1]))
     width, height = zoom * (high - low)
-    occupancy = np.zeros((*cut.occupancy.shape, 4), np.uint8)
-    occupancy[..., :3] = (37, 99, 235)
-    occupancy[..., 3] = np.where(cut.unknown, 0, 255 * (0.1 + 0.9 * cut.occupancy.clip(0, 1)))
+    # As masks over the page's own colours, which differ between light and dark.
     unknown = np.where(cut.unknown, np.uint8(255), np.uint8(0))
+    occupied = np.where(cut.unknown, 0, 255 * cut.occupancy.clip(0, 1)).astype(np.uint8)
+    layers = {"unknown": unknown, "occupied": occupied}
     box = f'x="{left}" y="{top}" width="{width:.1f}" height="{height:.1f}"'
     fill = f'{box} preserveAspectRatio="none"'
-    name = f"unknown-{'xyz'[cut.axes[0]]}{'xyz'[cut.axes[1]]}"
-    parts = [
-        _text(12.0, 20.0, title, "title"),
-        f'<mask id="{name}"><image {fill} href="{picture_url(unknown[::-1], "PNG")}"/></mask>',
-        f'<rect {box} fill="url(#unknown)" mask="url(#{name})"/>',
-        f'<image {fill} href="{picture_url(occupancy[::-1], "PNG")}"/>',
-        f'<rect {box} class="frame"/>',
-    ]
+    axes = "".join("xyz"[k] for k in cut.axes)
+    parts = [_text(12.0, 20.0, title, "title"), f'<rect {box} class="free"/>']
+    for name, shares in layers.items():
+        parts += [
+            f'<mask id="{name}-{axes}"><image {fill} href="{picture_url(shares[::-1], "PNG")}"/></mask>',
+            f'<rect {box} class="{name}" mask="url(#{name}-{axes})"/>',
+        ]
+    parts.append(f'<rect {box} class="frame"/>')
     for tick in _ticks(low[0], high[0]):
         x = left + zoom * (tick - low[0])
         parts.append(_line([(x, top + height), (x, top + height + 4)], "frame"))
@@ -103,11 +103,10 @@ def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> str:
         y = top + height - zoom * (tick - low[1])
         parts.append(_line([(left - 4, y), (left, y)], "frame"))
         parts.append(_text(left - 7, y + 4, f"{tick:g}", "small end"))
-    names = ["xyz"[k] for k in cut.axes]
     parts.append(
-        _text(left + width / 2, top + height + 32, f"{names[0]} in the base frame (m)", "small middle")
+        _text(left + width / 2, top + height + 32, f"{axes[0]} in the base frame (m)", "small middle")
     )
-    parts.append(_text(left - 30, top - 9, f"{names[1]} in the base frame (m)", "small"))
+    parts.append(_text(left - 30, top - 9, f"{axes[1]} in the base frame (m)", "small"))
     if low[1] < marked < high[1]:
         y = top + height - zoom * (marked - low[1])
         parts.append(_line([(left, y), (left + width, y)], "mark"))

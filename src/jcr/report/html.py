@@ -194,7 +194,9 @@ def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = N
     if scene is not None:
         blocks["Map"] = scene.history
     for stage, options in _options(out).items():
-        blocks[f"Options: {stage}"] = {name: str(value) for name, value in options.items()}
+        blocks[f"Options: {stage}"] = {
+            name: "unset" if value is None else str(value) for name, value in options.items()
+        }
     packages = ("numpy", "scipy", "torch", "pycolmap")
     blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}
     blocks["Versions"] |= {name: metadata.version(name) for name in packages}

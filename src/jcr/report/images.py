@@ -151,7 +151,9 @@ def residuals_section(capture: Capture, result: RunResult) -> str:
             "<p>Refining with the images' features moved the camera on the gripper by "
             f"{significant(shift_mm)} mm and {significant(turn_deg)}°.</p>"
         )
-        tick = " The dark tick is the same image by camera poses alone, before its features refined the fit."
+        tick = (
+            " The upright tick is the same image by camera poses alone, before its features refined the fit."
+        )
     return filled(
         "residuals.html",
         tick=tick,

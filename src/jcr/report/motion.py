@@ -94,8 +94,8 @@ def _next_poses(capture: Capture, calibration: CalibrationFile) -> str:
     return (
         '<h3>Poses to add</h3><p class="soft">Gripper poses that would shrink these most, one after the other, in '
         "reach of those of the capture; look that the arm is free to go there. The 3D view shows them in green.</p>"
-        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>move</th><th>turn</th><th>then offset</th>'
-        f"<th>orientation</th><th>scale</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
+        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>by</th><th>then offset, '
+        f"orientation, scale</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )
 
 
@@ -103,13 +103,12 @@ def _next_pose(capture: Capture, number: int, pose: Proposal) -> str:
     near = capture.base_from_gripper[capture.images.index(pose.like)]
     motion = inverse(near) @ np.array(pose.base_from_gripper)
     std = np.array(pose.expected_std)
+    copy = copy_button(json.dumps(np.array(pose.base_from_gripper).round(6).tolist()), f"pose {number}")
     cells = (
-        escape(pose.like),
-        f"{1e3 * np.linalg.norm(motion[:3, 3]):.0f} mm",
+        f"{escape(pose.like)} {copy}",
+        f"{1e3 * np.linalg.norm(motion[:3, 3]):.0f}\u00a0mm, "
         f"{np.degrees(rotation_angle(motion[:3, :3])):.0f}°",
-        f"±{significant(1e3 * float(std[:3].max()))} mm",
-        f"±{significant(float(np.degrees(std[3:6].max())))}°",
-        f"±{significant(100 * float(std[6]))}\u00a0%",
-        copy_button(json.dumps(np.array(pose.base_from_gripper).round(6).tolist()), f"pose {number}"),
+        f"±{significant(1e3 * float(std[:3].max()))}\u00a0mm, "
+        f"±{significant(float(np.degrees(std[3:6].max())))}°, ±{significant(100 * float(std[6]))}\u00a0%",
     )
     return f"<tr><th>{number}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"

@@ -13,7 +13,7 @@ def objects_section(measured: Measured, label_names: tuple[str, ...]) -> str:
     rows = []
     for size in measured.objects:
         length, width, height = (
-            f"<td>{1e3 * value:.1f} ± {1e3 * std:.1f}</td>"
+            f"<td>{1e3 * value:.1f} ±\u00a0{1e3 * std:.1f}</td>"
             for value, std in zip(size.box_size, size.box_std, strict=True)
         )
         if not size.top_seen:
