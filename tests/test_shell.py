@@ -84,9 +84,12 @@ def test_every_export_format_is_in_the_table():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.CaptureFixture[str]):
     assert dispatch([name, "--help"]) == 0
-    listed = set(re.findall(r"^. (?:-h, )?(--[a-z][a-z0-9-]*)", capsys.readouterr().out, re.MULTILINE))
+    told = capsys.readouterr().out
+    listed = set(re.findall(r"^. (?:-h, )?(--[a-z][a-z0-9-]*)", told, re.MULTILINE))
     offered = {argument.flag for argument in arguments_of(import_module(f"jcr.cli.{name}").Arguments)}
     assert listed == (offered | {"--help"}) - {None}
+    # Arguments are told by their own names, and None is no word of a command line.
+    assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]
 
 
 TYPED = {

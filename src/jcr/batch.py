@@ -37,7 +37,7 @@ class BatchOptions:
     """Where and how much to run."""
 
     processes: int | None = None
-    """Captures at a time on this machine (None: one for every two cores); cores are shared out among them."""
+    """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""
     calibrate_only: bool = False
     """Stop at calibration.json: no cloud, map and report."""
     ray: str | None = None

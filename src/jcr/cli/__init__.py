@@ -135,7 +135,12 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
                 command.Arguments,
                 prog=program,
                 args=list(arguments),
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+                config=(
+                    tyro.conf.OmitArgPrefixes,
+                    tyro.conf.FlagCreatePairsOff,
+                    tyro.conf.PositionalMetavarFromFieldName,
+                    tyro.conf.DisallowNone,
+                ),
             )
     except SystemExit as stop:
         if not stop.code:

@@ -9,7 +9,7 @@ from datetime import date
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
@@ -87,9 +87,12 @@ class Arguments:
       jcr bench all captures --out docs/results --readme README.md
     """
 
-    name: Annotated[BenchName, tyro.conf.Positional]
-    """What to measure."""
-    captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = None
+    name: Annotated[
+        BenchName,
+        tyro.conf.Positional,
+        tyro.conf.arg(help=f"What to measure: {', '.join(get_args(BenchName))}."),
+    ]
+    captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
     """For real and compact: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
     """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""

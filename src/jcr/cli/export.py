@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 import tyro
@@ -45,8 +45,13 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    format: Annotated[FormatName | None, tyro.conf.Positional] = None
-    """Whose; left out: all are listed with what they hold."""
+    format: Annotated[
+        FormatName | None,
+        tyro.conf.Positional,
+        tyro.conf.arg(
+            help=f"{', '.join(get_args(FormatName))}; left out: all are listed with what they hold."
+        ),
+    ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None
     """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
     parent_frame: str = "tool0"

@@ -41,7 +41,7 @@ class SimulateOptions:
     texture: bool = True
     """Print and grain on the surfaces; without, each has one uniform colour, with nothing for features."""
     table: TableName | None = None
-    """Light or dark table top (None: as the scene has it)."""
+    """Light or dark table top (unset: as the scene has it)."""
     robot_noise: tuple[float, float] = (0.0, 0.0)
     """Sigma per axis, in mm and degrees, of Gaussian errors of the gripper poses in capture.json; the images
     show the true ones."""
@@ -53,8 +53,8 @@ class SimulateOptions:
     """Sigma of the blur, in pixels."""
     vignetting: float = 0.0
     """Share of light lost in the corners, 0 to 1."""
-    jpeg_quality: int | None = 90
-    """1 to 100 (None: lossless PNG)."""
+    jpeg_quality: int | Literal["lossless"] = 90
+    """1 to 100, or lossless: PNG."""
     truth: Literal["full", "scene"] = "full"
     """Write truth/ with depth and labels of every image, or with scene.json alone."""
 
@@ -74,7 +74,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
     base_from_gripper = gripper_poses(
         options.pattern, options.images, scene.table_center_in_base, gripper_from_camera, motion
     )
-    suffix = "png" if options.jpeg_quality is None else "jpg"
+    suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
     truth = Truth(
         folder=out,
         scene=scene.name,
@@ -111,8 +111,8 @@ def _check(out: Path, options: SimulateOptions) -> None:
         raise InputError(f"--images {options.images}: give 1 to 1000")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: give 0 or more")
-    if options.jpeg_quality is not None and not 1 <= options.jpeg_quality <= 100:
-        raise InputError(f"--jpeg-quality {options.jpeg_quality}: give 1 to 100, or None for PNG")
+    if options.jpeg_quality != "lossless" and not 1 <= options.jpeg_quality <= 100:
+        raise InputError(f"--jpeg-quality {options.jpeg_quality}: give 1 to 100, or lossless for PNG")
     if min(*options.robot_noise, options.noise, options.blur) < 0:
         raise InputError("--robot-noise, --noise and --blur are sigmas: give 0 or more")
     if not 0 <= options.vignetting <= 1:
@@ -174,8 +174,8 @@ def _degraded(
     return np.clip(light + 0.5, 0, 255).astype(np.uint8)
 
 
-def _encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | None) -> bytes:
+def _encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:
     """RGB as JPEG of that quality, or as PNG."""
-    if jpeg_quality is None:
+    if jpeg_quality == "lossless":
         return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()
