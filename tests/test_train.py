@@ -146,6 +146,28 @@ def test_the_seed_decides_everything():
     torch.testing.assert_close(together.depth, one.depth)
 
 
+def test_nothing_is_drawn_on_another_device_than_the_generator_is_on(monkeypatch: pytest.MonkeyPatch):
+    class Elsewhere(torch.Generator):
+        """A generator of the device that computes shapes alone; what is mixed with the CPU's raises there."""
+
+        device = torch.device("meta")
+
+    for name in ("rand", "randn", "randint"):
+        made = getattr(torch, name)
+        monkeypatch.setattr(torch, name, lambda *sizes, generator, made=made, **rest: made(*sizes, **rest))
+    textures = torch.empty(2 * TEXELS, 3, device="meta")
+    found = draw_views(2, SMALL, textures, Elsewhere())
+    first = torch.empty(5, dtype=torch.long, device="meta")
+    seen = seen_by(found, first, first, stride=4)
+    loss, _ = confident_regression(
+        tuple(Pointmap(x, x[..., 0]) for x in true_points(found, first, first)),
+        true_points(found, first, first),
+        0.2,
+    )
+    for x in (*found, *seen, true_attention(*seen, (64, 48)), loss):
+        assert x.device.type == "meta"
+
+
 def test_textures_tile_and_blur_with_the_size_of_a_pixel():
     textures = make_textures(6, torch.Generator().manual_seed(0))
     assert textures.shape == (6 * TEXELS, 3)

@@ -1,4 +1,4 @@
-"""`jcr bench compact`: the network in this package on captures it was not trained on, beside COLMAP."""
+"""`jcr bench compact`: a small network on captures that it was not trained on, beside COLMAP."""
 
 import tempfile
 import time
@@ -12,17 +12,17 @@ from numpy import ndarray
 
 from jcr.calibrate.file import read_hand_eye
 from jcr.capture.read import read_capture
-from jcr.errors import NotTrustedError
+from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_log
 from jcr.pipeline import RunOptions, RunResult, calibrate
 from jcr.reconstruct.backends import BackendName, ReconstructOptions
-from jcr.reconstruct.checkpoints import COMPACT
+from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.truth import read_truth, true_depth, true_labels
 from jcr.train.validate import PairErrors, capture_views, pair_errors, summary
 
-SEEDS = range(200, 206)
+SEEDS = range(200, 203)
 """Of the scenes; validation while training looks at others."""
 IMAGES = 10
 
@@ -43,10 +43,17 @@ class Calibrated:
     seconds: float = 0.0
 
 
-def run(captures: Path | None = None, weights: str = str(COMPACT)) -> str:
-    """Markdown: pairs, then calibrations, on simulated captures, and on the real ones below `captures`."""
+def run(captures: Path | None = None, weights: str | None = None) -> str:
+    """Markdown: pairs, then calibrations, on simulated captures, and on the real ones below `captures`.
+
+    Raises InputError where there are no weights, or they do not say their one size of images.
+    """
+    if weights is None and not CHECKPOINTS["compact"].is_cached():
+        raise InputError("bench compact: this package has no weights; name yours with --weights FOLDER")
+    weights = weights or CHECKPOINTS["compact"].hub_id
     loaded = load_weights(weights)
-    assert loaded.size is not None
+    if loaded.size is None:
+        raise InputError(f"{weights}: its config.json has no only_size, as python -m jcr.train writes")
     pair_rows, rows, said = [], [], []
     with tempfile.TemporaryDirectory() as name:
         for texture in (True, False):
@@ -125,6 +132,7 @@ def _run(folder: Path, backend: BackendName, weights: str) -> tuple[RunResult | 
 def _depth_errors(result: RunResult, folder: Path) -> tuple[float, float]:
     """Log of true over found depth, and the median error of the objects' heights in percent."""
     truth, made, hand_eye = read_truth(folder), result.reconstruction, result.hand_eye
+    base_from_camera = read_capture(folder).base_from_gripper @ hand_eye.gripper_from_camera
     ratios, points, true_points, labels = [], [], [], []
     for row, image in enumerate(made.image_index):
         pinhole = made.pointmap_intrinsics
@@ -139,8 +147,7 @@ def _depth_errors(result: RunResult, folder: Path) -> tuple[float, float]:
         x_in_camera = apply(inverse(made.recon_from_camera[row]), made.points_in_recon[row][inside])
         shown = (label > 0) & (depth > 0)
         ratios.append(np.log(depth[shown] / np.maximum(hand_eye.scale * x_in_camera[shown, 2], 1e-6)))
-        base_from_camera = result_base_from_camera(result, int(image), folder)
-        points.append(apply(base_from_camera, hand_eye.scale * x_in_camera[shown])[:, 2])
+        points.append(apply(base_from_camera[image], hand_eye.scale * x_in_camera[shown])[:, 2])
         true_camera = depth[shown, None] * ray[inside][shown]
         true_points.append(apply(truth.base_from_camera[image], true_camera)[:, 2])
         labels.append(label[shown])
@@ -152,11 +159,6 @@ def _depth_errors(result: RunResult, folder: Path) -> tuple[float, float]:
         float(np.median(np.concatenate(ratios))),
         100 * float(np.median([abs(found / true - 1) for found, true in heights])),
     )
-
-
-def result_base_from_camera(result: RunResult, image: int, folder: Path) -> Float[ndarray, "4 4"]:
-    """As the robot and the calibration say."""
-    return read_capture(folder).base_from_gripper[image] @ result.hand_eye.gripper_from_camera
 
 
 def _height(z: Float[ndarray, "n"], label: ndarray, thing: int) -> float:

@@ -69,7 +69,7 @@ BENCHES: dict[BenchName, Bench] = {
     ),
     "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
     "compact": Bench(
-        "the network in this package, and COLMAP, on simulated captures (and on those in DIR)", True
+        "a small network of one's own, beside COLMAP, on simulated captures (and on those in DIR)", True
     ),
     "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
     "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
@@ -83,6 +83,7 @@ class Arguments:
     examples:
       jcr bench calibrate
       jcr bench run --out docs/results
+      jcr bench compact --weights training/weights
       jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
       jcr bench all captures --out docs/results --readme README.md
     """
@@ -96,6 +97,8 @@ class Arguments:
     """For real and compact: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
     """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
+    weights: str | None = None
+    """For compact: a folder of weights, such as python -m jcr.train leaves; unset: those in this package."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
     resume: bool = False
@@ -119,7 +122,7 @@ def main(arguments: Arguments) -> int:
             )
         found = bench.run(arguments.captures, arguments.boards)
     elif arguments.name == "compact":
-        found = bench.run(arguments.captures)
+        found = bench.run(arguments.captures, arguments.weights)
     elif BENCHES[arguments.name].draws:
         found = bench.run(arguments.out)
     else:
