@@ -10,6 +10,7 @@ import pycolmap
 import yaml
 from scipy.spatial.transform import Rotation
 
+from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.transforms_json import OPENGL_FROM_OPENCV
 from jcr.geometry import inverse
@@ -262,16 +263,19 @@ def write_lerobot(
     key: str,
     names: list[str],
     fps: int = 10,
-    codec: str = "libsvtav1",
+    codec: str | None = "libsvtav1",
 ) -> Path:
-    """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video."""
+    """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video.
+
+    Without a codec the pictures are in the table, as PNG files.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     camera = "observation.images.wrist"
     features = {
         camera: {
-            "dtype": "video",
+            "dtype": "video" if codec else "image",
             "shape": [*episodes[0][0][0].shape],
             "names": ["height", "width", "channels"],
         },
@@ -291,13 +295,18 @@ def write_lerobot(
 
     def table(rows: list[tuple[int, np.ndarray]]) -> pa.Table:
         states = np.concatenate([states for _, states in rows]).tolist()
-        return pa.table(
-            {
-                key: pa.array(states, pa.list_(pa.float64())),
-                "timestamp": np.concatenate([np.arange(len(states)) / fps for _, states in rows]),
-                "episode_index": np.concatenate([np.full(len(states), index) for index, states in rows]),
-            }
-        )
+        columns = {
+            key: pa.array(states, pa.list_(pa.float64())),
+            "timestamp": np.concatenate([np.arange(len(states)) / fps for _, states in rows]),
+            "episode_index": np.concatenate([np.full(len(states), index) for index, states in rows]),
+        }
+        if codec is None:
+            columns[camera] = [
+                {"bytes": encode_png(picture), "path": f"{index}_{k}.png"}
+                for index, _ in rows
+                for k, picture in enumerate(episodes[index][0])
+            ]
+        return pa.table(columns)
 
     def save(content: pa.Table, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -306,14 +315,17 @@ def write_lerobot(
     if not v3:
         for index, (pictures, states) in enumerate(episodes):
             save(table([(index, states)]), folder / f"data/chunk-000/episode_{index:06d}.parquet")
-            write_video(folder / f"videos/chunk-000/{camera}/episode_{index:06d}.mp4", pictures, fps, codec)
+            if codec:
+                file = folder / f"videos/chunk-000/{camera}/episode_{index:06d}.mp4"
+                write_video(file, pictures, fps, codec)
         return folder
     save(
         table([(k, states) for k, (_, states) in enumerate(episodes)]),
         folder / "data/chunk-000/file-000.parquet",
     )
-    everything = [picture for pictures, _ in episodes for picture in pictures]
-    write_video(folder / f"videos/{camera}/chunk-000/file-000.mp4", everything, fps, codec)
+    if codec:
+        everything = [picture for pictures, _ in episodes for picture in pictures]
+        write_video(folder / f"videos/{camera}/chunk-000/file-000.mp4", everything, fps, codec)
     starts = np.cumsum([0, *(len(pictures) for pictures, _ in episodes)])[:-1] / fps
     zeros = [0] * len(episodes)
     columns = {
@@ -321,7 +333,8 @@ def write_lerobot(
         "data/chunk_index": zeros,
         "data/file_index": zeros,
     }
-    columns |= {f"videos/{camera}/{name}": zeros for name in ("chunk_index", "file_index")}
-    columns[f"videos/{camera}/from_timestamp"] = starts
+    if codec:
+        columns |= {f"videos/{camera}/{name}": zeros for name in ("chunk_index", "file_index")}
+        columns[f"videos/{camera}/from_timestamp"] = starts
     save(pa.table(columns), folder / "meta/episodes/chunk-000/file-000.parquet")
     return folder

@@ -16,7 +16,8 @@ from jcr.records import Capture
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
 pytest.importorskip("av", reason="av is not installed (extra lerobot)")
-pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
+pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
+pq = pytest.importorskip("pyarrow.parquet")
 
 HOLD, MOVE = 5, 5
 """Frames at rest, and on the way to the next view."""
@@ -79,6 +80,24 @@ def test_cartesian_states_give_still_frames_with_their_poses(
     solved = jcr.solve_hand_eye(got.base_from_gripper, problem.recon_from_camera[view])
     assert np.abs(solved.gripper_from_camera - problem.gripper_from_camera).max() < 1e-6
     assert not solved.warnings
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_pictures_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
+    states = writers.rows_as("rpy", problem.base_from_gripper[:6])
+    other = pictured(tabletop, 2, first=9), walked(states[:2])
+    episode = pictured(tabletop, 6), walked(states)
+    path = writers.write_lerobot(tmp_path / "set", [other, episode], version, DROID, XYZRPY, codec=None)
+    got = jcr.read_capture(path, ReadOptions(episode=(1,), frames=6), into=tmp_path / "frames")
+    assert_paired(got, problem.base_from_gripper[:6])
+    for file in path.rglob("data/**/*.parquet"):
+        table = pq.read_table(file)
+        emptied = [{"bytes": None, "path": "x.png"}] * len(table)
+        at = table.column_names.index("observation.images.wrist")
+        pictures = pa.array(emptied, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+        pq.write_table(table.set_column(at, "observation.images.wrist", pictures), file)
+    with pytest.raises(jcr.InputError, match="holds no observation.images.wrist of frame .*embedded"):
+        jcr.read_capture(path, ReadOptions(episode=(1,), frames=6), into=tmp_path / "again")
 
 
 def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: Path):

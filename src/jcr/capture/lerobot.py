@@ -1,4 +1,4 @@
-"""LeRobot data sets v2.1 and v3.0: videos of a wrist camera, with poses or joint angles frame by frame."""
+"""LeRobot data sets v2.1 and v3.0: videos or pictures of a wrist camera, with poses or joint angles frame by frame."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.joints import read_arm
-from jcr.capture.lerobot_files import INFO, Episode, read_episode
+from jcr.capture.lerobot_files import INFO, Episode, pictures_in_table, read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_json
 from jcr.capture.pose_table import poses_of_columns
@@ -46,13 +46,20 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     )
     tolerance_s = 0.5 / float(info["fps"])
 
-    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, UInt8[ndarray, "h w 3"], str]]:
+    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
         for episode, part in zip(episodes, parts, strict=True):
             mine = rows[np.isin(rows, part)]
-            if len(mine):
-                times = episode.video_start_s + episode.time_s[mine - part[0]]
-                for row, rgb in zip(mine.tolist(), frames_at(episode.video, times, tolerance_s), strict=True):
-                    yield row, rgb, ".png"
+            if len(mine) == 0:
+                continue
+            if episode.video is None:
+                for row, file in zip(
+                    mine.tolist(), pictures_in_table(episode, camera, mine - part[0]), strict=True
+                ):
+                    yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+                continue
+            times = episode.video_start_s + episode.time_s[mine - part[0]]
+            for row, rgb in zip(mine.tolist(), frames_at(episode.video, times, tolerance_s), strict=True):
+                yield row, rgb, ".png"
 
     def lens(size: tuple[int, int]) -> Intrinsics | None:
         return None if options.camera_info is None else read_camera_info(options.camera_info, size)
@@ -67,12 +74,12 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
 
 def _camera(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
-    cameras = [key for key, feature in features.items() if feature.get("dtype") == "video"]
+    cameras = [key for key, feature in features.items() if feature.get("dtype") in ("video", "image")]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
     if options.camera_topic is not None or len(cameras) != 1:
         raise InputError(
-            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos'}"
+            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos or pictures'}"
         )
     return cameras[0]
 

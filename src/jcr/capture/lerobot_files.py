@@ -1,11 +1,12 @@
 """Where a LeRobot data set keeps an episode: v2.1 in files of its own, v3.0 among others in one file."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.extras import extra
@@ -22,7 +23,9 @@ class Episode:
     index: int
     time_s: Float[ndarray, " n"]
     state: Float[ndarray, "n k"]
-    video: Path
+    table: Path
+    video: Path | None
+    """None where the pictures are in the table."""
     video_start_s: float
 
 
@@ -39,29 +42,63 @@ def _episode_v2(path: Path, info: dict[str, Any], camera: str, key: str, index: 
         raise InputError(f"{path}: no episode {index}; there are {total}, counted from 0")
     chunk = index // int(info.get("chunks_size", 1000))
     fields = {"episode_chunk": chunk, "episode_index": index, "video_key": camera}
-    rows = _rows(_file(path, info, "data_path", fields), key)
-    return Episode(index, rows[0], rows[1], _file(path, info, "video_path", fields), 0.0)
+    data = _file(path, info, "data_path", fields)
+    video = _file(path, info, "video_path", fields) if _is_video(info, camera) else None
+    return Episode(index, *_rows(data, key), data, video, 0.0)
 
 
 def _episode_v3(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
     """v3.0: many episodes in one table and one video; meta/episodes says where."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     columns = ["episode_index", "data/chunk_index", "data/file_index"]
-    columns += [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    if _is_video(info, camera):
+        columns += [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     found = 0
     for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
         table = _table(parquet, file, columns)
         found += len(table["episode_index"])
         if index in table["episode_index"]:
-            chunk, number, video_chunk, video_number, start = (
-                table[name][table["episode_index"].index(index)] for name in columns[1:]
-            )
+            row = table["episode_index"].index(index)
+            chunk, number, *of_video = (table[name][row] for name in columns[1:])
             data = _file(path, info, "data_path", {"chunk_index": chunk, "file_index": number})
-            fields = {"video_key": camera, "chunk_index": video_chunk, "file_index": video_number}
-            return Episode(
-                index, *_rows(data, key, index), _file(path, info, "video_path", fields), float(start)
-            )
+            video, start = None, 0.0
+            if of_video:
+                fields = {"video_key": camera, "chunk_index": of_video[0], "file_index": of_video[1]}
+                video, start = _file(path, info, "video_path", fields), float(of_video[2])
+            return Episode(index, *_rows(data, key, index), data, video, start)
     raise InputError(f"{path}: no episode {index}; meta/episodes knows {found}, counted from 0")
+
+
+def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
+    """The picture files of ascending rows of an episode that has them in its table, read a few rows at a time.
+
+    Raises InputError where one cannot be read or is not in the table.
+    """
+    parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
+    wanted, row = set(rows.tolist()), 0
+    try:
+        with parquet.ParquetFile(episode.table) as file:
+            for batch in file.iter_batches(32, columns=["episode_index", camera]):
+                for index, picture in zip(batch["episode_index"].to_pylist(), batch[camera], strict=True):
+                    if index != episode.index:
+                        continue
+                    if row in wanted:
+                        file_of_row = picture["bytes"].as_py()
+                        if not file_of_row:
+                            raise InputError(
+                                f"{episode.table}: holds no {camera} of frame {row}; write the data set again with "
+                                "its pictures embedded"
+                            )
+                        yield file_of_row
+                    row += 1
+    except InputError:
+        raise
+    except Exception as error:  # Arrow's own errors have no common base
+        raise InputError(f"{episode.table}: {camera} cannot be read ({error}); download it again") from None
+
+
+def _is_video(info: dict[str, Any], camera: str) -> bool:
+    return info["features"][camera]["dtype"] == "video"
 
 
 def _rows(
