@@ -87,7 +87,7 @@ def run(
         added = read_added(folder, capture)
         result = _calibrate(capture, folder, options, progress)
         result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result)
+        _report(capture, result, progress)
         return result
 
 
@@ -145,7 +145,7 @@ def build_map(
         added = with_images(read_added(folder, capture), add)
         result = _calibrate(capture, folder, options, progress)
         result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result)
+        _report(capture, result, progress)
         return result
 
 
@@ -272,10 +272,13 @@ def _measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
     return measure_cloud(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
 
 
-def _report(capture: Capture, result: RunResult) -> None:
+def _report(capture: Capture, result: RunResult, progress: Progress | None) -> None:
     from jcr.report.html import report_html
 
+    report = progress or silent
+    report("report", 0.0)
     write_text(result.out / "report.html", report_html(capture, result))
+    report("report", 1.0)
 
 
 def _report_failure(capture: Capture, folder: Path, failed: CalibrationFile) -> None:

@@ -51,8 +51,8 @@ def structure_from_motion(
         cameras = extract(database, images, lenses, known, working_size_px, report)
         report("matching", 0.0)
         match(database, seed)
-        report("mapping", 0.0)
-        model = _map_incrementally(database, len(images), cameras, known, seed)
+        report("matching", 1.0)
+        model = _map_incrementally(database, len(images), cameras, known, seed, report)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise NotTrustedError(_why_not_registered(database, len(images), model))
         _adjust_robustly(model, hold_lens=known)
@@ -117,9 +117,17 @@ def match(database: Path, seed: int) -> None:
 
 
 def _map_incrementally(
-    database: Path, n_images: int, cameras: list[pycolmap.Camera], known: bool, seed: int
+    database: Path,
+    n_images: int,
+    cameras: list[pycolmap.Camera],
+    known: bool,
+    seed: int,
+    report: Progress,
 ) -> pycolmap.Reconstruction | None:
-    """The model with most images over all starting cameras; with relaxed demands if that is below three."""
+    """The model with most images over all starting cameras; with relaxed demands if that is below three.
+
+    The share of images in the model is reported; it falls back where another start is tried.
+    """
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
@@ -136,7 +144,7 @@ def _map_incrementally(
         for camera in cameras:
             with closing(pycolmap.Database.open(database)) as db:
                 db.update_camera(camera)
-            models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
+            models = _models(database, n_images, pipeline, report)
             for model in models.values():
                 if model.num_reg_images() > registered:
                     best, registered = model, model.num_reg_images()
@@ -145,6 +153,28 @@ def _map_incrementally(
         if registered >= _MIN_REGISTERED:
             return best
     return best
+
+
+def _models(
+    database: Path, n_images: int, pipeline: pycolmap.IncrementalPipelineOptions, report: Progress
+) -> dict[int, pycolmap.Reconstruction]:
+    """COLMAP's models from one start, the share of images registered so far reported."""
+    registered = 0
+
+    def add(count: int) -> None:
+        nonlocal registered
+        registered += count
+        report("mapping", min(registered / n_images, 1.0))  # COLMAP may begin again with another pair
+
+    add(0)
+    return pycolmap.incremental_mapping(
+        database,
+        database.parent,
+        database.parent,
+        pipeline,
+        initial_image_pair_callback=lambda: add(2),
+        next_image_callback=lambda: add(1),
+    )
 
 
 def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
