@@ -112,7 +112,13 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
         with Image.open(capture.folder / name) as upright:
             on_its_side = upright.convert("RGB").transpose(Image.Transpose.ROTATE_90)
             on_its_side.save(tmp_path / names[-1], exif=exif)
-    again = reconstruct(replace(turned, folder=tmp_path, images=tuple(names)), SMALL)
+    shares = []
+    again = reconstruct(
+        replace(turned, folder=tmp_path, images=tuple(names)),
+        SMALL,
+        lambda stage, share: shares.append(share) if stage == "mapping" else None,
+    )
+    assert shares == [0.0, 0.5, 0.75, 1.0, 1.0]  # a pair first, then image by image
     np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
     np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
     np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
