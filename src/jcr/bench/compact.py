@@ -29,7 +29,7 @@ IMAGES = 10
 
 @dataclass(frozen=True)
 class Calibrated:
-    """One calibration held against the truth; infinite where there is none."""
+    """One calibration held against the truth; infinite where it gave nothing, NaN where no truth is known."""
 
     mm: float = np.inf
     deg: float = np.inf
@@ -173,7 +173,7 @@ def _median(rows: list[Calibrated]) -> Calibrated:
 
 def _line(capture: str, backend: str, row: Calibrated) -> str:
     numbers = (row.mm, row.deg, row.scale_percent, row.height_percent, row.sigmas)
-    shown = ("nothing" if not np.isfinite(x) else f"{x:.3g}" for x in numbers)
+    shown = ("" if np.isnan(x) else f"{x:.3g}" if np.isfinite(x) else "nothing" for x in numbers)
     trusted = "yes" if row.trusted else "no"
     return f"| {capture} | {backend} | {' | '.join(shown)} | {trusted} | {row.seconds:.1f} |"
 

@@ -175,6 +175,8 @@ def heading(arguments: Arguments) -> str:
     if arguments.captures is not None:
         # Where they lie is the machine's own affair.
         command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
+    if arguments.weights is not None:
+        command += ["--weights", Path(arguments.weights).name]
     return (
         f"# jcr bench {arguments.name}\n\n{BENCHES[arguments.name].what}\n\n"
         f"    {shlex.join(command)}\n\n{date.today().isoformat()}. {machine()}\n\n"

@@ -34,7 +34,7 @@ def draw(png: Path, folders: list[Path]) -> None:
             if all(found):
                 medians = [np.median(values) for values in found]
                 rotation.plot(
-                    [x for x, _ in looks], medians, f"C{number}{style}", label=f"{folder.name}, {name}"
+                    [x for x, _ in looks], medians, f"C{number}.{style}", label=f"{folder.name}, {name}"
                 )
     losses.set(title="distance from the truth, in units of the pair", yscale="log")
     attention.set(title="attention's cross-entropy, nats")
