@@ -2,6 +2,7 @@
 
 import html
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -181,6 +182,12 @@ def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list
     assert words in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_wrong_arguments_are_told_in_full_on_an_ascii_terminal_too(tmp_path: Path):
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    finished = run_jcr("run", "a", "b", "--backend", "magic", cwd=tmp_path, env=environment)
+    assert "magic" in finished.stderr and "--backend" in finished.stderr and finished.stderr.count("\n") == 1
 
 
 def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: Path, tabletop: Path):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import minimum_filter
 
 from chromium import Chromium
 from jcr.errors import InputError
@@ -257,7 +258,12 @@ def test_in_a_browser(viewer: Viewer, tmp_path: Path):
         assert "occupancy over" in chromium.js("document.body.innerText")
 
         viewer.clicked.content = "not yet"
-        x, y = chromium.center("canvas")
+        drawn = (
+            picture.astype(int).max(-1) - picture.astype(int).min(-1)
+        ) > 15  # the background is grey or white
+        rows, columns = np.nonzero(minimum_filter(drawn, 7)[200:, 320:450])  # of the table, left of the panel
+        middle = len(rows) // 2
+        x, y = int(columns[middle]) + 320, int(rows[middle]) + 200
         chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         for kind in ("mousePressed", "mouseReleased"):
             chromium.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)

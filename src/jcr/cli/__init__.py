@@ -153,15 +153,12 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
 
 
 def _flatten(box: str) -> str:
-    """The first message of tyro's box, on one line."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    """The first message of tyro's box, on one line; where the terminal is ASCII, its title has a block of its own."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", box).strip()
     lines = [line.strip(" │") for line in text.splitlines() if not re.match(r"^[╭╰├]", line.strip())]
-    message = []
-    for line in lines:
-        if re.match(r"^[─━-]{3,}$", line):
-            break
-        message.append(line)
-    return re.sub(r"\s+", " ", " ".join(message)).strip() or "the arguments cannot be understood"
+    blocks = re.split(r"^[─━-]{3,}$", "\n".join(lines), flags=re.MULTILINE)
+    message = blocks[0] if text.startswith("╭") or len(blocks) == 1 else blocks[1]
+    return re.sub(r"\s+", " ", message).strip() or "the arguments cannot be understood"
 
 
 def _fail(status: int, message: str) -> int:
