@@ -203,6 +203,7 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
     pq.write_table(pa.table(columns), table)
     info = {"codebase_version": "v2.1", "total_episodes": 1, "data_path": "data/0.parquet"}
     info |= {"video_path": "videos/0.mp4", "fps": 10, "features": {"state": {"shape": [2]}}}
+    info["features"]["wrist"] = {"dtype": "video"}
     found = {
         "episode.parquet": Target(table, lambda file: read_episode(folder / "set", info, "wrist", "state", 0))
     }

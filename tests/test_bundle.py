@@ -82,7 +82,7 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
         adjusted = solved(problem, observed(problem, rng, 80, 0.3))
         missed = error(problem, adjusted.bundle.gripper_from_camera, adjusted.scale)
-        covariance = adjusted.covariance * widening(adjusted.degrees_of_freedom)
+        covariance = adjusted.covariance * widening(adjusted.degrees_of_freedom, 10)
         inside += missed @ np.linalg.solve(covariance, missed) < chi2.ppf(0.95, 7)
         estimates.append(adjusted.noise)
     assert inside / runs >= 0.88

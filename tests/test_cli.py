@@ -46,8 +46,10 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert content["converged"] is True
     assert np.shape(content["uncertainty"]["covariance"]) == (7, 7)
     assert len(content["images"]) == 12
-    std_mm = content["uncertainty"]["translation_std_mm"]
-    assert 1e3 * max(content["next_poses"][-1]["expected_std"][:3]) < max(std_mm)
+    reported = np.sqrt(np.diag(content["uncertainty"]["covariance"]))
+    promised = np.array(content["next_poses"][-1]["expected_std"])
+    # Two views beside twelve make the uncertainty somewhat less, not a fraction.
+    assert (promised < reported).all() and (promised > 0.5 * reported).all()
 
 
 def test_an_added_image_extends_the_map_and_stays(done: Path, tabletop: Path, tmp_path: Path):

@@ -227,7 +227,7 @@ def _refined(
         gripper_from_camera=x,
         scale=adjusted.scale,
         base_from_recon=adjusted.base_from_recon,
-        covariance=adjusted.covariance * widening(adjusted.degrees_of_freedom),
+        covariance=adjusted.covariance * widening(adjusted.degrees_of_freedom, int(used.sum())),
         translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
         rotation_residual_rad=rotation_angle(turn),
         robot_noise=RobotNoise(*adjusted.noise, estimated=hand_eye.robot_noise.estimated),

@@ -1,6 +1,7 @@
 """calibration.json: what a calibration is on disk."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -191,12 +192,18 @@ def calibration_file(
 def _proposals(
     capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs, hand_eye: HandEye
 ) -> list[NextPose]:
-    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used."""
+    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used.
+
+    What they would leave is the reported standard deviation, less by the share by which their information shrinks
+    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ.
+    """
     used = capture.base_from_gripper[reconstruction.image_index[hand_eye.inliers]]
     noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
     if not hand_eye.converged:
         return next_poses(used, PROPOSED)[1]
-    return next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)[1]
+    expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
+    reported = np.sqrt(np.diag(hand_eye.covariance))
+    return [replace(pose, expected_std=pose.expected_std * reported / expected) for pose in proposed]
 
 
 def failed_file(

@@ -63,6 +63,7 @@ class PoseFit:
     """σ_t (m) and σ_r (rad) per axis, given or estimated."""
     degrees_of_freedom: tuple[float, float]
     """Of the two estimates; infinite when the noise was given."""
+    poses_used: int
     hessian: Float[ndarray, "13 13"]
     """Of the negative log likelihood, prior included."""
     missed: Float[ndarray, "n 6"]
@@ -73,17 +74,19 @@ class PoseFit:
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """Covariance in records.COVARIANCE_ORDER, widened for an estimated noise."""
-        return np.linalg.inv(self.hessian)[:7, :7] * widening(self.degrees_of_freedom)
+        return np.linalg.inv(self.hessian)[:7, :7] * widening(self.degrees_of_freedom, self.poses_used)
 
 
-def widening(degrees_of_freedom: tuple[float, float]) -> float:
-    """Factor on a 7×7 covariance whose two variances were estimated with so many degrees of freedom.
+def widening(degrees_of_freedom: tuple[float, float], poses: int) -> float:
+    """Factor on a 7×7 covariance whose two variances were estimated, with so many degrees of freedom, from `poses`.
 
     A squared Mahalanobis distance then follows 7·F(7, ν), not χ²(7); the factor makes the 95 % ellipsoid that
     users draw from a covariance hold 95 %. The tie between the variances adds nothing to ν: it tells their ratio,
-    and of how large both are the residuals alone speak.
+    and of how large both are the residuals alone speak. Where known errors of cameras or features explain a share s
+    of the residuals, the noise has 1 - s of their degrees, but also 1 - s of the covariance hangs on it: in
+    Satterthwaite's approximation (Biometrics Bulletin 2, 1946) ν is then that of all residuals, 6 a pose less 13.
     """
-    nu = sum(degrees_of_freedom)
+    nu = max(sum(degrees_of_freedom), 6 * poses - 13)
     return 1.0 if np.isinf(nu) else float(7 * f.ppf(0.95, 7, nu) / chi2.ppf(0.95, 7))
 
 
@@ -142,6 +145,7 @@ def fit_poses(
         system.residual[:, 3:],
         robot,
         dof,
+        int(used.sum()),
         system.hessian,
         missed,
         missed_covariance,

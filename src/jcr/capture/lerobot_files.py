@@ -98,7 +98,7 @@ def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -
 
 
 def _is_video(info: dict[str, Any], camera: str) -> bool:
-    return info["features"][camera]["dtype"] == "video"
+    return info["features"][camera].get("dtype") == "video"
 
 
 def _rows(
