@@ -140,17 +140,22 @@ def _all(arguments: Arguments) -> int:
         raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
     from jcr.bench.suite import Outcome, absent_networks, between_marks, run, write_index
     from jcr.files import write_text
+    from jcr.reconstruct.checkpoints import CHECKPOINTS
 
     names: dict[str, bool] = {name: bench.timed for name, bench in BENCHES.items()}
     given: dict[str, list[str]] = {}
     absent = absent_networks()
+    if arguments.weights is not None:
+        given["compact"] = ["--weights", arguments.weights]
+    elif not CHECKPOINTS["compact"].is_cached():
+        del names["compact"]
     if arguments.captures is None:
         del names["real"]
         absent.append("real captures: no folder of them was named")
     else:
         boards = ["--boards", *arguments.boards] if arguments.boards else []
         given["real"] = [str(arguments.captures), *boards]
-        given["compact"] = [str(arguments.captures)]
+        given["compact"] = [str(arguments.captures), *given.get("compact", [])]
 
     def report(outcome: Outcome) -> None:
         if not arguments.output.quiet:
