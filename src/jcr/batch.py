@@ -24,7 +24,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, fingerprint, run
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 
 STATE = "batch.json"
 """In each run folder: its row of the table, and a fingerprint of what it was made from."""
@@ -94,7 +94,7 @@ def batch(
     """
     if options.processes is not None and options.processes < 1:
         raise InputError(f"--processes {options.processes}: give 1 or more")
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     tasks = [
         Task(path.resolve(), out.resolve() / name, run_options, options.calibrate_only)
         for path, name in zip(captures, _names(captures), strict=True)

@@ -16,7 +16,7 @@ from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_log
 from jcr.pipeline import options_of, read_capture_of
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.file import read_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
@@ -64,7 +64,7 @@ def verify(
     Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
     when the images show too little of the old scene, or too few of another, to tell.
     """
-    report = progress or (lambda stage, fraction: None)
+    report = progress or silent
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: a rate of false alarms between 0 and 0.5")
     calibration = read_calibration(out)

@@ -14,7 +14,7 @@ from jcr.capture.plain_files import read_json, read_yaml
 from jcr.capture.table import find_table
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 
 BAGS = (".bag", ".mcap", ".db3")
@@ -97,7 +97,7 @@ def read_source(
         raise InputError(
             f"{path}: its images lie inside of it; say where to put the chosen ones: into=FOLDER"
         )
-    return _extracted(path, options, Path(into), reader, progress or (lambda stage, fraction: None))
+    return _extracted(path, options, Path(into), reader, progress or silent)
 
 
 def _extracted(path: Path, options: ReadOptions, into: Path, reader: Any, progress: Progress) -> Capture:

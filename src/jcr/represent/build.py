@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.records import PointCloud
 from jcr.represent.chunks import threads_of_one_core
 from jcr.represent.clear import with_clear_cells
@@ -78,7 +78,7 @@ def build_scene(
 
     def fit(field: Field) -> int:
         stage = f"map: {', '.join(field.heads)}"
-        report = partial(progress or (lambda stage, fraction: None), stage)
+        report = partial(progress or silent, stage)
         return train(field, rays, seen, recipe, options.map_seed, options.max_seconds, report)
 
     with threads_of_one_core(torch.device(device)) as pool:

@@ -11,7 +11,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from viser.extras import ViserUrdf
 
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.represent.scene import Unknown
 from jcr.view.layers import LEAST, MapPoints, SliceOf, level_slice, map_points, unknown_edge
@@ -39,7 +39,7 @@ class Viewer:
         progress: Progress | None = None,
     ) -> None:
         """Fill the server; `robot` is a yourdfpy.URDF and `joint_values` a row for each of the run's grippers."""
-        report = progress or (lambda stage, fraction: None)
+        report = progress or silent
         self.server, self.run, self.scene, self._lock = server, run, run.scene, threading.Lock()
         self.joint_values = joint_values
         server.scene.set_up_direction("+z")
