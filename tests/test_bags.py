@@ -172,6 +172,18 @@ def test_files_that_are_no_bags_are_one_line(fault: str, tmp_path: Path, mcap: P
     assert "\n" not in str(caught.value)
 
 
+def test_messages_that_are_not_the_standard_ones_are_refused(tmp_path: Path, mcap: Path):
+    """Found by fuzzing: a definition without `child_frame_id` was read as a transform."""
+    file = tmp_path / "scan.mcap"
+    data = next(mcap.glob("*.mcap")).read_bytes()
+    assert b"child_frame_id" in data
+    file.write_bytes(data.replace(b"child_frame_id", b"chilb_frame_id"))
+    with pytest.raises(
+        jcr.InputError, match=r"its definition of tf2_msgs/msg/TFMessage is not the one of ROS"
+    ):
+        jcr.read_capture(file, FRAMES, into=tmp_path / "frames")
+
+
 def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
     """A steady turn with a steady advance along x is its own interpolation."""
     start = 1_700_000_000_000_000_001

@@ -12,9 +12,16 @@ from pathlib import Path
 import atheris
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-with atheris.instrument_imports(
-    include=["jcr.capture", "jcr.calibrate.file", "jcr.export.points", "jcr.live", "yaml"]
-):
+READERS = [
+    "jcr.capture",
+    "jcr.calibrate.file",
+    "jcr.cli.query",
+    "jcr.export.points",
+    "jcr.live",
+    "jcr.reconstruct",
+]
+READERS += ["jcr.represent", "rosbags", "safetensors", "yaml"]
+with atheris.instrument_imports(include=READERS):
     from fuzz_targets import targets
     from jcr.errors import InputError
     from jcr.live.line_server import parsed, pose_of

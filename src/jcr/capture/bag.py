@@ -39,6 +39,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         ]
         cameras = [c for c in reader.connections if c.topic == topic]
         pose_connections = _pose_connections(reader, options, path)
+        _refuse_other_definitions(reader, [*cameras, *infos[:1], *pose_connections], path)
         log_ns, stamp_ns, info = [], [], None
         tree, joint_states = TfTree(), []
         span = max(reader.end_time - reader.start_time, 1)
@@ -95,6 +96,19 @@ def _opened(path: Path) -> Iterator[Any]:
         yield reader
     finally:
         reader.close()
+
+
+def _refuse_other_definitions(reader: Any, connections: list[Any], path: Path) -> None:
+    """InputError where a bag defines a message, or one inside it, otherwise than ROS 2 and ROS 1 do."""
+    typesys = extra("rosbags.typesys", "ros", "a bag")
+    ros2, ros1 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS2_HUMBLE, typesys.Stores.ROS1_NOETIC))
+    ros1.register({name: ros2.fielddefs[TF[0]] for name in TF})
+    for name in {connection.msgtype for connection in connections}:
+        known = {store.hash_rihs01(name) for store in (ros2, ros1) if name in store.fielddefs}
+        if reader.typestore.hash_rihs01(name) not in known:
+            raise InputError(
+                f"{path}: its definition of {name} is not the one of ROS; record it with the standard message"
+            )
 
 
 def _messages(reader: Any, connections: list[Any], path: Path, **span: int) -> Iterator[tuple[Any, int, Any]]:
