@@ -172,12 +172,18 @@ def test_files_that_are_no_bags_are_one_line(fault: str, tmp_path: Path, mcap: P
     assert "\n" not in str(caught.value)
 
 
-def test_messages_that_are_not_the_standard_ones_are_refused(tmp_path: Path, mcap: Path):
-    """Found by fuzzing: a definition without `child_frame_id` was read as a transform."""
+@pytest.mark.parametrize(
+    "was, now",
+    [(b"child_frame_id", b"chilb_frame_id"), (b"MSG: geometry_msgs/Vector3", b"MSG: geometry_msgs/Vector4")],
+)
+def test_messages_that_are_not_the_standard_ones_are_refused(
+    was: bytes, now: bytes, tmp_path: Path, mcap: Path
+):
+    """Found by fuzzing: a definition without `child_frame_id`, and one that is not whole, were taken for ROS's."""
     file = tmp_path / "scan.mcap"
     data = next(mcap.glob("*.mcap")).read_bytes()
-    assert b"child_frame_id" in data
-    file.write_bytes(data.replace(b"child_frame_id", b"chilb_frame_id"))
+    assert was in data
+    file.write_bytes(data.replace(was, now))
     with pytest.raises(
         jcr.InputError, match=r"its definition of tf2_msgs/msg/TFMessage is not the one of ROS"
     ):

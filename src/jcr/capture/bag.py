@@ -104,11 +104,19 @@ def _refuse_other_definitions(reader: Any, connections: list[Any], path: Path) -
     ros2, ros1 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS2_HUMBLE, typesys.Stores.ROS1_NOETIC))
     ros1.register({name: ros2.fielddefs[TF[0]] for name in TF})
     for name in {connection.msgtype for connection in connections}:
-        known = {store.hash_rihs01(name) for store in (ros2, ros1) if name in store.fielddefs}
-        if reader.typestore.hash_rihs01(name) not in known:
+        defined = _definition(reader.typestore, name)
+        if defined is None or defined not in (_definition(ros2, name), _definition(ros1, name)):
             raise InputError(
                 f"{path}: its definition of {name} is not the one of ROS; record it with the standard message"
             )
+
+
+def _definition(store: Any, name: str) -> str | None:
+    """A hash over a message's fields and those of all that is in it; None where not all are defined."""
+    try:
+        return store.hash_rihs01(name)
+    except KeyError:
+        return None
 
 
 def _messages(reader: Any, connections: list[Any], path: Path, **span: int) -> Iterator[tuple[Any, int, Any]]:
