@@ -2,16 +2,24 @@
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jcr.bench.compact import scored
 from jcr.bench.peers import grid_search
 from jcr.bench.suite import CLAIM, MARKS, Outcome, between_marks, claims, run, write_index
+from jcr.bench.synthetic_pairs import PairErrors, pairs_of_capture
+from jcr.capture.read import read_capture
 from jcr.cli.bench import BENCHES
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg, scale_translation
+from jcr.geometry import rotation_between_deg, rotation_exp, scale_translation, transform
+from jcr.pipeline import RunOptions, calibrate
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.dust3r.pairs import write_pairs
+from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.problem import hand_eye_problem
 
 ROOT = Path(__file__).parents[1]
@@ -89,3 +97,28 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
         )
         assert rotation_between_deg(x[:3, :3], problem.gripper_from_camera[:3, :3]) < 1e-5
         assert (abs(found - scale) < 3 / 20_000) == found_there
+
+
+def test_calibrations_are_scored_by_the_truth_of_their_capture(tmp_path: Path):
+    """Exact pointmaps score nothing; then an offset, a turn and a scale are changed by known amounts."""
+    folder = simulate(tmp_path / "capture", SimulateOptions(images=6, seed=200, texture=False))
+    exact = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)
+    write_pairs(tmp_path / "pairs.npz", pairs_of_capture(folder, errors=exact)[0])
+    options = RunOptions(ReconstructOptions("predictions", weights=str(tmp_path / "pairs.npz")))
+    result = calibrate(read_capture(folder), tmp_path / "out", options)
+    right = scored(result, folder)
+    assert (
+        right.trusted
+        and max(right.mm, 10 * right.deg, right.scale_percent) < 0.5
+        and right.height_percent < 2
+    )
+    found = result.hand_eye
+    move = transform(rotation_exp(np.radians([0, 0, 3.0])), np.array([0.02, 0, 0]))
+    moved = replace(found, gripper_from_camera=found.gripper_from_camera @ move)
+    wrong = scored(replace(result, hand_eye=moved), folder)
+    assert wrong.mm == pytest.approx(20, abs=1) and wrong.deg == pytest.approx(3, abs=0.1)
+    assert wrong.sigmas > 10
+    large = scored(replace(result, hand_eye=replace(found, scale=1.1 * found.scale)), folder)
+    assert large.scale_percent == pytest.approx(10, abs=0.5) and large.height_percent == pytest.approx(
+        10, abs=2
+    )

@@ -102,8 +102,11 @@ def run(captures: Path | None = None, weights: str | None = None) -> str:
 def calibrated(folder: Path, backend: BackendName, weights: str) -> Calibrated:
     """A simulated capture calibrated with a back end."""
     result, seconds = _run(folder, backend, weights)
-    if result is None:
-        return Calibrated(seconds=seconds)
+    return Calibrated(seconds=seconds) if result is None else scored(result, folder, seconds)
+
+
+def scored(result: RunResult, folder: Path, seconds: float = 0.0) -> Calibrated:
+    """A calibration of the simulated capture in `folder`, held against its truth."""
     truth, hand_eye = read_truth(folder), result.hand_eye
     log_scale, height = _depth_errors(result, folder)
     x, true = hand_eye.gripper_from_camera, truth.gripper_from_camera
@@ -111,7 +114,7 @@ def calibrated(folder: Path, backend: BackendName, weights: str) -> Calibrated:
     return Calibrated(
         1e3 * float(np.linalg.norm(off[:3])),
         float(rotation_between_deg(x[:3, :3], true[:3, :3])),
-        100 * abs(float(np.expm1(log_scale))),
+        100 * abs(float(np.expm1(-log_scale))),
         height,
         float(np.sqrt(off @ np.linalg.solve(hand_eye.covariance, off) / 7)),
         result.converged,
@@ -153,7 +156,9 @@ def _depth_errors(result: RunResult, folder: Path) -> tuple[float, float]:
         labels.append(label[shown])
     z, true_z, label = (np.concatenate(parts) for parts in (points, true_points, labels))
     heights = [
-        (_height(z, label, thing), _height(true_z, label, thing)) for thing in np.unique(label) if thing > 1
+        (_height(z, label, thing), _height(true_z, label, thing))
+        for thing in np.unique(label).tolist()
+        if thing > 1
     ]
     return (
         float(np.median(np.concatenate(ratios))),
