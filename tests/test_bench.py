@@ -107,11 +107,8 @@ def test_calibrations_are_scored_by_the_truth_of_their_capture(tmp_path: Path):
     options = RunOptions(ReconstructOptions("predictions", weights=str(tmp_path / "pairs.npz")))
     result = calibrate(read_capture(folder), tmp_path / "out", options)
     right = scored(result, folder)
-    assert (
-        right.trusted
-        and max(right.mm, 10 * right.deg, right.scale_percent) < 0.5
-        and right.height_percent < 2
-    )
+    assert right.trusted and right.height_percent < 2
+    assert max(right.mm, 10 * right.deg, right.scale_percent) < 0.5
     found = result.hand_eye
     move = transform(rotation_exp(np.radians([0, 0, 3.0])), np.array([0.02, 0, 0]))
     moved = replace(found, gripper_from_camera=found.gripper_from_camera @ move)
@@ -119,6 +116,5 @@ def test_calibrations_are_scored_by_the_truth_of_their_capture(tmp_path: Path):
     assert wrong.mm == pytest.approx(20, abs=1) and wrong.deg == pytest.approx(3, abs=0.1)
     assert wrong.sigmas > 10
     large = scored(replace(result, hand_eye=replace(found, scale=1.1 * found.scale)), folder)
-    assert large.scale_percent == pytest.approx(10, abs=0.5) and large.height_percent == pytest.approx(
-        10, abs=2
-    )
+    assert large.scale_percent == pytest.approx(10, abs=0.5)
+    assert large.height_percent > 9  # of views from several heights, which no longer agree
