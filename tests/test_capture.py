@@ -62,6 +62,13 @@ def test_unknown_intrinsics_and_other_keys_are_fine(capture: Path):
     assert jcr.read_capture(capture).intrinsics is None
 
 
+def test_a_byte_order_mark_is_no_fault(capture: Path):
+    """Some editors put one before the JSON that they save."""
+    file = capture / "capture.json"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert len(jcr.read_capture(capture)) == len(json.loads(file.read_text("utf-8-sig"))["frames"])
+
+
 def test_exif_rotation_is_honoured(capture: Path):
     for k in range(4):
         file = capture / "images" / f"{k:02d}.jpg"

@@ -78,6 +78,21 @@ def test_cameras_that_were_given_read_back_with_their_capture(
     assert_same_calibration(got.base_from_gripper, cameras, problem)
 
 
+@pytest.mark.parametrize("name", [b"x" * 300, b"../../secret.png"])
+def test_a_model_that_names_no_file_is_refused(
+    name: bytes, tmp_path: Path, capture: Capture, problem: HandEyeProblem
+):
+    """The long name was found by fuzzing."""
+    path = writers.write_colmap(tmp_path, capture, problem.recon_from_camera)
+    file = path / "sparse" / "0" / "images.bin"
+    known = Path(capture.images[2]).name.encode() + b"\0"
+    data = file.read_bytes()
+    assert data.count(known) == 1
+    file.write_bytes(data.replace(known, name + b"\0"))
+    with pytest.raises(jcr.InputError, match="no path inside|leads out"):
+        jcr.read_capture(path)
+
+
 @pytest.mark.parametrize("name", ["moveit", "easy_handeye2"])
 def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path, problem: HandEyeProblem):
     write = writers.write_moveit if name == "moveit" else writers.write_easy_handeye2

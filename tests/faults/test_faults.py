@@ -6,6 +6,7 @@ there are what they were.
 
 import hashlib
 import json
+import os
 import pickle
 import re
 import shutil
@@ -282,6 +283,8 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         "96x72|48x36",
     ),
     "missing picture": (picture(Path.unlink), 2, "no such image"),
+    "picture that is a folder": (picture(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
+    "picture that is a pipe": (picture(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
     # The poses.
     "NaN in a pose": (posed(lambda p: p * np.nan, only=2), 2, "NaN or infinity"),
     "infinity in a pose": (posed(lambda p: p + np.inf, only=2), 2, "NaN or infinity"),
@@ -316,6 +319,11 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         written(lambda c: (c.capture / "capture.json").write_bytes(b'{"frames": "\xff\xfe"}')),
         2,
         "not UTF-8",
+    ),
+    "a number of 5000 digits": (
+        written(lambda c: (c.capture / "capture.json").write_text(f'{{"frames": [{"9" * 5000}]}}')),
+        2,
+        "4300 digits",
     ),
     "NUL in a path": (image_named("images/0\0.png"), 2, "no path inside"),
     "half a surrogate in a path": (image_named("images/\ud800.png"), 2, "no path inside"),

@@ -29,9 +29,9 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
 
 def lens_of_ros(
     matrix: Sequence[Any],
-    model: str,
+    model: Any,
     coefficients: Sequence[Any],
-    calibrated_size: tuple[int, int],
+    calibrated_size: Sequence[Any],
     size: tuple[int, int],
     where: str,
 ) -> Intrinsics | None:

@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from jcr.capture.checks import checked_capture, checked_lens
 from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import contained
 from jcr.capture.table import gripper_poses
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
@@ -51,7 +52,11 @@ def read(path: Path, options: ReadOptions) -> Capture:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
     names, _ = read_cameras(folder)
-    located = [f"images/{name}" if (root / "images" / name).is_file() else name for name in names]
+    beside = [f"images/{name}" for name in names]
+    located = [
+        place if contained(root, place, str(folder)).is_file() else name
+        for place, name in zip(beside, names, strict=True)
+    ]
     known, poses, notes = gripper_poses(root, located, options)
     capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
     lens = read_lens(folder, capture.image_size)

@@ -55,9 +55,7 @@ def read_json(file: Path) -> Any:
         return dict(pairs)
 
     try:
-        return json.loads(file.read_bytes().decode("utf-8"), object_pairs_hook=unique)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not UTF-8 text (byte {error.start}); save it as UTF-8 JSON") from None
+        return json.loads(read_text(file), object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         raise InputError(
             f"{file}: not JSON at line {error.lineno}, column {error.colno}: {error.msg}"
@@ -68,12 +66,10 @@ def read_json(file: Path) -> Any:
         raise InputError(f"{file}: a number that is none ({error}); correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); check its permissions") from None
 
 
 def contained(folder: Path, name: str, where: str) -> Path:
-    """`folder/name`, or InputError when the name is absolute, no name of a file, or leads out of the folder."""
+    """`folder/name`, or InputError when the name is absolute, no file's name, or leads out of the folder."""
     try:
         longest = max(len(part.encode()) for part in Path(name).parts)
     except ValueError:  # an empty name, or half of a surrogate pair
@@ -83,4 +79,6 @@ def contained(folder: Path, name: str, where: str) -> Path:
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")
+    if target.exists() and not target.is_file():  # to open a pipe would be to wait for ever
+        raise InputError(f"{where}: {name!r} is a folder, a pipe or a device; name the image's file")
     return target
