@@ -54,9 +54,9 @@ def reconstruct(
         raise NotTrustedError("; ".join([str(error), *notes])) from None
     notes += sparse.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in sparse.rows]:
-        notes.append(f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}")
+        notes += (f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return with_pointmaps(
-        replace(sparse, notes=tuple(notes)),
+        replace(sparse, notes=notes),
         [images[row] for row in sparse.rows],
         options,
         report,

@@ -5,6 +5,7 @@ Model and coefficients: OpenCV, "Camera Calibration and 3D Reconstruction".
 """
 
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -63,6 +64,7 @@ def _jacobian(lens: Intrinsics, x_normalized: Float[ndarray, "*batch 2"]) -> Flo
     return out
 
 
+@lru_cache(maxsize=64)  # every stage asks for the same lens
 def fold_distance_px(lens: Intrinsics) -> float | None:
     """How far from the principal point the distortion folds over inside the frame; None when it never does.
 
@@ -75,7 +77,8 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)
     rays = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    folded = np.linalg.det(_jacobian(lens, rays)) <= 0
+    slope = _jacobian(lens, rays)
+    folded = slope[..., 0, 0] * slope[..., 1, 1] <= slope[..., 0, 1] * slope[..., 1, 0]
     x_px = distort(lens, rays)
     outside = ((x_px < -0.5) | (x_px > [lens.width - 0.5, lens.height - 0.5])).any(-1)
     # A ray that is still in the frame at the widest angle counts as folded there.
@@ -89,18 +92,18 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     return float(np.linalg.norm(at_fold - [lens.cx, lens.cy], axis=-1).min())
 
 
-def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, list[str]]:
+def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
     """Given intrinsics, without a distortion that has no inverse, and a note that says so.
 
     With such a distortion images do not register.
     """
     if lens is None or (fold := fold_distance_px(lens)) is None:
-        return lens, []
+        return lens, ()
     note = (
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
         "calibrate the lens again with points out to the corners, or give zero distortion"
     )
-    return replace(lens, distortion=NO_DISTORTION), [note]
+    return replace(lens, distortion=NO_DISTORTION), (note,)
 
 
 def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:

@@ -16,8 +16,8 @@ from jcr.progress import Progress
 from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.backend import reconstruction_from_pairs
 from jcr.reconstruct.dust3r.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
-from jcr.reconstruct.dust3r.preprocess import ImageGrid, PreparedImages, image_grid, read_colors, usable_lens
-from jcr.reconstruct.lens import NO_DISTORTION
+from jcr.reconstruct.dust3r.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
+from jcr.reconstruct.lens import NO_DISTORTION, usable_lens
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
 from jcr.records import Capture, Reconstruction
 

@@ -6,7 +6,7 @@ half pixel shifts the principal point by (1 − s)/2 pixels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,7 +14,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.capture.images import read_image
-from jcr.reconstruct.lens import NO_DISTORTION, distort, fold_distance_px, pinhole_inside, undistort_image
+from jcr.reconstruct.lens import NO_DISTORTION, distort, pinhole_inside, undistort_image, usable_lens
 from jcr.records import Capture, Intrinsics
 
 PATCH = 16
@@ -131,14 +131,6 @@ def prepare_images(
         pinhole = pinhole_inside(lens, max(lens.width, lens.height))
     grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
     return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, notes)
-
-
-def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
-    """The lens without a distortion that folds over inside the frame, and a note where it does."""
-    if lens is None or (fold := fold_distance_px(lens)) is None:
-        return lens, ()
-    note = f"the stored distortion folds over at {fold:.0f} px from the centre: not used"
-    return replace(lens, distortion=NO_DISTORTION), (note,)
 
 
 def read_colors(
