@@ -162,6 +162,9 @@ def test_every_command_has_help_with_examples():
 def test_sizes_of_nothing_are_refused(tmp_path: Path):
     finished = run_jcr("measure", tmp_path)
     assert finished.returncode == 2 and "make one with jcr map" in finished.stderr
+    (tmp_path / "file").write_text("")
+    finished = run_jcr("measure", tmp_path / "file")
+    assert finished.returncode == 2 and finished.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -170,7 +173,7 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
         (["fly"], "no command"),
         (["run"], "required"),
         (["run", "nowhere", "out"], "nowhere"),
-        (["run", "nowhere", "out", "--backend", "magic"], "magic"),
+        (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, compact, dust3r, given, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),
         (["query", "nowhere", "nowhere"], "nowhere"),
         (["map", "nowhere"], "nowhere"),

@@ -158,7 +158,13 @@ def _flatten(box: str) -> str:
     lines = [line.strip(" │") for line in text.splitlines() if not re.match(r"^[╭╰├]", line.strip())]
     blocks = re.split(r"^[─━-]{3,}$", "\n".join(lines), flags=re.MULTILINE)
     message = blocks[0] if text.startswith("╭") or len(blocks) == 1 else blocks[1]
-    return re.sub(r"\s+", " ", message).strip() or "the arguments cannot be understood"
+    line = re.sub(r"\s+", " ", message).strip() or "the arguments cannot be understood"
+    return re.sub(r"Expected one of \((.*?)\)", _choices, line)
+
+
+def _choices(listed: re.Match[str]) -> str:
+    """tyro lists choices in the order of a set, among them the None that stands for none given."""
+    return "Expected one of " + ", ".join(sorted(set(re.findall(r"'([^']*)'", listed[1])) - {"None"}))
 
 
 def _fail(status: int, message: str) -> int:

@@ -50,8 +50,8 @@ def read_cloud(path: Path) -> PointCloud:
     try:
         header, separator, body = path.read_bytes().partition(b"end_header\n")
         lines = header.decode().splitlines()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no cloud here; make one with jcr map OUT") from None
+    except OSError as error:
+        raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
     except UnicodeDecodeError:
         separator, lines, body = b"", [], b""
     words = [line.split(maxsplit=3) for line in lines]
