@@ -405,6 +405,27 @@ def _summary(
     )
 
 
+def free_lens(
+    adjusted: Adjusted, intrinsics: Intrinsics
+) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
+    """The camera one Gauss-Newton step on, with its lens free and before it at `intrinsics`, and the covariance.
+
+    In the order of projection.CAMERA_PARAMETERS; the covariance is not widened for the estimated noise. None where
+    there are too few observations to free a lens.
+    """
+    problem, bundle = adjusted.problem, adjusted.bundle
+    if len(problem.image) < MIN_OBSERVATIONS_FOR_LENS:
+        return None
+    lens, lens_std = _free_lens(intrinsics, True)
+    problem = replace(problem, lens=lens, lens_std=lens_std)
+    view = _view(bundle, problem)
+    weights = _weights(view, adjusted.sigma_px)
+    normal = _normal_equations(bundle, view, problem, weights, adjusted.noise, 0.0)
+    covariance, free = np.linalg.inv(normal.schur), slice(6, 6 + lens.shape[1])
+    step = covariance[free] @ normal.right
+    return bundle.camera + lens @ step, lens @ covariance[free, free] @ lens.T
+
+
 def median_reprojection(
     adjusted: Adjusted, base_from_gripper: Float[ndarray, "m 4 4"] | None = None
 ) -> Float[ndarray, " m"]:

@@ -9,6 +9,7 @@ from numpy import ndarray
 from jcr.calibrate.bundle import Adjusted, adjust, lens_of, median_reprojection
 from jcr.calibrate.conventions import better_reading, explained
 from jcr.calibrate.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibrate.given_lens import LensDoubt, lens_doubt
 from jcr.calibrate.hand_eye import judged, solve_hand_eye
 from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
 from jcr.calibrate.residuals import paper_residuals
@@ -74,33 +75,55 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
     if contradiction is not None:
         return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
-    if not hand_eye.converged:
-        return _investigated(hand_eye, gripper, camera)
     used = hand_eye.inliers
     tracks = of_images(reconstruction.tracks, used)
-    if (
-        not options.bundle_adjustment
+    adjustable = (
+        options.bundle_adjustment
         # What pointmaps say of the cameras is in their covariance, with the errors that neighbours share; their
         # tracks, taken for independent, make it worse: simulated, 0.2 mm became 1.3 mm.
-        or evidence is not None
-        or cues is not None  # bundle adjustment knows the robot's scale and height alone
-        or len(tracks.image) < MIN_OBSERVATIONS
-        or used.sum() < 3
+        and evidence is None
+        and cues is None  # bundle adjustment knows the robot's scale and height alone
+        and len(tracks.image) >= MIN_OBSERVATIONS
+        and used.sum() >= 3
+    )
+    adjusted = None
+    if not hand_eye.converged:
+        hand_eye = _investigated(hand_eye, gripper, camera)
+    elif adjustable:
+        adjusted = adjust(
+            gripper[used],
+            (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon),
+            camera[used],
+            reconstruction.intrinsics,
+            tracks,
+            noise,
+            refine_lens=capture.intrinsics is None,
+        )
+        refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
+        if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
+            hand_eye = refined
+    # Of motions that show too little, what is missing comes first; and pointmaps were made with a lens of their own.
+    if (
+        capture.intrinsics is None
+        or not adjustable
+        or tracks.from_pointmaps
+        or not hand_eye.observability.observable
     ):
         return hand_eye
-    adjusted = adjust(
-        gripper[used],
-        (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon),
-        camera[used],
-        reconstruction.intrinsics,
-        tracks,
-        noise,
-        refine_lens=capture.intrinsics is None,
+    doubt = lens_doubt(
+        hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
     )
-    refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
-    if tracks.from_pointmaps and not _better(refined.held_out, hand_eye.held_out):
-        return hand_eye
-    return refined
+    return hand_eye if doubt is None else _doubted(hand_eye, doubt)
+
+
+def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
+    """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
+    covariance = hand_eye.covariance + np.outer(doubt.shift, doubt.shift)
+    widened = judged(replace(hand_eye, covariance=covariance))
+    if hand_eye.converged and widened.converged:
+        return replace(widened, warnings=(*widened.warnings, doubt.text))
+    # More images, the cure for a large covariance, do not mend a lens.
+    return replace(widened, converged=False, warnings=(doubt.text, *hand_eye.warnings))
 
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
