@@ -1,5 +1,7 @@
 """Hand-eye bundle adjustment on simulated observations with a known answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -72,6 +74,22 @@ def test_wrong_matches_do_not_pull():
     tracks.x_px[wrong] += rng.normal(size=(wrong.sum(), 2)) * 40
     adjusted = solved(problem, tracks)
     assert np.linalg.norm(error(problem, adjusted.bundle.gripper_from_camera, problem.scale)[:3]) < 1e-3
+
+
+@pytest.mark.parametrize("views", [2, 3, 8])
+def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
+    # A point seen twice takes up three of its four errors.
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 8, robot_noise=(1e-4, np.radians(0.01)))
+    tracks = observed(problem, rng, 400, 0.3)
+    order = rng.permutation(len(tracks.image))
+    rank = np.zeros(len(order), dtype=int)
+    for point in np.unique(tracks.point):
+        own = order[tracks.point[order] == point]
+        rank[own] = np.arange(len(own))
+    few = rank < views
+    tracks = replace(tracks, image=tracks.image[few], x_px=tracks.x_px[few], point=tracks.point[few])
+    assert solved(problem, tracks).sigma_px == pytest.approx(0.3, rel=0.1)
 
 
 def test_robot_noise_is_found_and_the_ellipsoid_covers():

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from scipy.stats import chi2
 
 from jcr.calibrate.pose_fit import robot_noise
 from jcr.calibrate.projection import parameters, project, project_derivatives
@@ -19,6 +20,8 @@ from jcr.records import Intrinsics, Tracks
 POINTS_AT_ONCE = 4096
 """Points whose coupling to the cameras is held in memory together."""
 MIN_SIGMA_PX = 0.05
+FAR_OFF = 6.0
+"""Median residuals; seven sigma."""
 LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
 LENS_STD = {"cx": 0.02, "cy": 0.02, "k1": 0.3, "k2": 0.3}
@@ -72,6 +75,9 @@ class _Problem:
     lens_start: Float[ndarray, "9"]
     lens_std: Float[ndarray, " c"]
     rows_of_image: list[Int[ndarray, "..."]]
+    median_square: Float[ndarray, " p"]
+    """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
+    views its position takes up 3."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,7 @@ def adjust(
         parameters(intrinsics),
         lens_std,
         [np.flatnonzero(tracks.image[order] == i) for i in range(len(base_from_gripper))],
+        chi2.ppf(0.5, 2 * np.bincount(point) - 3),
     )
     recon_scaled = recon_from_camera.copy()
     recon_scaled[:, :3, 3] *= scale
@@ -134,7 +141,7 @@ def adjust(
     robot = noise or (1e-3, np.radians(0.2))
     dof = (np.inf, np.inf)
     view = _view(bundle, problem)
-    sigma_px = _sigma_px(view)
+    sigma_px = _sigma_px(view, problem)
     damping, total = 1e-4, 0
     for _ in range(12):
         before = (*robot, sigma_px)
@@ -143,7 +150,7 @@ def adjust(
             bundle, view, problem, weights, robot, damping, max_iterations
         )
         total += used
-        sigma_px = _sigma_px(view)
+        sigma_px = _sigma_px(view, problem)
         if noise is None:
             normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
             robot, dof = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot)
@@ -216,9 +223,13 @@ def _robot_residual(bundle: Bundle, reported: Float[ndarray, "m 4 4"]) -> Float[
     return np.concatenate([adjusted[:, :3, 3] - reported[:, :3, 3], turned], axis=1)
 
 
-def _sigma_px(view: _View) -> float:
-    """Noise of an image coordinate from the median length of the residuals, Rayleigh-distributed."""
-    return max(float(np.median(np.linalg.norm(view.residual, axis=1))) / 1.1774, MIN_SIGMA_PX)
+def _sigma_px(view: _View, problem: _Problem) -> float:
+    """Noise of an image coordinate, from the median point none of whose observations is far off."""
+    square = (view.residual**2).sum(1)
+    far = square > FAR_OFF**2 * np.median(square)
+    squares = np.bincount(problem.point, square) / problem.median_square
+    clean = np.bincount(problem.point, far) == 0
+    return max(float(np.sqrt(np.median(squares[clean] if clean.any() else squares))), MIN_SIGMA_PX)
 
 
 def _weights(view: _View, sigma_px: float) -> Float[ndarray, " k"]:

