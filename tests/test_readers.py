@@ -14,8 +14,11 @@ import capture_writers as writers
 import jcr
 from jcr.capture import capture_json
 from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import read_npy
+from jcr.capture.pose_table import stamp_ns
 from jcr.capture.read import FORMATS, format_of, read_source
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
+from jcr.cli.query import read_points
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
@@ -413,3 +416,20 @@ def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProb
 
     result = calibrate_poses(read_source(path), tmp_path / "out")
     assert not result.converged and "inverses" in result.calibration.warnings[0]
+
+
+@pytest.mark.parametrize("text", ["9700000000000000000", "1e30", "nan", "now"])
+def test_a_stamp_that_64_bits_do_not_hold_is_refused(text: str):
+    """The first was found by fuzzing: it made floats of all the stamps beside it."""
+    assert stamp_ns("9200000000000000000", "a table") == 9_200_000_000_000_000_000
+    with pytest.raises(jcr.InputError, match="no time stamp"):
+        stamp_ns(text, "a table")
+
+
+def test_an_archive_named_as_an_array_is_refused(tmp_path: Path):
+    """Found by fuzzing: numpy.load opens what begins with PK as an archive, whatever its name."""
+    np.savez(tmp_path / "points.npz", points=np.zeros((2, 3)))
+    (tmp_path / "points.npz").rename(tmp_path / "points.npy")
+    for read in (read_npy, read_points):
+        with pytest.raises(jcr.InputError, match=r"points\.npy: not a NumPy array"):
+            read(tmp_path / "points.npy")

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.checks import check_metres, read_rigid
 from jcr.capture.images import read_image
-from jcr.capture.plain_files import contained, read_json
+from jcr.capture.plain_files import contained, read_json, read_npy
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture
@@ -87,7 +87,7 @@ def read_pose(path: Path) -> Float[ndarray, "4 4"]:
         raise InputError(f"{path}: no such pose file (base_from_gripper, 4x4, as .json, .npy or text)")
     try:
         if path.suffix == ".npy":
-            value = np.load(path, allow_pickle=False)
+            value = read_npy(path)
         elif path.suffix == ".json":
             value = read_json(path)
             value = value["base_from_gripper"] if isinstance(value, dict) else value

@@ -1,8 +1,11 @@
-"""Text, YAML and JSON that others wrote: plain data alone, from inside of the folder, or one line of what is wrong."""
+"""Text, YAML, JSON and arrays that others wrote: plain data from inside of the folder, or one line of what is wrong."""
 
 import json
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy import ndarray
 
 from jcr.errors import InputError
 
@@ -66,6 +69,15 @@ def read_json(file: Path) -> Any:
         raise InputError(f"{file}: a number that is none ({error}); correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
+
+
+def read_npy(file: Path) -> ndarray:
+    """The array that numpy.save wrote, never objects; InputError for any other file."""
+    try:
+        with file.open("rb") as stream:
+            return np.lib.format.read_array(stream, allow_pickle=False)
+    except Exception as error:  # NumPy reads a header with Python's own parser, which has errors of its own
+        raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
 
 
 def contained(folder: Path, name: str, where: str) -> Path:

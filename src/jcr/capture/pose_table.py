@@ -29,6 +29,9 @@ _SHOWN = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 
+_LATEST_NS = np.iinfo(np.int64).max
+"""In the year 2262."""
+
 
 @dataclass(frozen=True)
 class PoseTable:
@@ -85,9 +88,10 @@ def stamp_ns(text: str, where: str) -> int:
         size = abs(value)
         if not size < 10**20:
             raise ValueError
-        return int(
-            value * (10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1)
-        )
+        unit_ns = 10**9 if size < 10**11 else 10**6 if size < 10**14 else 10**3 if size < 10**17 else 1
+        if not -_LATEST_NS <= (stamp := int(value * unit_ns)) <= _LATEST_NS:
+            raise ValueError
+        return stamp
     except (InvalidOperation, ValueError, OverflowError):
         raise InputError(f"{where}: {text!r} is no time stamp; give seconds or nanoseconds") from None
 

@@ -4,9 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from jcr.capture.plain_files import read_text
+from jcr.capture.plain_files import read_npy, read_text
 from jcr.errors import InputError
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".npy")
@@ -85,18 +83,10 @@ def _text(file: Path) -> tuple[list[str] | None, list[list[str]]]:
 
 def _array(file: Path) -> tuple[list[str] | None, list[list[str]]]:
     """The same of a NumPy array: a structured one has a header, matrices are rows of their numbers."""
-    try:
-        array = np.load(file, allow_pickle=False)
-    except Exception as error:  # NumPy reads a header with Python's own parser, which has errors of its own
-        raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
-    if isinstance(array, np.ndarray) and array.dtype.names is not None and array.ndim == 1:
+    array = read_npy(file)
+    if array.dtype.names is not None and array.ndim == 1:
         return list(array.dtype.names), [[str(value) for value in row] for row in array.tolist()]
-    if (
-        not isinstance(array, np.ndarray)
-        or array.dtype.kind not in "fiu"
-        or array.ndim not in (2, 3)
-        or not array.size
-    ):
+    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or not array.size:
         raise InputError(f"{file}: no table of numbers; save (n,4,4) matrices or (n,k) rows with numpy.save")
     return None, [[repr(value) for value in row] for row in array.reshape(len(array), -1).tolist()]
 

@@ -10,6 +10,7 @@ import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.plain_files import read_npy
 from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -85,7 +86,7 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
         raise InputError(f"{path}: no such file of points (.csv, .npy or .ply)")
     try:
         if path.suffix == ".npy":
-            points = np.load(path, allow_pickle=False)
+            points = read_npy(path)
         elif path.suffix == ".ply":
             import trimesh
 
@@ -98,7 +99,7 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
         raise
     except Exception as error:
         raise InputError(f"{path}: cannot be read as points ({error}); give x, y, z in metres") from error
-    if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.number):
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: expected points of shape (n, 3) in metres, got {points.shape} {points.dtype}"
         )

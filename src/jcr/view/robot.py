@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.optimize import least_squares
 
+from jcr.capture.plain_files import read_npy
 from jcr.errors import InputError
 from jcr.geometry import rotation_log
 
@@ -44,14 +45,18 @@ def read_joints(path: Path, robot: "yourdfpy.URDF", images: int) -> Float[ndarra
     names = robot.actuated_joint_names
     try:
         if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = read_npy(path)
         else:
             lines = [line for line in path.read_text().splitlines() if line.strip()]
             header = int(any(word.strip() in names for word in lines[0].split(",")))
             values = np.array([[float(word) for word in line.split(",")] for line in lines[header:]])
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"{path}: cannot be read as joint values ({error}); give .csv or .npy") from None
-    if values.shape != (images, len(names)) or not np.isfinite(values).all():
+    if (
+        values.dtype.kind not in "fiu"
+        or values.shape != (images, len(names))
+        or not np.isfinite(values).all()
+    ):
         raise InputError(
             f"{path}: expected finite joint values of shape ({images}, {len(names)}), a row an image, columns "
             f"{', '.join(names)}, got {values.shape}"
