@@ -6,7 +6,7 @@ from pathlib import Path
 SOURCE = Path(__file__).parent.parent / "src" / "jcr"
 LAYERS = [
     {"errors"},
-    {"geometry", "records", "files", "progress", "rounding"},
+    {"geometry", "records", "files", "memory", "progress", "rounding"},
     {"information"},
     {"capture"},
     {"reconstruct"},

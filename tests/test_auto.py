@@ -4,16 +4,18 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from jcr import auto
 from jcr.calibrate import calibrate
 from jcr.calibrate.calibrate import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct.backends import Backend, ReconstructOptions, candidates
 from jcr.reconstruct.checkpoints import CHECKPOINTS, Checkpoint
 from jcr.reconstruct.dust3r.network import Dust3r
@@ -184,6 +186,33 @@ def garbage_weights(tmp_path: Path) -> Path:
     )
     (folder / "config.json").write_text(json.dumps(GARBAGE))
     return folder
+
+
+def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_weights(
+    tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    weights = load_file(garbage_weights / "model.safetensors")
+    flat = {key: 0 * tensor if "downstream" in key else tensor for key, tensor in weights.items()}
+    save_file(flat, garbage_weights / "model.safetensors")
+    (garbage_weights / "config.json").write_text(json.dumps(GARBAGE | {"licence": "for tests alone"}))
+    frames = []
+    for k in range(3):
+        grey = np.full((48, 64, 3), 90 + 5 * k, np.uint8)
+        grey[20 + k, 30] = 255
+        cv2.imwrite(str(tmp_path / f"{k}.png"), grey)
+        pose = transform(rotation_exp(np.array([0.3 * k, 0.2, 0.1 * k * k])), np.array([0.1 * k, 0.0, 0.3]))
+        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
+    lens = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0] * 5}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    for backend in ("auto", "dust3r"):
+        out = tmp_path / backend
+        command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
+        assert dispatch(command) == 3
+        licence = f"weights {garbage_weights}: licence for tests alone"
+        assert licence in " ".join(json.loads((out / "calibration.json").read_text())["warnings"])
+        assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
+        assert licence in capsys.readouterr().err
 
 
 @pytest.mark.slow

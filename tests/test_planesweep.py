@@ -9,8 +9,9 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.reconstruct import planesweep
 from jcr.reconstruct.lens import rays
-from jcr.reconstruct.planesweep import plane_sweep
+from jcr.reconstruct.planesweep import PlaneSweepOptions, plane_sweep
 from jcr.reconstruct.views import choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Tracks
 
@@ -94,11 +95,28 @@ def swept(scene: Scene) -> tuple[ndarray, ndarray]:
     return _sweep(scene.images, scene.recon_from_camera, scene.tracks)
 
 
-def _sweep(images: ndarray, recon_from_camera: ndarray, tracks: Tracks) -> tuple[ndarray, ndarray]:
+def _sweep(
+    images: ndarray, recon_from_camera: ndarray, tracks: Tracks, options: PlaneSweepOptions | None = None
+) -> tuple[ndarray, ndarray]:
     neighbours = choose_neighbours(tracks, recon_from_camera, 4)
-    return plane_sweep(
-        images, recon_from_camera, PINHOLE, neighbours, sweep_planes(tracks, recon_from_camera)
+    planes = sweep_planes(tracks, recon_from_camera)
+    return plane_sweep(images, recon_from_camera, PINHOLE, neighbours, planes, options)
+
+
+def test_a_tight_budget_takes_the_images_one_by_one_and_changes_no_bit(
+    scene: Scene, swept: tuple[ndarray, ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = []
+    smooth = planesweep._add_semi_global_paths
+    monkeypatch.setattr(
+        planesweep,
+        "_add_semi_global_paths",
+        lambda cost, grey: together.append(len(cost)) or smooth(cost, grey),
     )
+    tight = _sweep(scene.images, scene.recon_from_camera, scene.tracks, PlaneSweepOptions(memory_gb=0.1))
+    assert together == [1] * len(scene.images)
+    for one, other in zip(tight, swept, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_depth_is_found_and_confidence_knows_where(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:

@@ -37,8 +37,12 @@ def best_reconstruction(
     except (NotTrustedError, InputError) as error:
         if isinstance(error, InputError) and options.weights is not None:
             raise
-        other = _attempt(capture, second, calibrate_options, progress)
-        return other.noted(f"{chose}, gave nothing ({error}); {other.told()} was used instead")
+        nothing = f"{chose}, gave nothing ({error})"
+        try:
+            other = _attempt(capture, second, calibrate_options, progress)
+        except NotTrustedError as last:  # the licence of weights that were used belongs to this answer, too
+            raise NotTrustedError(f"{last}; {nothing}") from None
+        return other.noted(f"{nothing}; {other.told()} was used instead")
     if one.hand_eye.converged or not one.hand_eye.observability.observable:
         return one.noted(chose)
     doubt = f"{chose}, is not to be trusted ({one.hand_eye.warnings[0]})"

@@ -34,6 +34,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import read_cloud, write_cloud
 from jcr.files import remove_unfinished, write_text
+from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
 from jcr.reconstruct.file import FORMAT, read_reconstruction, write_reconstruction
@@ -186,6 +187,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         else:
             reconstruction = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
             (folder / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
+            give_back()  # what the back end worked with
             write_reconstruction(folder / "reconstruction.npz", reconstruction)
         state = {
             "capture": str(capture.folder.resolve()),
@@ -196,6 +198,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         reconstructed = time.perf_counter()
         report("calibrate", 0.0)
         hand_eye = calibrate_stage(capture, reconstruction, options.calibrate)
+        give_back()
         report("calibrate", 1.0)
     except NotTrustedError as error:
         if state.get("reconstruct") != made_from:  # what is there is another capture's, or of other options
@@ -230,11 +233,18 @@ def _map(
         from jcr.reconstruct.added import extend
 
         reconstruction = extend(
-            reconstruction, result.hand_eye, len(capture), added, device, progress or silent
+            reconstruction,
+            result.hand_eye,
+            len(capture),
+            added,
+            device,
+            progress or silent,
+            options.reconstruct.memory_gb,
         )
         write_added(added, capture)
     cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
     write_cloud(folder / "cloud.ply", cloud)
+    give_back()
     scene = build_scene(cloud, options.map, progress, device=device)
     scene.save(folder / "map.safetensors")
     timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}

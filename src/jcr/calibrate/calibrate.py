@@ -60,7 +60,8 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     evidence = reconstruction.evidence
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
     if len(camera) < 2:
-        raise NotTrustedError(f"{len(camera)} of {len(capture)} images registered; overlap the views more")
+        few = f"{len(camera)} of {len(capture)} images registered; overlap the views more"
+        raise NotTrustedError("; ".join([few, *reconstruction.notes]))
     noise = _noise(options)
     cues = _cues(capture, reconstruction, options)
     camera_covariance = None if evidence is None else evidence.covariance

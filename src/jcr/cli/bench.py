@@ -26,6 +26,7 @@ BenchName = Literal[
     "density",
     "limits",
     "map",
+    "memory",
     "pairs",
     "predictions",
     "real",
@@ -71,6 +72,7 @@ BENCHES: dict[BenchName, Bench] = {
     "compact": Bench(
         "a small network of one's own, beside COLMAP, on simulated captures (and on those in DIR)", True
     ),
+    "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
     "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
     "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
 }

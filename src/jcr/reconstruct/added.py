@@ -38,6 +38,7 @@ def extend(
     added: Capture,
     device: str,
     report: Progress,
+    memory_gb: float = 8.0,
 ) -> Reconstruction:
     """The reconstruction with further images, oldest first, whose gripper poses are known.
 
@@ -77,6 +78,7 @@ def extend(
         device,
         report,
         changing=True,
+        memory_gb=memory_gb,
     )
     points, confidence = points[-new:], confidence[-new:]
     for name, of_image in zip(added.images, confidence, strict=True):

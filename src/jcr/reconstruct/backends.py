@@ -41,7 +41,8 @@ class ReconstructOptions:
     """The board or tags that marker looks for, lengths in metres: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     memory_gb: float = 8.0
-    """Memory that dust3r and mast3r may take."""
+    """Most that the process may take of main memory (peak resident set, the program included), and a network of a
+    GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,8 @@ def device_of(options: ReconstructOptions) -> str:
 def _colmap(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
-    return reconstruct(capture, ColmapOptions(seed=options.seed, device=device_of(options)), progress)
+    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
 
 
 def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
@@ -199,7 +201,8 @@ def _marker(capture: Capture, options: ReconstructOptions, progress: Progress | 
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct(capture, MarkerOptions(options.board, device=device_of(options)), progress)
+    made = MarkerOptions(options.board, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
 
 
 def _predictions(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
@@ -207,12 +210,14 @@ def _predictions(capture: Capture, options: ReconstructOptions, progress: Progre
 
     if options.weights is None:
         raise InputError("--backend predictions: name the npz file with --weights FILE (docs/predictions.md)")
-    return reconstruct(capture, PredictionsOptions(Path(options.weights)), progress)
+    return reconstruct(capture, PredictionsOptions(Path(options.weights), options.memory_gb), progress)
 
 
 def _given(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.colmap import ColmapOptions
     from jcr.reconstruct.given import reconstruct
 
     if options.weights is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --weights PATH")
-    return reconstruct(capture, Path(options.weights), options.seed, device_of(options), progress)
+    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, Path(options.weights), made, progress)

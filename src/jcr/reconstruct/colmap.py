@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.progress import Progress, silent
-from jcr.reconstruct.dense import DenseOptions, with_pointmaps
+from jcr.reconstruct.dense import DenseOptions, plan_memory, with_pointmaps
 from jcr.reconstruct.lens import usable_lens
 from jcr.records import Capture, Intrinsics, Reconstruction
 
@@ -39,16 +39,26 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.reconstruct.sfm import structure_from_motion
+    from jcr.reconstruct.sfm import BYTES_OF_FEATURES, structure_from_motion
 
     options = options or ColmapOptions()
     report = progress or silent
+    width, height = capture.image_size
+    working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
+    plan_memory(len(capture), (width, height), options, working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
     given, notes = usable_lens(capture.intrinsics)
     lenses = [given] if given else _guessed_lenses(capture)
     try:
         sparse = structure_from_motion(
-            images, lenses, given is not None, options.working_size_px, options.seed, options.verbose, report
+            images,
+            lenses,
+            given is not None,
+            options.working_size_px,
+            options.seed,
+            options.verbose,
+            report,
+            options.memory_gb,
         )
     except NotTrustedError as error:
         raise NotTrustedError("; ".join([str(error), *notes])) from None

@@ -1,5 +1,6 @@
 """Dense pointmaps of images whose cameras are known, whichever back end found them."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
 from jcr.reconstruct.lens import pinhole_inside, rays, undistort_image
-from jcr.reconstruct.views import choose_neighbours, sweep_planes
+from jcr.reconstruct.views import PLANES, choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 
@@ -25,6 +27,8 @@ class DenseOptions:
     """Other images that each is compared with for its pointmap."""
     device: str = "cpu"
     """Where the plane sweep runs: cpu or cuda."""
+    memory_gb: float = 8.0
+    """Peak resident set of the process, the program itself included."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ def with_pointmaps(
             sweep_planes(sparse.tracks, sparse.recon_from_camera) if planes is None else planes,
             options.device,
             report,
+            memory_gb=options.memory_gb,
         )
     else:
         points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
@@ -90,6 +95,7 @@ def dense_pointmaps(
     device: str,
     report: Progress,
     changing: bool = False,
+    memory_gb: float = 8.0,
 ) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
     """Points in the recon frame and their confidence, per pixel of undistorted images.
 
@@ -104,9 +110,33 @@ def dense_pointmaps(
         pinhole,
         neighbours,
         planes,
-        PlaneSweepOptions(device=device, changing=changing),
+        PlaneSweepOptions(device=device, changing=changing, memory_gb=memory_gb),
         lambda fraction: report("dense depth", fraction),
     )
-    x_in_camera = depth[..., None] * rays(pinhole)
-    x_in_recon = np.einsum("mij,mhwj->mhwi", recon_from_camera[:, :3, :3], x_in_camera)
-    return x_in_recon + recon_from_camera[:, None, None, :3, 3], confidence
+    points = np.empty((*depth.shape, 3))
+    for k, pose in enumerate(recon_from_camera):
+        points[k] = np.einsum("ij,hwj->hwi", pose[:3, :3], depth[k, ..., None] * rays(pinhole)) + pose[:3, 3]
+    return points, confidence
+
+
+def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, features: int = 0) -> None:
+    """Say what memory the reconstruction of so many images of a size, and their map, will take before they start.
+
+    `features` are the bytes that finding features takes at least. Raises InputError where the budget cannot be
+    kept with one image at a time.
+    """
+    from jcr.reconstruct.planesweep import BYTES_OF_PLANE, BYTES_OF_RESULT, BYTES_OF_THREAD
+
+    width, height = size
+    pixels = int(width * height * min(1.0, options.pointmap_size_px / max(size)) ** 2)
+    program = resident() + ALLOWANCE
+    pictures = 3 * width * height * images
+    result = images * pixels * BYTES_OF_RESULT
+    one = pixels * (BYTES_OF_THREAD + PLANES * BYTES_OF_PLANE)
+    budget = options.memory_gb * GB
+    least = program + pictures + max(features, result + max(one, MAP))
+    require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
+    cores = os.cpu_count() or 1
+    all_at_once = pixels * (min(cores, images) * BYTES_OF_THREAD + images * PLANES * BYTES_OF_PLANE)
+    ample = program + pictures + max(features * min(cores, images), result + max(all_at_once, MAP))
+    announce(min(ample, int(budget)), budget)

@@ -20,7 +20,7 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.dense import SparseModel, with_pointmaps
+from jcr.reconstruct.dense import SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
@@ -28,7 +28,7 @@ MIN_POINTS = 50
 
 
 def reconstruct(
-    capture: Capture, cameras: Path, seed: int, device: str, progress: Progress | None = None
+    capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
 ) -> Reconstruction:
     """The capture's images that the model at `cameras` knows, with its poses held, and pointmaps.
 
@@ -45,8 +45,8 @@ def reconstruct(
         )
     recon_from_camera = recon_from_camera[[row_of[Path(capture.images[k]).name] for k in known]]
     lens = capture.intrinsics or reader.read_lens(cameras, capture.image_size)
+    plan_memory(len(known), capture.image_size, options)
     images = [read_image(capture.folder / capture.images[k]) for k in known]
-    options = ColmapOptions(seed=seed, device=device)
     tracks = _own_tracks(
         cameras, [names[row_of[Path(capture.images[k]).name]] for k in known], capture.image_size
     )
@@ -82,7 +82,7 @@ def _triangulated(
     """Points of matched features, with lens and cameras held."""
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = extract(database, images, [lens], True, options.working_size_px, report)
+        cameras = extract(database, images, [lens], True, options.working_size_px, report, options.memory_gb)
         report("matching", 0.0)
         match(database, options.seed)
         model = pycolmap.Reconstruction()

@@ -17,7 +17,7 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, rotation_log, transform
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
-from jcr.reconstruct.dense import DenseOptions, SparseModel, with_pointmaps
+from jcr.reconstruct.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.lens import WITHIN_FOLD, fold_distance_px
 from jcr.reconstruct.views import sweep_planes
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -59,6 +59,7 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     """
     report = progress or silent
     readings = boards(options.board)
+    plan_memory(len(capture), capture.image_size, options)
     images = [read_image(capture.folder / name) for name in capture.images]
     report("board", 0.0)
     board, seen = most_seen(readings, images)

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from jcr.geometry import inverse
+from jcr.memory import GB, relieve, resident
 from jcr.reconstruct.lens import rays, resized
 from jcr.records import Intrinsics
 
@@ -46,6 +47,10 @@ table often gets the object's depth; the neighbours that look past the object th
 two scenes on plain tables: of the confident table points 0.7 and 1.2 % are too near by 2 %, before 1.4 and 3.2 %."""
 
 
+BYTES_OF_THREAD, BYTES_OF_PLANE, BYTES_OF_RESULT = 2000, 4, 80
+"""Per pixel: of the image that a thread works on; of each plane of an image that is smoothed; of every image."""
+
+
 @dataclass(frozen=True)
 class PlaneSweepOptions:
     """How depth is searched and when it is believed."""
@@ -58,6 +63,8 @@ class PlaneSweepOptions:
     """The images are of different times: one that sees through a point of another may show what was there before."""
     device: str = "cpu"
     """cpu or cuda."""
+    memory_gb: float = 8.0
+    """Peak resident set of the process: fewer images at a time and fewer threads keep within it."""
 
 
 def plane_sweep(
@@ -77,7 +84,12 @@ def plane_sweep(
     as agree see through the point.
     """
     options = options or PlaneSweepOptions()
-    report = progress or (lambda fraction: None)
+
+    def report(fraction: float) -> None:
+        relieve(options.memory_gb * GB)
+        if progress is not None:
+            progress(fraction)
+
     device = torch.device(options.device)
     m = len(images)
     color = torch.from_numpy(images.astype(np.float32) / 255).to(device).movedim(-1, 1)
@@ -107,11 +119,30 @@ def plane_sweep(
     def agree(i: int, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
         return _agreement(inverse_depth, i, neighbours[i], motions[i], pinhole, tolerance)
 
-    with _threads_over_images(device) as pool:
-        cost = torch.stack(list(_told(pool.map(coarse, range(m)), report, 0.0, 0.45 / m)))
-        _add_semi_global_paths(cost, coarse_color.mean(1))
-        index, _ = _peak(-cost.movedim(-1, 1), dim=1)
-        del cost
+    def smooth(rows: range, costs: Iterable[Float[Tensor, "h w d"]]) -> Float[Tensor, "k h w"]:
+        """Positions on the planes of these images' surfaces; no image asks another one here."""
+        size = (len(rows), coarse_pinhole.height, coarse_pinhole.width, sweep.shape[1])
+        cost = torch.empty(size, device=device)
+        for k, of_image in enumerate(costs):
+            cost[k] = of_image
+        _add_semi_global_paths(cost, coarse_color[rows.start : rows.stop].mean(1))
+        return _peak(-cost.movedim(-1, 1), dim=1)[0]
+
+    threads, together = torch.get_num_threads(), m
+    if device.type == "cpu":
+        pixels = pinhole.width * pinhole.height
+        room = options.memory_gb * GB - resident() - m * pixels * BYTES_OF_RESULT
+        threads = max(1, min(threads, int(room / 2 // (pixels * BYTES_OF_THREAD))))
+        room -= threads * pixels * BYTES_OF_THREAD
+        together = max(1, min(m, int(room // (pixels * sweep.shape[1] * BYTES_OF_PLANE))))
+
+    with _threads_over_images(device, threads) as pool:
+        groups = [range(start, min(start + together, m)) for start in range(0, m, together)]
+        found = []
+        for rows in groups:
+            costs = _told(pool.map(coarse, rows), report, 0.45 * rows.start / m, 0.45 / m)
+            found.append(smooth(rows, costs))
+        index = torch.cat(found)
         index = F.interpolate(index[:, None], (pinhole.height, pinhole.width))[:, 0]
         surface = _on_planes(sweep[:, 0], pinhole) + step[:, None, None] * index
         refined = list(_told(pool.map(fine, range(m)), report, 0.5, 0.5 / m))
@@ -129,15 +160,15 @@ def plane_sweep(
 
 
 @contextmanager
-def _threads_over_images(device: torch.device) -> Iterator[Executor]:
-    """As many threads as torch has, each to work on images of its own.
+def _threads_over_images(device: torch.device, count: int) -> Iterator[Executor]:
+    """So many threads, each to work on images of its own.
 
     Torch's own threads wait for each other after every one of thousands of short steps.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(threads if device.type == "cpu" else 1) as pool:
+        with ThreadPoolExecutor(count if device.type == "cpu" else 1) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)

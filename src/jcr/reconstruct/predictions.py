@@ -12,10 +12,12 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
+from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.backend import reconstruction_from_pairs
 from jcr.reconstruct.dust3r.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
+from jcr.reconstruct.dust3r.predict import memory_after
 from jcr.reconstruct.dust3r.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.reconstruct.lens import NO_DISTORTION, usable_lens
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
@@ -28,6 +30,8 @@ class PredictionsOptions:
 
     path: Path
     """The npz file."""
+    memory_gb: float = 8.0
+    """Peak resident set of the process; a large file of pairs is not read into memory but page by page."""
     align: AlignOptions = field(default_factory=AlignOptions)
 
 
@@ -38,7 +42,9 @@ def reconstruct(
 
     Raises InputError for a file that is missing, damaged, or does not fit the capture.
     """
-    arrays = read_arrays(options.path)
+    budget, program = options.memory_gb * GB, resident() + ALLOWANCE
+    room = max(budget - program - MAP, 0) / 2
+    arrays = read_arrays(options.path, room)
     source = str(options.path)
     if "edges" in arrays:
         predictions = pairs_from_arrays(arrays, source)
@@ -46,7 +52,11 @@ def reconstruct(
         rank = np.argsort(np.argsort(rows))
         # Rows of a reconstruction ascend; the file's images are renumbered to that order.
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
-        height, width = predictions.conf.shape[1:]
+        count, height, width = predictions.conf.shape
+        size = options.path.stat().st_size
+        needed = program + memory_after(len(rows), count, height * width) + (size if size <= room else 0)
+        require(needed, budget, f"aligning {count} pairs, with the program itself,")
+        announce(needed, budget, "" if size <= room else f", and {size / GB:.2g} GB left in {source}")
         images = _images(capture, rows, arrays, (width, height), source)
         rows = np.sort(rows)
         poses = capture.base_from_gripper[rows]

@@ -20,12 +20,15 @@ from PIL import Image
 
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
+from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
 from jcr.reconstruct.dense import SparseModel
 from jcr.reconstruct.lens import fold_distance_px, resized
 from jcr.records import Intrinsics, Tracks
 
 HALF_PIXEL = 0.5
+BYTES_OF_FEATURES = 330
+"""Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
 _MIN_REGISTERED = 3
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
@@ -39,6 +42,7 @@ def structure_from_motion(
     seed: int,
     verbose: bool,
     report: Progress,
+    memory_gb: float = 8.0,
 ) -> SparseModel:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
@@ -48,7 +52,7 @@ def structure_from_motion(
     """
     with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = extract(database, images, lenses, known, working_size_px, report)
+        cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb)
         report("matching", 0.0)
         match(database, seed)
         report("matching", 1.0)
@@ -77,8 +81,12 @@ def extract(
     known: bool,
     working_size_px: int,
     report: Progress,
+    memory_gb: float = 8.0,
 ) -> list[pycolmap.Camera]:
-    """Features of every image, at the working size, in a new database; and the lenses as COLMAP's cameras."""
+    """Features of every image, at the working size, in a new database; and the lenses as COLMAP's cameras.
+
+    As many threads are used as the budget, a peak resident set, has room for.
+    """
     width, height = lenses[0].width, lenses[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -99,10 +107,23 @@ def extract(
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
     cpu = pycolmap.Device.cpu
-    at_once = 4 * (os.cpu_count() or 1)  # fewer would leave threads idle at every end
+    cores = os.cpu_count() or 1
+    extraction = pycolmap.FeatureExtractionOptions()
+    give_back()
+    room = memory_gb * GB - resident()
+    extraction.num_threads = max(1, min(cores, int(room // (size[0] * size[1] * BYTES_OF_FEATURES))))
+    at_once = 4 * cores  # fewer would leave threads idle at every end
     for start in steps(report, "features", range(0, len(names), at_once)):
         few = names[start : start + at_once]
-        pycolmap.extract_features(database, database.parent, few, pycolmap.CameraMode.SINGLE, device=cpu)
+        pycolmap.extract_features(
+            database,
+            database.parent,
+            few,
+            pycolmap.CameraMode.SINGLE,
+            extraction_options=extraction,
+            device=cpu,
+        )
+    give_back()
     return cameras
 
 

@@ -7,6 +7,9 @@ from numpy import ndarray
 from jcr.geometry import apply, inverse
 from jcr.records import Tracks
 
+PLANES = 48
+"""Of a sweep."""
+
 
 def choose_neighbours(
     tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int
@@ -31,7 +34,7 @@ def choose_neighbours(
 
 
 def sweep_planes(
-    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int = 48
+    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int = PLANES
 ) -> Float[ndarray, "m d 3"]:
     """For each image `count` planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
 

@@ -194,7 +194,8 @@ def gauss_newton(
             residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
         ]
         noise = measure_noise(images, misfit)
-        equations = [image_equations(*each) for each in zip(images, misfit, noise, strict=True)]
+        # The residuals of an image, which are most of the memory, go as its equations come.
+        equations = [image_equations(o, misfit.pop(0), own) for o, own in zip(images, noise, strict=True)]
         observer_axes = adjoint(inverse(state.recon_from_camera))
         ties = [
             PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
@@ -242,6 +243,7 @@ def gauss_newton(
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
             return Solution(state, cameras, images, noise, pair_spread, settled)
+        del equations, reduced  # or they would stay until the next ones are complete
 
 
 def _spread(

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.errors import NotTrustedError
+from jcr.memory import give_back, resident
 from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.dust3r.alignment import AlignOptions
@@ -40,12 +41,14 @@ class Dust3rOptions:
 
 
 def predict(
-    capture: Capture, options: Dust3rOptions, progress: Progress | None = None
+    capture: Capture, options: Dust3rOptions, progress: Progress | None = None, *, aligned: bool = False
 ) -> tuple[PreparedImages, PairPredictions, tuple[str, ...]]:
     """The images as the network saw them, its pointmaps of pairs, and notes for the user.
 
-    Raises InputError for images or weights that cannot be used, or a memory budget that is too small.
+    `aligned` says that alignment and map follow, within the same memory. Raises InputError for images or weights
+    that cannot be used, or a memory budget that is too small.
     """
+    program = resident()
     loaded = load_weights(options.weights or CHECKPOINTS[options.model].hub_id, options.device)
     size = options.pairs.image_size
 
@@ -54,7 +57,14 @@ def predict(
 
     images = prepare_images(capture, grid)
     predictions, notes = predict_pairs(
-        loaded, images, capture.images, capture.base_from_gripper, options.pairs, progress
+        loaded,
+        images,
+        capture.images,
+        capture.base_from_gripper,
+        options.pairs,
+        progress,
+        program=program,
+        aligned=aligned,
     )
     return images, predictions, (f"weights {loaded.source}: licence {loaded.licence}", *notes)
 
@@ -67,7 +77,8 @@ def reconstruct(
     Raises InputError as `predict` does.
     """
     options = options or Dust3rOptions()
-    images, predictions, notes = predict(capture, options, progress)
+    images, predictions, notes = predict(capture, options, progress, aligned=True)
+    give_back()  # the network
     rows = np.arange(len(capture))
     poses = capture.base_from_gripper
     try:

@@ -1,6 +1,6 @@
 """Correspondences between images from their pointmaps: reciprocal nearest neighbours, below a pixel."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -70,11 +70,14 @@ def tracks_from_pairs(
     for e, (n, m) in enumerate(p.edges):
         confidence[n] += p.conf[e]
         confidence[m] += p.conf2[e]
-    pairs = (
-        (n, m, (p.pts3d[e], p.conf[e]), (p.pts3d_in_other_view[e], p.conf2[e]))
-        for e, (n, m) in enumerate(p.edges.tolist())
-    )
-    return _tracks(pairs, confidence, points_in_recon, original_px, options or MatchOptions())
+        p.release()
+
+    def pairs() -> Iterator[tuple[int, int, Pointmap, Pointmap]]:
+        for e, (n, m) in enumerate(p.edges.tolist()):
+            yield n, m, (p.pts3d[e], p.conf[e]), (p.pts3d_in_other_view[e], p.conf2[e])
+            p.release()
+
+    return _tracks(pairs(), confidence, points_in_recon, original_px, options or MatchOptions())
 
 
 def tracks_from_pointmaps(

@@ -1,5 +1,9 @@
 """Which pairs of images to predict, and their pointmaps as a record and a file, read by global alignment."""
 
+import math
+import mmap
+import struct
+import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -42,7 +46,8 @@ class PairOptions:
     image_size: Literal[512, 224] = 512
     """Long edge that the network sees, in pixels; 224 has a quarter of the pixels to compute."""
     memory_gb: float = 8.0
-    """Budget on the device that computes, and for the pointmaps in main memory."""
+    """Peak resident set of the process, the program itself included; on a GPU, what the network takes there, too.
+    Pointmaps that do not fit lie in a file."""
     cache: Path | None = None
     """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
     cache_gb: float = 4.0
@@ -79,6 +84,16 @@ class PairPredictions:
         """Images the edges speak of."""
         return len(self.images) or int(self.edges.max()) + 1
 
+    def release(self) -> None:
+        """Take pointmaps that lie in a file out of the resident set; they come back page by page when read."""
+        for array in (self.pts3d, self.conf, self.pts3d_in_other_view, self.conf2):
+            _release(array)
+
+
+def _release(array: ndarray) -> None:
+    if isinstance(array, np.memmap) and isinstance(array.base, mmap.mmap):
+        array.base.madvise(mmap.MADV_DONTNEED)
+
 
 def write_pairs(path: Path, predictions: PairPredictions) -> None:
     """Write predictions as npz (uncompressed: pointmaps do not compress), whole or not at all."""
@@ -91,8 +106,25 @@ def write_pairs(path: Path, predictions: PairPredictions) -> None:
         extra["intrinsics"] = np.array([k.fx, k.fy, k.cx, k.cy])
     if predictions.grid is not None:
         extra["grid"] = np.array(list(asdict(predictions.grid).values()), dtype=np.int64)
-    with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, **{name: getattr(predictions, name) for name in ARRAYS}, **extra)  # type: ignore[arg-type]
+    with (
+        written_whole(path) as temporary,
+        open(temporary, "wb") as stream,
+        zipfile.ZipFile(stream, "w") as archive,
+    ):
+        for name in ARRAYS:
+            _write_rows(archive, name, getattr(predictions, name))
+        for name, value in extra.items():
+            _write_rows(archive, name, np.asanyarray(value))
+
+
+def _write_rows(archive: zipfile.ZipFile, name: str, array: ndarray) -> None:
+    """An array of an npz file as numpy.savez writes it, but row by row: it may be larger than the memory."""
+    array = np.asanyarray(array, order="C")
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
+        for row in array.reshape(max(len(array), 1) if array.ndim else 1, -1):
+            member.write(row.tobytes())
+            _release(array)
 
 
 def read_pairs(path: Path) -> PairPredictions:
@@ -103,15 +135,46 @@ def read_pairs(path: Path) -> PairPredictions:
     return pairs_from_arrays(read_arrays(path), str(path))
 
 
-def read_arrays(path: Path) -> dict[str, ndarray]:
-    """All arrays of an npz file; InputError where it is missing or damaged."""
+def read_arrays(path: Path, in_memory: float = math.inf) -> dict[str, ndarray]:
+    """All arrays of an npz file; of one with more than `in_memory` bytes, what is not compressed stays there, mapped.
+
+    Raises InputError where the file is missing or damaged.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; `jcr predict CAPTURE {path.name}` writes one")
     try:
+        if path.stat().st_size > in_memory:
+            return _map_arrays(path)
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             return dict(file)
     except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
         raise InputError(f"{path}: no readable npz file ({error}); write it again with numpy.savez") from None
+
+
+def _map_arrays(path: Path) -> dict[str, ndarray]:
+    """Every array of an npz file, read-only, in the file itself where it lies there plainly."""
+    arrays = {}
+    with open(path, "rb") as stream, zipfile.ZipFile(stream) as archive:
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                read = np.lib.format.read_array_header_1_0
+                shape, by_columns, dtype = (
+                    read if version == (1, 0) else np.lib.format.read_array_header_2_0
+                )(member)
+                start = member.tell()
+                while member.read(1 << 20):  # to the end, where its checksum is compared
+                    pass
+            if info.compress_type != zipfile.ZIP_STORED or by_columns or not math.prod(shape):
+                with archive.open(info) as member:
+                    arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+                continue
+            # What stands before the data: 30 bytes, two of them the length of the name, two that of further fields.
+            stream.seek(info.header_offset + 26)
+            start += info.header_offset + 30 + sum(struct.unpack("<HH", stream.read(4)))
+            arrays[name] = np.memmap(path, dtype, "r", start, shape)
+    return arrays
 
 
 def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPredictions:
@@ -149,6 +212,7 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
     for name in ("pts3d", "conf", "pts3d_in_other_view", "conf2"):
         # One edge at a time: a mask of the whole would cost as much memory again as a quarter of the file.
         for edge, values in enumerate(arrays[name]):
+            _release(arrays[name])
             if not np.isfinite(values).all():
                 raise InputError(
                     f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"
@@ -292,6 +356,7 @@ def _chain_views(chain: PairPredictions, count: int, samples: int = 1000) -> lis
         own = np.argsort(chain.conf[there].ravel())[-len(confidence) // 2 :][:: max(1, len(best) // samples)]
         points = chain.pts3d[there].reshape(-1, 3)[own].astype(np.float64)
         views.append(_ChainView(camera_from_next, points, scale * in_next))
+        chain.release()
     return views
 
 

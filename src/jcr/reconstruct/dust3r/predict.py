@@ -1,7 +1,8 @@
 """Pairwise pointmaps of a capture: an encoder per image, a decoder per ordered pair, a memory budget."""
 
 import logging
-import sys
+import math
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
+from jcr.memory import ALLOWANCE, GB, MAP, announce, relieve, require, resident
 from jcr.progress import Progress, silent
+from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.network import PATCH, DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
 from jcr.reconstruct.dust3r.pairs import (
@@ -30,7 +33,8 @@ from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
 
 logger = logging.getLogger(__name__)
 
-GB = 1e9
+OBSERVED, RECORDED = 80, 60
+"""Bytes per pixel, when the network has gone: of a pointmap in alignment, and of an image in the reconstruction."""
 MAX_BATCH = {"cpu": 1, "cuda": 16}
 """Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
 
@@ -47,18 +51,10 @@ class MemoryEstimate:
     pointmaps: int
     """Of all pairs, in main memory."""
 
-    def batch(self, budget: float, device: str, pointmaps_in_memory: bool) -> int:
-        """Pairs that fit into `budget` bytes beside what stays; InputError when not even one does."""
-        stays = self.weights + self.features
-        if device == "cpu" and pointmaps_in_memory:
-            stays += self.pointmaps
-        pairs = int((budget - stays) // self.per_pair)
-        if pairs < 1:
-            raise InputError(
-                f"one pair of images needs {(stays + self.per_pair) / GB:.2g} GB on the {device}, the budget "
-                f"is {budget / GB:.2g}; raise --memory-gb, or use --image-size 224"
-            )
-        return min(pairs, MAX_BATCH[device])
+    @property
+    def one_pair(self) -> int:
+        """With the network, on the device that computes."""
+        return self.weights + self.features + self.per_pair
 
 
 def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width: int) -> MemoryEstimate:
@@ -77,6 +73,12 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
     return MemoryEstimate(weights, features, blocks + head, pairs * pixels * 8 * 4)
 
 
+def memory_after(images: int, pairs: int, pixels: int) -> int:
+    """Bytes that aligning, matching and mapping pairs of `pixels` pixels take beside their pointmaps."""
+    observed = min(AlignOptions.pixels, pixels)
+    return MAP + 2 * pairs * observed * OBSERVED + images * pixels * RECORDED
+
+
 def predict_pairs(
     loaded: LoadedNetwork,
     images: PreparedImages,
@@ -84,11 +86,16 @@ def predict_pairs(
     base_from_gripper: Float[ndarray, "n 4 4"],
     options: PairOptions | None = None,
     progress: Progress | None = None,
+    *,
+    program: int | None = None,
+    aligned: bool = False,
 ) -> tuple[PairPredictions, tuple[str, ...]]:
     """Pointmaps of the pairs of a capture's images, and notes on what was left out or did not fit.
 
-    Pairs found in the cache are not computed again. On CUDA that runs out of memory the batch is halved, then
-    the CPU takes over. Raises InputError for options out of range, and when one pair does not fit the budget.
+    `program` is the resident set (bytes) before the weights were loaded; `aligned` says that the pairs will be,
+    and mapped, within the same budget. Pairs found in the cache are not computed again. On CUDA that runs out of
+    memory the batch is halved, then the CPU takes over. Raises InputError for options out of range, and when one
+    pair does not fit the budget.
     """
     options = options or PairOptions()
     for name, value in (("window", options.window), ("memory-gb", options.memory_gb)):
@@ -97,7 +104,8 @@ def predict_pairs(
     if options.cache_gb < 0:
         raise InputError(f"--cache-gb {options.cache_gb}: give a size, or 0 for no cache")
     count = len(images.colors)
-    predictor = _Predictor(loaded, images, names, options, progress or silent)
+    program = resident() if program is None else program
+    predictor = _Predictor(loaded, images, names, options, progress or silent, program, aligned)
     graph = options.pair_graph
     if graph == "auto":
         graph = "complete" if count <= FEW_IMAGES else "robot"
@@ -120,12 +128,15 @@ class _Predictor:
         names: tuple[str, ...],
         options: PairOptions,
         progress: Progress,
+        program: int,
+        aligned: bool,
     ) -> None:
         self.loaded, self.images, self.names = loaded, images, names
         self.network = loaded.network
         self.device = self.network.device
         self.budget = options.memory_gb * GB
         self.progress = progress
+        self.program, self.aligned = program, aligned
         self.features: dict[int, Features] = {}
         self.batch = 0
         self.notes: tuple[str, ...] = ()
@@ -140,11 +151,18 @@ class _Predictor:
         """Pointmaps of `edges`, from `known` or the cache where they are there."""
         height, width = self.images.colors.shape[1:3]
         estimate = estimate_memory(self.network, len(self.images.colors), len(edges), height, width)
-        # Pointmaps that would fill half the budget live in a file that the system pages in and out.
-        in_memory = estimate.pointmaps <= self.budget / 2
-        self.batch = estimate.batch(self.budget, self.device.type, in_memory)
+        in_memory, needed = self._plan(estimate, len(edges))
         shapes = ((height, width, 3), (height, width)) * 2
         arrays = [_new_array((len(edges), *shape), in_memory) for shape in shapes]
+        predictions = PairPredictions(
+            edges,
+            *arrays,
+            images=self.names,
+            colors=self.images.colors,
+            intrinsics=self.images.intrinsics,
+            grid=self.images.grid,
+            is_metric=self.loaded.is_metric,
+        )
         rows = {} if known is None else {tuple(edge): row for row, edge in enumerate(known.edges.tolist())}
         missing, damaged = [], 0
         for e, edge in enumerate(edges.tolist()):
@@ -161,38 +179,46 @@ class _Predictor:
             else:
                 for array, values in zip(arrays, found, strict=True):
                     array[e] = values
+                predictions.release()
         if damaged and self.cache is not None:
             self._say(
                 f"{damaged} of the pairs in the cache {self.cache.folder} were damaged: predicted again"
             )
         if missing:
-            self._announce(estimate, in_memory)
-        needed = np.setdiff1d(edges[missing], list(self.features))
-        self._in_batches("encode images", needed, self._encode)
-        self._in_batches(
-            "predict pairs", np.array(missing, dtype=np.int64), lambda part: self._decode(part, edges, arrays)
-        )
+            where = "" if in_memory else f", and {estimate.pointmaps / GB:.2g} GB of pointmaps in a file"
+            announce(needed, self.budget, where)
+        unseen = np.setdiff1d(edges[missing], list(self.features))
+        self._in_batches("encode images", unseen, self._encode)
+
+        def decode(rows: Int[ndarray, " b"]) -> None:
+            self._decode(rows, edges, arrays)
+            predictions.release()
+
+        self._in_batches("predict pairs", np.array(missing, dtype=np.int64), decode)
         if self.cache is not None:
             self.cache.prune()
-        return PairPredictions(
-            edges,
-            *arrays,
-            images=self.names,
-            colors=self.images.colors,
-            intrinsics=self.images.intrinsics,
-            grid=self.images.grid,
-            is_metric=self.loaded.is_metric,
-        )
+        return predictions
 
-    def _announce(self, estimate: MemoryEstimate, in_memory: bool) -> None:
-        """What memory the work will take, before it starts."""
-        taken = estimate.weights + estimate.features + self.batch * estimate.per_pair
-        taken += estimate.pointmaps if in_memory else 0
-        where = "" if in_memory else f", and {estimate.pointmaps / GB:.2g} GB of pointmaps in a file"
-        sys.stderr.write(
-            f"memory: about {taken / GB:.2g} GB beside the program itself{where}; the budget is "
-            f"{self.budget / GB:.2g} GB\n"
-        )
+    def _plan(self, estimate: MemoryEstimate, pairs: int) -> tuple[bool, int]:
+        """Whether the pointmaps are kept in memory and how much of it will be needed; sets the size of a batch.
+
+        Pointmaps that would fill half the budget, or leave too little for the rest, lie in a file that the system
+        pages in and out. Raises InputError when not even one pair at a time fits.
+        """
+        count, height, width = self.images.colors.shape[:3]
+        program = self.program + ALLOWANCE
+        afterwards = memory_after(count, pairs, height * width) if self.aligned else 0
+        on_cpu = self.device.type == "cpu"
+        least = program + max(estimate.one_pair if on_cpu else 0, afterwards)
+        require(least, self.budget, "one pair of images, with the program itself,")
+        in_memory = estimate.pointmaps <= min(self.budget / 2, self.budget - least)
+        stays = estimate.weights + estimate.features
+        if on_cpu:
+            stays += program + in_memory * estimate.pointmaps
+        else:
+            require(estimate.one_pair, self.budget, f"one pair of images on the {self.device}")
+        self.batch = min(int((self.budget - stays) // estimate.per_pair), MAX_BATCH[self.device.type])
+        return in_memory, least + in_memory * estimate.pointmaps
 
     def _pair_key(self, edge: list[int]) -> str:
         made_by = f"{self.key} {self.device.type}".encode()
@@ -232,6 +258,7 @@ class _Predictor:
                 fits = True
             if fits:
                 done += len(part)
+                relieve(self.budget)
                 self.progress(stage, done / len(rows))
             else:
                 # Outside of the except clause, whose traceback keeps the tensors of the failed batch alive.
@@ -275,4 +302,11 @@ def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
     if in_memory:
         return np.empty(shape, np.float32)
     with tempfile.TemporaryFile() as stream:
+        try:  # to write on a full disk through a mapping would kill the process
+            os.posix_fallocate(stream.fileno(), 0, 4 * math.prod(shape))
+        except OSError as error:
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for pointmaps that do not fit --memory-gb ({error.strerror}); make "
+                "room, name another folder in TMPDIR, or raise --memory-gb"
+            ) from None
         return np.memmap(stream, np.float32, "w+", shape=shape)

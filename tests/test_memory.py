@@ -1,0 +1,146 @@
+"""The budget of `--memory-gb` is one of the peak resident set, and is kept by the whole process."""
+
+import errno
+import json
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+
+from jcr.bench.align import CHILD
+from jcr.bench.pairs import random_network
+from jcr.bench.synthetic_pairs import synthetic_pairs
+from jcr.cli import dispatch
+from jcr.errors import InputError
+from jcr.memory import GB, give_back, resident
+from jcr.reconstruct.dust3r import predict
+from jcr.reconstruct.dust3r.align import align
+from jcr.reconstruct.dust3r.matches import tracks_from_pairs
+from jcr.reconstruct.dust3r.pairs import (
+    PairPredictions,
+    complete_pairs,
+    pairs_from_arrays,
+    read_arrays,
+    write_pairs,
+)
+
+TINY = {"enc_embed_dim": 32, "enc_depth": 1, "enc_num_heads": 2, "dec_embed_dim": 32, "dec_depth": 1}
+TINY |= {"dec_num_heads": 2}
+SIDE = 320
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten pictures of noise, whose pairs make 0.29 GB of pointmaps, and weights beside them."""
+    folder = tmp_path_factory.mktemp("capture")
+    rng = np.random.default_rng(0)
+    frames = []
+    for k in range(10):
+        Image.fromarray(rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)).save(folder / f"{k}.png")
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
+    network = random_network(TINY)
+    save_file(
+        {key: value.contiguous() for key, value in network.state_dict().items()}, folder / "model.safetensors"
+    )
+    config = TINY | {"only_size": [SIDE, SIDE], "licence": "none"}
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def refusal(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> float:
+    """The budget that a command asks for when it is given too little."""
+    assert dispatch([*arguments, "--memory-gb", "0.1"]) == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
+    assert len(error) == 1 and "--memory-gb 0.1" in error[0]
+    found = re.search(r"raise --memory-gb to ([\d.]+)", error[0])
+    assert found is not None
+    return float(found[1])
+
+
+def test_a_network_keeps_the_least_budget_that_is_not_refused(capture: Path, tmp_path: Path) -> None:
+    arguments = ["predict", str(capture), str(tmp_path / "pairs.npz"), "--weights", str(capture)]
+    arguments += ["--pair-graph", "complete", "--device", "cpu", "--cache-gb", "0"]
+
+    def in_a_process(budget_gb: float) -> tuple[int, str]:
+        command = [sys.executable, "-c", CHILD, *arguments, "--memory-gb", str(budget_gb)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        return done.returncode, done.stderr
+
+    status, text = in_a_process(0.1)
+    least = re.search(r"raise --memory-gb to ([\d.]+)", text)
+    assert status == 2 and least is not None
+    status, text = in_a_process(float(least[1]))
+    assert status == 0, text
+    said, high = re.search(r"about ([\d.]+) GB", text), re.search(r"VmHWM:\s+(\d+) kB", text)
+    assert "0.29 GB of pointmaps in a file" in text and said is not None and high is not None
+    peak_gb = 1024 * int(high[1]) / GB
+    assert peak_gb <= min(float(least[1]), float(said[1]) + 0.01)
+    assert peak_gb + 0.29 > float(least[1]), "with the pointmaps in memory it would have passed the budget"
+    with zipfile.ZipFile(tmp_path / "pairs.npz") as archive:
+        assert archive.testzip() is None
+
+
+def test_a_back_end_without_network_names_the_budget_it_needs(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["run", str(capture), str(tmp_path / "out"), "--device", "cpu"]
+    assert 0.5 < refusal([*run, "--backend", "colmap"], capsys) < 2
+    assert 0.5 < refusal([*run, "--backend", "marker", "--board", "chessboard:9x6:0.025"], capsys) < 2
+    assert 0.5 < refusal([*run, "--backend", "dust3r", "--weights", str(capture)], capsys) < 2
+    assert not (tmp_path / "out" / "calibration.json").exists()
+
+
+def test_pointmaps_in_a_file_leave_the_resident_set(tmp_path: Path) -> None:
+    shape = (100, 256, 256)
+    points, conf = predict._new_array((*shape, 3), False), predict._new_array(shape, False)
+    pairs = PairPredictions(np.tile([[0, 1]], (100, 1)), points, conf, points, conf)
+    give_back()
+    before = resident()
+    for row in range(100):
+        points[row] = 1.0
+    assert resident() - before > 0.9 * points.nbytes
+    pairs.release()
+    assert resident() - before < 0.1 * points.nbytes
+    before = resident()
+    write_pairs(tmp_path / "pairs.npz", pairs)
+    assert resident() - before < 0.1 * points.nbytes and points[99].min() == 1.0
+
+
+def test_pairs_left_in_their_file_align_and_match_to_the_same_bits(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.npz"
+    pairs, _ = synthetic_pairs(complete_pairs(5), (64, 48))
+    write_pairs(path, pairs)
+    made = []
+    for limit in (np.inf, 0.0):
+        read = pairs_from_arrays(read_arrays(path, limit), str(path))
+        assert isinstance(read.pts3d, np.memmap) == (limit == 0)
+        alignment = align(read)
+        tracks = tracks_from_pairs(read, alignment.points_in_recon(), lambda x: x)
+        made.append((alignment.depth, alignment.confidence, alignment.recon_from_camera, tracks.x_px))
+    for one, other in zip(*made, strict=True):
+        np.testing.assert_array_equal(one, other)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="no readable npz"):
+        read_arrays(path, 0.0)
+
+
+def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(InputError, match="no room for pointmaps.*TMPDIR"):
+        predict._new_array((4, 4), False)
