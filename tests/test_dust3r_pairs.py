@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from jcr import memory
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.reconstruct.dust3r import predict
@@ -94,6 +95,7 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
     flipped.write_bytes(content)
     cut.write_bytes(cut.read_bytes()[:-1])
     poses = np.tile(np.eye(4), (4, 1, 1))
+    memory._say.cache_clear()
     third, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))
     assert sum(decoded) == 14
     assert notes == (f"2 of the pairs in the cache {tmp_path} were damaged: predicted again",)

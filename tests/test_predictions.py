@@ -206,7 +206,7 @@ def test_a_network_gives_the_same_record(
     """The dust3r back end around synthetic predictions on the grid it prepared."""
     made = pairs_from_arrays(pair_arrays(truth), "synthetic")
 
-    def predict(capture: Capture, options: backend.Dust3rOptions, progress: object) -> tuple:
+    def predict(capture: Capture, options: object, progress: object, *, aligned: bool) -> tuple:
         images = predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
         return images, made, ("weights X: licence Y",)
 

@@ -42,8 +42,8 @@ def relieve(budget: float) -> None:
 
 
 def announce(needed: int, budget: float, beside: str = "") -> None:
-    """Say what work will take (bytes), before it starts."""
-    sys.stderr.write(
+    """Say what work will take (bytes), before it starts; the same is not said twice, of many captures in a row."""
+    _say(
         f"memory: about {needed / GB:.2g} GB, the program included{beside}; the budget is {budget / GB:.2g} GB\n"
     )
 
@@ -56,6 +56,11 @@ def require(needed: int, budget: float, what: str) -> None:
             f"--memory-gb {budget / GB:.2g}: {what} needs {needed / GB:.2g} GB; raise --memory-gb to {least:g}, or "
             "use smaller images"
         )
+
+
+@cache
+def _say(line: str) -> None:
+    sys.stderr.write(line)
 
 
 @cache

@@ -19,7 +19,7 @@ from jcr.memory import GB
 from jcr.simulate.capture import SimulateOptions, simulate
 
 IMAGES = (8, 20, 40)
-WIDTH = 320
+WIDTH = 240
 LOOSE_GB = 8.0
 TOO_LITTLE_GB = 0.1
 SMALL = {
@@ -73,7 +73,7 @@ def run() -> str:
         for name, command, counts in jobs:
             for count in counts:
                 least = _least(command, captures[count], folder)
-                budgets = (least, LOOSE_GB) if count == counts[-1] else (least,)
+                budgets = (least, LOOSE_GB) if count == IMAGES[-1] else (least,)
                 rows += [(name, _peak(command, captures[count], folder, budget)) for budget in budgets]
     kept = sum(row.peak_gb <= row.budget_gb for _, row in rows)
     over = max(row.peak_gb / row.said_gb for _, row in rows)

@@ -138,5 +138,6 @@ def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, featu
     require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
     cores = os.cpu_count() or 1
     all_at_once = pixels * (min(cores, images) * BYTES_OF_THREAD + images * PLANES * BYTES_OF_PLANE)
-    ample = program + pictures + max(features * min(cores, images), result + max(all_at_once, MAP))
+    # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
+    ample = program + pictures + max(features * min(cores, images), result + all_at_once + MAP)
     announce(min(ample, int(budget)), budget)

@@ -76,7 +76,7 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
 def memory_after(images: int, pairs: int, pixels: int) -> int:
     """Bytes that aligning, matching and mapping pairs of `pixels` pixels take beside their pointmaps."""
     observed = min(AlignOptions.pixels, pixels)
-    return MAP + 2 * pairs * observed * OBSERVED + images * pixels * RECORDED
+    return max(MAP, 2 * pairs * observed * OBSERVED) + images * pixels * RECORDED
 
 
 def predict_pairs(
