@@ -111,9 +111,10 @@ def _capture(folder: Path, count: int) -> Path:
     content = json.loads((large / "capture.json").read_text())
     frames, lens = content["frames"][:count], content["intrinsics"]
     (small / "images").mkdir(parents=True)
+    with Image.open(large / frames[0]["image"]) as picture:
+        factor = WIDTH / picture.width
     for frame in frames:
         with Image.open(large / frame["image"]) as picture:
-            factor = WIDTH / picture.width
             size = (WIDTH, round(picture.height * factor))
             picture.resize(size, Image.Resampling.BOX).save(small / frame["image"], quality=95)
     lens |= {name: lens[name] * factor for name in ("fx", "fy")}

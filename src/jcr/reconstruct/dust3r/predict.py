@@ -59,7 +59,11 @@ class MemoryEstimate:
 
 def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width: int) -> MemoryEstimate:
     """What predicting `pairs` pairs of `images` images of height x width pixels will take."""
-    weights = sum(tensor.numel() * tensor.element_size() for tensor in network.parameters())
+    # In main memory the convolutions are there twice, as they are laid out and in the file that is mapped.
+    twice = network.device.type == "cpu"
+    weights = sum(
+        x.numel() * x.element_size() * (2 if twice and x.ndim == 4 else 1) for x in network.parameters()
+    )
     pixels, tokens = height * width, height * width // PATCH**2
     enc_dim, dec_dim = network.decoder_embed.in_features, network.decoder_embed.out_features
     # Every layer of both views is kept for the heads; a block works on about 12 arrays of its width.
