@@ -14,6 +14,9 @@ from jcr.reconstruct.lens import pinhole_inside, rays, undistort_image
 from jcr.reconstruct.views import PLANES, choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
+BYTES_OF_FEATURES_FOUND = 5_000_000
+"""Per image: features, matches and tracks in structure from motion and bundle adjustment."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DenseOptions:
@@ -131,7 +134,7 @@ def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, featu
     pixels = int(width * height * min(1.0, options.pointmap_size_px / max(size)) ** 2)
     program = resident() + ALLOWANCE
     pictures = 3 * width * height * images
-    result = images * pixels * BYTES_OF_RESULT
+    result = images * (pixels * BYTES_OF_RESULT + BYTES_OF_FEATURES_FOUND)
     one = pixels * (BYTES_OF_THREAD + PLANES * BYTES_OF_PLANE)
     budget = options.memory_gb * GB
     least = program + pictures + max(features, result + max(one, MAP))

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from jcr.geometry import inverse
-from jcr.memory import GB, relieve, resident
+from jcr.memory import ALLOWANCE, GB, relieve, resident
 from jcr.reconstruct.lens import rays, resized
 from jcr.records import Intrinsics
 
@@ -131,7 +131,7 @@ def plane_sweep(
     threads, together = torch.get_num_threads(), m
     if device.type == "cpu":
         pixels = pinhole.width * pinhole.height
-        room = options.memory_gb * GB - resident() - m * pixels * BYTES_OF_RESULT
+        room = options.memory_gb * GB - resident() - ALLOWANCE - m * pixels * BYTES_OF_RESULT
         threads = max(1, min(threads, int(room / 2 // (pixels * BYTES_OF_THREAD))))
         room -= threads * pixels * BYTES_OF_THREAD
         together = max(1, min(m, int(room // (pixels * sweep.shape[1] * BYTES_OF_PLANE))))
