@@ -8,7 +8,6 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.calibrate.bundle import adjust, median_reprojection
-from jcr.calibrate.pose_fit import widening
 from jcr.calibrate.projection import parameters, project, project_derivatives
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.observations import LENS, observed
@@ -100,8 +99,7 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
         adjusted = solved(problem, observed(problem, rng, 80, 0.3))
         missed = error(problem, adjusted.bundle.gripper_from_camera, adjusted.scale)
-        covariance = adjusted.covariance * widening(adjusted.degrees_of_freedom, 10)
-        inside += missed @ np.linalg.solve(covariance, missed) < chi2.ppf(0.95, 7)
+        inside += missed @ np.linalg.solve(adjusted.covariance, missed) < chi2.ppf(0.95, 7)
         estimates.append(adjusted.noise)
     assert inside / runs >= 0.88
     assert np.mean(estimates, axis=0) == pytest.approx(noise, rel=0.2)

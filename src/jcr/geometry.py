@@ -65,6 +65,15 @@ def inverse(a_from_b: Transforms) -> Transforms:
     return transform(rotation_t, -(rotation_t @ a_from_b[..., :3, 3:])[..., 0])
 
 
+def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
+    """Matrices that take twists (v, ω) in b axes to a axes."""
+    out = np.zeros((len(a_from_b), 6, 6))
+    rotation = a_from_b[:, :3, :3]
+    out[:, :3, :3] = out[:, 3:, 3:] = rotation
+    out[:, :3, 3:] = skew(a_from_b[:, :3, 3]) @ rotation
+    return out
+
+
 def apply(a_from_b: Float[ndarray, "4 4"], x_in_b: Vectors) -> Vectors:
     """x_in_a for points (...,3) under one rigid transform (4,4)."""
     return x_in_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]

@@ -64,6 +64,20 @@ def residuals(
     return residual, j
 
 
+def residuals_by_camera(
+    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
+) -> Float[ndarray, "n 6 6"]:
+    """Derivative of `residuals` by the twist (v, ω) of each camera, T ← [exp(ω) R, exp(ω) c + v]."""
+    base_from_recon = z[:3, :3]
+    predicted = predict(x, scale, z, recon_from_camera)[:, :3, :3]
+    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
+    j = np.zeros((len(predicted), 6, 6))
+    j[:, :3, :3] = scale * base_from_recon
+    j[:, :3, 3:] = -base_from_recon @ skew(scale * recon_from_camera[:, :3, 3] - lever)
+    j[:, 3:, 3:] = np.swapaxes(predicted, 1, 2) @ base_from_recon
+    return j
+
+
 def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"], noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibrate.pose_fit import robot_noise
+from jcr.calibrate.noise import noise_share, robot_noise, widened
 from jcr.calibrate.projection import parameters, project, project_derivatives
 from jcr.geometry import apply, fit_similarity, inverse, rotation_exp, rotation_log, transform
 from jcr.records import Intrinsics, Tracks
@@ -50,10 +50,9 @@ class Adjusted:
     """Metres per recon unit."""
     base_from_recon: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "7 7"]
-    """Before widening for the estimated noise; records.COVARIANCE_ORDER."""
+    """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     noise: tuple[float, float]
     sigma_px: float
-    degrees_of_freedom: tuple[float, float]
     robot_residual: Float[ndarray, "m 6"]
     """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
     robot_hat: Float[ndarray, "m 6 6"]
@@ -139,7 +138,6 @@ def adjust(
         parameters(intrinsics),
     )
     robot = noise or (1e-3, np.radians(0.2))
-    dof = (np.inf, np.inf)
     view = _view(bundle, problem)
     sigma_px = _sigma_px(view, problem)
     damping, total = 1e-4, 0
@@ -153,11 +151,11 @@ def adjust(
         sigma_px = _sigma_px(view, problem)
         if noise is None:
             normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
-            robot, dof = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot)
+            robot = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot)
         change = np.abs(np.log(np.array([*robot, sigma_px]) / before)).max()
         if change < 0.01:
             break
-    return _summary(bundle, problem, robot, sigma_px, dof, tracks.points_in_recon[kept], total)
+    return _summary(bundle, problem, robot, noise is None, sigma_px, tracks.points_in_recon[kept], total)
 
 
 def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
@@ -346,8 +344,8 @@ def _robot_noise(
     problem: _Problem,
     covariance: Float[ndarray, "d d"],
     robot: tuple[float, float],
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Restricted maximum likelihood of the robot's noise, one step, with its degrees of freedom."""
+) -> tuple[float, float]:
+    """Restricted maximum likelihood of the robot's noise, one step."""
     told = _robot_residual(bundle, problem.reported)
     m = len(told)
     spread = np.diag(covariance)[-6 * m :].reshape(m, 6)
@@ -356,15 +354,15 @@ def _robot_noise(
         max(3 * m - float(spread[:, :3].sum()) / robot[0] ** 2, 0.1),
         max(3 * m - float(spread[:, 3:].sum()) / robot[1] ** 2, 0.1),
     )
-    return robot_noise(squares, dof, robot), dof
+    return robot_noise(squares, dof, robot)
 
 
 def _summary(
     bundle: Bundle,
     problem: _Problem,
     robot: tuple[float, float],
+    estimated: bool,
     sigma_px: float,
-    dof: tuple[float, float],
     points_in_recon: Float[ndarray, "p 3"],
     iterations: int,
 ) -> Adjusted:
@@ -397,6 +395,12 @@ def _summary(
     covariance[:6, 6] = covariance[6, :6] = cross[:6]
     covariance[6, 6] = variance - coupling @ cross
 
+    # How errors of the reported poses pass into the seven, and what is told of them once all is adjusted.
+    precision = np.tile(np.repeat(np.asarray(robot) ** -2.0, 3), m)
+    of_gripper = camera_covariance[:, -6 * m :]
+    gain = np.concatenate([of_gripper[:6], -coupling[None] @ of_gripper]) * precision
+    told = np.diag(precision) - precision[:, None] * of_gripper[-6 * m :] * precision
+
     hat = np.stack(
         [camera_covariance[i : i + 6, i : i + 6] for i in range(len(cross) - 6 * m, len(cross), 6)]
     )
@@ -405,10 +409,9 @@ def _summary(
         bundle,
         scale,
         base_from_recon,
-        covariance,
+        widened(covariance, noise_share(gain, told, robot, estimated)),
         robot,
         sigma_px,
-        dof,
         _robot_residual(bundle, problem.reported),
         hat / sigma[:, None] / sigma[None],
         problem,

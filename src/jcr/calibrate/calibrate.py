@@ -11,7 +11,7 @@ from jcr.calibrate.conventions import better_reading, explained
 from jcr.calibrate.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibrate.given_lens import LensDoubt, lens_doubt
 from jcr.calibrate.hand_eye import judged, solve_hand_eye
-from jcr.calibrate.pose_fit import Cues, deleted_residuals, widening
+from jcr.calibrate.pose_fit import Cues, deleted_residuals
 from jcr.calibrate.residuals import paper_residuals
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
@@ -251,7 +251,7 @@ def _refined(
         gripper_from_camera=x,
         scale=adjusted.scale,
         base_from_recon=adjusted.base_from_recon,
-        covariance=adjusted.covariance * widening(adjusted.degrees_of_freedom, int(used.sum())),
+        covariance=adjusted.covariance,
         translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
         rotation_residual_rad=rotation_angle(turn),
         robot_noise=RobotNoise(*adjusted.noise, estimated=hand_eye.robot_noise.estimated),

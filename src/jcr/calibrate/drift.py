@@ -15,20 +15,22 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 from scipy.stats import chi2, f, ncf, ncx2
 
-from jcr.calibrate.pose_fit import (
+from jcr.calibrate.noise import degrees_of_freedom
+from jcr.calibrate.pose_fit import PoseFit
+from jcr.geometry import adjoint, rotation_exp, rotation_log, transform
+from jcr.information import (
     BASE_ROTATION,
     BASE_TRANSLATION,
-    REACH_WEIGHT,
     ROTATION,
     TRANSLATION,
-    PoseFit,
     Poses,
     residuals,
+    residuals_by_camera,
 )
-from jcr.geometry import rotation_exp, rotation_log, transform
 
 CLEAR = 10.0
 """Difference of −2 log likelihoods by which one explanation is preferred to the other (odds of 150 to 1)."""
@@ -68,8 +70,7 @@ def drift(
     _, scene_misfit = _moved_by(
         calibrated, base_from_gripper, recon_from_camera, camera_covariance, (BASE_TRANSLATION, BASE_ROTATION)
     )
-    offset, covariance = camera
-    nu = min(calibrated.degrees_of_freedom) + REACH_WEIGHT
+    offset, covariance, nu = camera
     more = 6 * (len(base_from_gripper) - 1)
     difference = camera_misfit - scene_misfit
     return Drift(
@@ -106,29 +107,34 @@ def _moved_by(
     recon_from_camera: Poses,
     camera_covariance: Float[ndarray, "n 6 6"],
     columns: tuple[slice, slice],
-) -> tuple[tuple[Float[ndarray, "6"], Float[ndarray, "6 6"]], float]:
-    """Generalised least squares for a motion of X or of base_from_recon: the motion, its covariance, the misfit."""
+) -> tuple[tuple[Float[ndarray, "6"], Float[ndarray, "6 6"], float], float]:
+    """Generalised least squares for a motion of X or of base_from_recon: the motion, its covariance and the degrees
+    of freedom behind that, and the misfit."""
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns[0] == TRANSLATION
-    sigma = np.repeat(calibrated.noise, 3)
-    spread = np.linalg.inv(calibrated.hessian)
+    spread, share_of_noise = np.linalg.inv(calibrated.hessian), calibrated.noise_share
     start = (x if of_x else z).copy()
     n = 6 * len(base_from_gripper)
-    normal, misfit = np.eye(6), 0.0
+    own = np.tile(np.repeat(np.diag(np.square(calibrated.noise)), 3, axis=1), len(base_from_gripper))
+    own = own[:, None] * np.eye(n)
+    normal, misfit, nu = np.eye(6), 0.0, np.inf
     for _ in range(10):
         residual, jacobian = residuals(x, scale, z, base_from_gripper, recon_from_camera)
         residual = residual.ravel()
-        by_camera = _by_camera(x, scale, z, base_from_gripper, recon_from_camera)
-        of_image = by_camera @ camera_covariance @ np.swapaxes(by_camera, 1, 2) + np.diag(sigma**2)
+        by_camera = residuals_by_camera(x, scale, z, recon_from_camera) @ adjoint(recon_from_camera)
+        of_camera = by_camera @ camera_covariance @ np.swapaxes(by_camera, 1, 2)
         stacked = jacobian.reshape(n, 13)
-        v = stacked @ spread @ stacked.T
-        for k, block in enumerate(of_image):
-            v[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
+        v = stacked @ spread @ stacked.T + own.sum(0) + block_diag(*of_camera)
         design = np.concatenate([stacked[:, part] for part in columns], axis=1)
         weighted = np.linalg.solve(v, np.c_[design, residual])
         normal, misfit = design.T @ weighted[:, :6], float(residual @ weighted[:, 6])
         step = -np.linalg.solve(normal, design.T @ weighted[:, 6])
         misfit -= float(step @ normal @ step)
+        # Of the drift's variance, what hangs on each of the robot's noises, in the old images and in the new.
+        of_noise = stacked @ share_of_noise.by_log_variance @ stacked.T + own
+        passed = weighted[:, :6].T @ of_noise @ weighted[:, :6]
+        share = np.trace(np.linalg.solve(normal, passed), axis1=1, axis2=2) / 6
+        nu = float(degrees_of_freedom(share, share_of_noise.log_variance_covariance))
         moved = x if of_x else z
         moved = transform(rotation_exp(step[3:]) @ moved[:3, :3], moved[:3, 3] + step[:3])
         x, z = (moved, z) if of_x else (x, moved)
@@ -136,24 +142,4 @@ def _moved_by(
             break
     now = x if of_x else z
     offset = np.r_[now[:3, 3] - start[:3, 3], rotation_log(now[:3, :3] @ start[:3, :3].T)]
-    return (offset, np.linalg.inv(normal)), max(misfit, 0.0)
-
-
-def _by_camera(
-    x: Float[ndarray, "4 4"],
-    scale: float,
-    z: Float[ndarray, "4 4"],
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-) -> Float[ndarray, "n 6 6"]:
-    """Derivative of the residuals by motions of the cameras, by central differences."""
-    step, out = 1e-5, np.zeros((len(base_from_gripper), 6, 6))
-    for k, motion in enumerate(step * np.eye(6)):
-        ahead, behind = (
-            residuals(
-                x, scale, z, base_from_gripper, recon_from_camera @ transform(rotation_exp(m[3:]), m[:3])
-            )[0]
-            for m in (motion, -motion)
-        )
-        out[:, :, k] = (ahead - behind) / (2 * step)
-    return out
+    return (offset, np.linalg.inv(normal), nu), max(misfit, 0.0)

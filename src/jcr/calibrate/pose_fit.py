@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.stats import chi2, f
 
-from jcr.geometry import rotation_exp, skew, transform
+from jcr.calibrate.noise import NoiseShare, noise_share, robot_noise, widened
+from jcr.geometry import rotation_exp, transform
 from jcr.information import (
     BASE_ROTATION,
     BASE_TRANSLATION,
@@ -25,17 +25,9 @@ from jcr.information import (
     ROTATION,
     TRANSLATION,
     Poses,
-    predict,
     residuals,
+    residuals_by_camera,
 )
-from jcr.records import REACH
-
-NOISE_FLOOR = (2e-5, np.radians(0.002))
-"""m, rad; so that a perfect fit does not claim a perfect robot."""
-REACH_WEIGHT = 5.0
-"""The relation σ_t ≈ REACH · σ_r counts as so many observations. A lens that is slightly off disturbs positions
-more than orientations, and few images do not tell the two noises apart: without it, real captures trust
-positions too much."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +55,10 @@ class PoseFit:
     """σ_t (m) and σ_r (rad) per axis, given or estimated."""
     degrees_of_freedom: tuple[float, float]
     """Of the two estimates; infinite when the noise was given."""
-    poses_used: int
     hessian: Float[ndarray, "13 13"]
     """Of the negative log likelihood, prior included."""
+    noise_share: NoiseShare
+    """In the inverse of `hessian`."""
     missed: Float[ndarray, "n 6"]
     """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
     missed_covariance: Float[ndarray, "n 6 6"]
@@ -74,30 +67,9 @@ class PoseFit:
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """Covariance in records.COVARIANCE_ORDER, widened for an estimated noise."""
-        return np.linalg.inv(self.hessian)[:7, :7] * widening(self.degrees_of_freedom, self.poses_used)
-
-
-def widening(degrees_of_freedom: tuple[float, float], poses: int) -> float:
-    """Factor on a 7×7 covariance whose two variances were estimated, with so many degrees of freedom, from `poses`.
-
-    A squared Mahalanobis distance then follows 7·F(7, ν), not χ²(7); the factor makes the 95 % ellipsoid that
-    users draw from a covariance hold 95 %. The tie between the variances adds nothing to ν: it tells their ratio,
-    and of how large both are the residuals alone speak. Where known errors of cameras or features explain a share s
-    of the residuals, the noise has 1 - s of their degrees, but also 1 - s of the covariance hangs on it: in
-    Satterthwaite's approximation (Biometrics Bulletin 2, 1946) ν is then that of all residuals, 6 a pose less 13.
-    """
-    nu = max(sum(degrees_of_freedom), 6 * poses - 13)
-    return 1.0 if np.isinf(nu) else float(7 * f.ppf(0.95, 7, nu) / chi2.ppf(0.95, 7))
-
-
-def robot_noise(
-    squares: tuple[float, float], degrees_of_freedom: tuple[float, float], before: tuple[float, float]
-) -> tuple[float, float]:
-    """σ_t and σ_r from sums of squared residuals (m², rad²), tied to each other by the arm's reach."""
-    weight = REACH_WEIGHT
-    sigma_t = np.sqrt((squares[0] + weight * (REACH * before[1]) ** 2) / (degrees_of_freedom[0] + weight))
-    sigma_r = np.sqrt((squares[1] + weight * (before[0] / REACH) ** 2) / (degrees_of_freedom[1] + weight))
-    return max(float(sigma_t), NOISE_FLOOR[0]), max(float(sigma_r), NOISE_FLOOR[1])
+        share = self.noise_share
+        of_seven = NoiseShare(share.by_log_variance[:, :7, :7], share.log_variance_covariance)
+        return widened(np.linalg.inv(self.hessian)[:7, :7], of_seven)
 
 
 def deleted_residuals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
@@ -145,8 +117,8 @@ def fit_poses(
         system.residual[:, 3:],
         robot,
         dof,
-        int(used.sum()),
         system.hessian,
+        noise_share(*system.passed_on(), robot, estimated=noise is None),
         missed,
         missed_covariance,
     )
@@ -182,6 +154,13 @@ class _System:
         explained = by_unknown @ np.linalg.inv(self.hessian) @ np.swapaxes(by_unknown, 1, 2)
         return self.weighed(self.residual[self.used].ravel()).reshape(m, 6), own - explained
 
+    def passed_on(self) -> tuple[Float[ndarray, "13 r"], Float[ndarray, "r r"]]:
+        """H⁻¹ Jᵀ W, by which errors of the used poses pass into the unknowns, and P = W - W J H⁻¹ Jᵀ W."""
+        by_unknown = self.weighed(self.jacobian[self.used].reshape(-1, 13))
+        gain = np.linalg.solve(self.hessian, by_unknown.T)
+        weight = np.diag(self.weight) if self.weight.ndim == 1 else self.weight
+        return gain, weight - by_unknown @ gain
+
 
 def _system(
     unknowns: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],
@@ -197,7 +176,7 @@ def _system(
     spread, weight = None, 1.0 / variance
     if camera_covariance is not None:
         n = len(used)
-        by_camera = _by_camera(*unknowns, recon_from_camera)
+        by_camera = residuals_by_camera(*unknowns, recon_from_camera)
         blocks = camera_covariance.reshape(n, 6, n, 6).swapaxes(1, 2)
         spread = by_camera[:, None] @ blocks @ np.swapaxes(by_camera, 1, 2)
         spread = spread.swapaxes(1, 2).reshape(6 * n, 6 * n)
@@ -250,20 +229,6 @@ def _missed(
         missed[i] = residual
         covariance[i] = own_spread + jacobian @ inverse_hessian @ jacobian.T
     return missed, covariance
-
-
-def _by_camera(
-    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
-) -> Float[ndarray, "n 6 6"]:
-    """Derivative of the residuals by the twist (v, ω) of each camera, T ← [exp(ω) R, exp(ω) c + v]."""
-    base_from_recon = z[:3, :3]
-    predicted = predict(x, scale, z, recon_from_camera)[:, :3, :3]
-    lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
-    j = np.zeros((len(predicted), 6, 6))
-    j[:, :3, :3] = scale * base_from_recon
-    j[:, :3, 3:] = -base_from_recon @ skew(scale * recon_from_camera[:, :3, 3] - lever)
-    j[:, 3:, 3:] = np.swapaxes(predicted, 1, 2) @ base_from_recon
-    return j
 
 
 def _prior(

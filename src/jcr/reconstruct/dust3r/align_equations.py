@@ -230,12 +230,3 @@ def _isotropic(alpha: Float[ndarray, "n m"], x: Float[ndarray, "3 m"]) -> Float[
 
 def _dot(a: Float[ndarray, "k 3 m"], v: Float[ndarray, "3 m"]) -> Float[ndarray, "k m"]:
     return np.einsum("kcm,cm->km", a, v)
-
-
-def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
-    """Matrices that take twists (v, ω) in b axes to a axes."""
-    out = np.zeros((len(a_from_b), 6, 6))
-    rotation = a_from_b[:, :3, :3]
-    out[:, :3, :3] = out[:, 3:, 3:] = rotation
-    out[:, :3, 3:] = skew(a_from_b[:, :3, 3]) @ rotation
-    return out

@@ -20,10 +20,10 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import adjoint, inverse, rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.align_depth import fused_depth
-from jcr.reconstruct.dust3r.align_equations import Layout, PairTies, adjoint, image_equations
+from jcr.reconstruct.dust3r.align_equations import Layout, PairTies, image_equations
 from jcr.reconstruct.dust3r.align_observations import ImageObservations, choose_pixels, observe, weight_is_log
 from jcr.reconstruct.dust3r.align_residuals import Noise, State, measure_noise, residuals
 from jcr.reconstruct.dust3r.align_start import initial_state

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, nearest_rotation, rotation_log, scale_translation, skew, transform
+from jcr.geometry import adjoint, inverse, nearest_rotation, rotation_log, scale_translation, skew, transform
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.align_equations import Layout, adjoint
+from jcr.reconstruct.dust3r.align_equations import Layout
 from jcr.reconstruct.dust3r.align_fast import (
     FINE_TOLERANCE,
     NORMAL_SQUARE_MEDIAN,
