@@ -166,6 +166,8 @@ class RobotNoise:
     translation: float
     rotation: float
     estimated: bool
+    given: tuple[float, float] | None = None
+    """m, rad: what the user said of it; counted where the residuals say no more."""
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ class Adjusted:
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     noise: tuple[float, float]
+    noise_estimated: bool
     sigma_px: float
     robot_residual: Float[ndarray, "m 6"]
     """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
@@ -111,7 +112,7 @@ def adjust(
 ) -> Adjusted:
     """Adjust from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
-    `noise` is the robot's (m, rad), estimated with the rest when None (restricted maximum likelihood). The
+    `noise` is the robot's (m, rad), at least; it is estimated with the rest (restricted maximum likelihood). The
     lens moves only when `refine_lens`: one focal length, principal point, two radial terms.
     """
     x, scale, z = start
@@ -149,13 +150,12 @@ def adjust(
         )
         total += used
         sigma_px = _sigma_px(view, problem)
-        if noise is None:
-            normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
-            robot = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot)
+        normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
+        robot = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot, noise)
         change = np.abs(np.log(np.array([*robot, sigma_px]) / before)).max()
         if change < 0.01:
             break
-    return _summary(bundle, problem, robot, noise is None, sigma_px, tracks.points_in_recon[kept], total)
+    return _summary(bundle, problem, robot, noise, sigma_px, tracks.points_in_recon[kept], total)
 
 
 def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
@@ -344,6 +344,7 @@ def _robot_noise(
     problem: _Problem,
     covariance: Float[ndarray, "d d"],
     robot: tuple[float, float],
+    given: tuple[float, float] | None,
 ) -> tuple[float, float]:
     """Restricted maximum likelihood of the robot's noise, one step."""
     told = _robot_residual(bundle, problem.reported)
@@ -354,14 +355,14 @@ def _robot_noise(
         max(3 * m - float(spread[:, :3].sum()) / robot[0] ** 2, 0.1),
         max(3 * m - float(spread[:, 3:].sum()) / robot[1] ** 2, 0.1),
     )
-    return robot_noise(squares, dof, robot)
+    return robot_noise(squares, dof, robot, given)
 
 
 def _summary(
     bundle: Bundle,
     problem: _Problem,
     robot: tuple[float, float],
-    estimated: bool,
+    given: tuple[float, float] | None,
     sigma_px: float,
     points_in_recon: Float[ndarray, "p 3"],
     iterations: int,
@@ -409,8 +410,9 @@ def _summary(
         bundle,
         scale,
         base_from_recon,
-        widened(covariance, noise_share(gain, told, robot, estimated)),
+        widened(covariance, noise_share(gain, told, robot, given)),
         robot,
+        robot != given,
         sigma_px,
         _robot_residual(bundle, problem.reported),
         hat / sigma[:, None] / sigma[None],

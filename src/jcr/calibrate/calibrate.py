@@ -30,7 +30,7 @@ class CalibrateOptions:
     """How the hand-eye calibration is found."""
 
     robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, MM DEG; estimated from the data when left out."""
+    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
     known_height: float | None = None
     """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
     known_length: tuple[str, float, float, float, float, float] | None = None
@@ -254,7 +254,7 @@ def _refined(
         covariance=adjusted.covariance,
         translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
         rotation_residual_rad=rotation_angle(turn),
-        robot_noise=RobotNoise(*adjusted.noise, estimated=hand_eye.robot_noise.estimated),
+        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise_estimated, hand_eye.robot_noise.given),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),

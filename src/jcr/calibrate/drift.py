@@ -17,9 +17,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
-from scipy.stats import chi2, f, ncf, ncx2
+from scipy.stats import chi2, f, hmean, ncf, ncx2
 
-from jcr.calibrate.noise import degrees_of_freedom
+from jcr.calibrate.noise import NoiseShare, directions
 from jcr.calibrate.pose_fit import PoseFit
 from jcr.geometry import adjoint, rotation_exp, rotation_log, transform
 from jcr.information import (
@@ -112,7 +112,7 @@ def _moved_by(
     of freedom behind that, and the misfit."""
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns[0] == TRANSLATION
-    spread, share_of_noise = np.linalg.inv(calibrated.hessian), calibrated.noise_share
+    spread, from_old = np.linalg.inv(calibrated.hessian), calibrated.noise_share
     start = (x if of_x else z).copy()
     n = 6 * len(base_from_gripper)
     own = np.tile(np.repeat(np.diag(np.square(calibrated.noise)), 3, axis=1), len(base_from_gripper))
@@ -130,11 +130,10 @@ def _moved_by(
         normal, misfit = design.T @ weighted[:, :6], float(residual @ weighted[:, 6])
         step = -np.linalg.solve(normal, design.T @ weighted[:, 6])
         misfit -= float(step @ normal @ step)
-        # Of the drift's variance, what hangs on each of the robot's noises, in the old images and in the new.
-        of_noise = stacked @ share_of_noise.by_log_variance @ stacked.T + own
-        passed = weighted[:, :6].T @ of_noise @ weighted[:, :6]
-        share = np.trace(np.linalg.solve(normal, passed), axis1=1, axis2=2) / 6
-        nu = float(degrees_of_freedom(share, share_of_noise.log_variance_covariance))
+        gain = np.linalg.solve(normal, weighted[:, :6].T)
+        of_noise = gain @ (stacked @ from_old.by_log_variance @ stacked.T + own) @ gain.T
+        share = NoiseShare(of_noise, from_old.log_variance_covariance)
+        nu = float(hmean(directions(np.linalg.inv(normal), share)[1]))
         moved = x if of_x else z
         moved = transform(rotation_exp(step[3:]) @ moved[:3, :3], moved[:3, 3] + step[:3])
         x, z = (moved, z) if of_x else (x, moved)

@@ -20,6 +20,8 @@ MAX_NOISE = (0.02, np.radians(3.0))
 MAX_STD = (0.02, np.radians(3.0), 0.05)
 """m, rad, relative scale: an answer less certain than this is none."""
 MIN_SHARE_USED = 0.6
+SURPRISE = 1.5
+"""Times the robot noise that was given; more is worth saying."""
 
 
 def solve_hand_eye(
@@ -34,8 +36,8 @@ def solve_hand_eye(
 
     Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
     the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
-    (m, rad), estimated when None. `camera_covariance` (6n,6n) is that of the camera poses where they are not
-    exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
+    (m, rad), at least: the residuals may say more. `camera_covariance` (6n,6n) is that of the camera poses where
+    they are not exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
     counts that cannot be poses; motion that shows too little is an answer (`observability`, `converged`), not an
     exception.
     """
@@ -76,7 +78,7 @@ def solve_hand_eye(
         translation_residual_m=np.linalg.norm(fit.translation_residual, axis=1)[back],
         rotation_residual_rad=np.linalg.norm(fit.rotation_residual, axis=1)[back],
         observability=seen,
-        robot_noise=RobotNoise(fit.noise[0], fit.noise[1], estimated=robot_noise is None),
+        robot_noise=RobotNoise(*fit.noise, fit.noise_estimated, robot_noise),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         converged=False,
@@ -127,6 +129,15 @@ def _doubts(hand_eye: HandEye):
 
 def _remarks(hand_eye: HandEye):
     """What a user should know of an answer that may still be trusted."""
+    noise = hand_eye.robot_noise
+    if noise.given is not None and (
+        noise.translation > SURPRISE * noise.given[0] or noise.rotation > SURPRISE * noise.given[1]
+    ):
+        yield (
+            f"gripper poses and pictures disagree by {1e3 * noise.translation:.2g} mm and "
+            f"{np.degrees(noise.rotation):.2g}° per axis, more than the robot noise that was given "
+            f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
+        )
     held_out = hand_eye.held_out
     if held_out is not None:
         typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.translation

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.linalg import eigh
 from scipy.stats import chi2, f
 
 from jcr.records import REACH
@@ -33,6 +32,9 @@ RATIO_STD = np.log(2.0)
 """Of log(σ_t / (REACH · σ_r)) over robots. The estimate leans on the relation more than this allows; how sure the
 estimate is may not, or three images of a robot of another ratio cover 79 % where 95 % are promised."""
 COVERED = 0.95
+MANY, FEWEST = 1e9, 1.0
+"""Degrees of freedom where the noise was given, and where next to nothing tells it."""
+RELATIVE_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -42,55 +44,75 @@ class NoiseShare:
     by_log_variance: Float[ndarray, "2 k k"]
     """Derivatives of the covariance by log σ_t² and log σ_r²: its parts that hang on each."""
     log_variance_covariance: Float[ndarray, "2 2"]
-    """Of the estimates of log σ_t² and log σ_r²; zero where the noise was given."""
+    """Of the estimates of log σ_t² and log σ_r²; zero where a given noise explains the residuals."""
 
 
 def robot_noise(
-    squares: tuple[float, float], degrees_of_freedom: tuple[float, float], before: tuple[float, float]
+    squares: tuple[float, float],
+    degrees_of_freedom: tuple[float, float],
+    before: tuple[float, float],
+    given: tuple[float, float] | None = None,
 ) -> tuple[float, float]:
-    """σ_t and σ_r from sums of squared residuals (m², rad²), tied to each other by the arm's reach."""
+    """σ_t and σ_r from sums of squared residuals (m², rad²), tied to each other by the arm's reach.
+
+    Where a noise is given, no less than that, but more where the residuals say so: in them are errors of cameras and
+    of wrong poses besides the robot's, and a covariance that left these out would be too small.
+    """
     weight = REACH_WEIGHT
     sigma_t = np.sqrt((squares[0] + weight * (REACH * before[1]) ** 2) / (degrees_of_freedom[0] + weight))
     sigma_r = np.sqrt((squares[1] + weight * (before[0] / REACH) ** 2) / (degrees_of_freedom[1] + weight))
-    return max(float(sigma_t), NOISE_FLOOR[0]), max(float(sigma_r), NOISE_FLOOR[1])
+    least = NOISE_FLOOR if given is None else given
+    return max(float(sigma_t), least[0]), max(float(sigma_r), least[1])
 
 
 def noise_share(
-    gain: Float[ndarray, "k r"], told: Float[ndarray, "r r"], robot: tuple[float, float], estimated: bool
+    gain: Float[ndarray, "k r"],
+    told: Float[ndarray, "r r"],
+    robot: tuple[float, float],
+    given: tuple[float, float] | None,
 ) -> NoiseShare:
     """From how errors of the reported poses (r = 6 times their number) pass into k unknowns, and P of the fit.
 
     P = W - W J H⁻¹ Jᵀ W is `told`; the information of log σ_k² is ½ tr(P V_k P V_l), V_k the part of the residuals'
-    covariance that is the robot's (Searle et al., "Variance components", 1992, section 6.6).
+    covariance that is the robot's (Searle et al., "Variance components", 1992, section 6.6). A given noise that
+    explains the residuals (χ² test at 5 %) is known.
     """
-    sigma = np.tile(np.repeat(robot, 3), len(told) // 6)
-    scaled = (gain * sigma).reshape(len(gain), -1, 2, 3)
-    share = np.einsum("kmca,lmca->ckl", scaled, scaled)
-    if not estimated:
-        return NoiseShare(share, np.zeros((2, 2)))
-    squares = (sigma[:, None] * told * sigma) ** 2
     m = len(told) // 6
-    information = squares.reshape(m, 2, 3, m, 2, 3).sum((0, 2, 3, 5)) / 2
+    sigma = np.tile(np.repeat(robot, 3), m)
+    scaled = (gain * sigma).reshape(len(gain), m, 2, 3)
+    share = np.einsum("kmca,lmca->ckl", scaled, scaled)
+    told = sigma[:, None] * told * sigma
+    degrees = np.diag(told).reshape(m, 2, 3).sum((0, 2))
+    if given is not None and chi2.sf(degrees @ (np.divide(robot, given) ** 2), degrees.sum()) > 1 - COVERED:
+        return NoiseShare(share, np.zeros((2, 2)))
+    information = (told**2).reshape(m, 2, 3, m, 2, 3).sum((0, 2, 3, 5)) / 2
     # log(σ_t² / σ_r²) has twice the standard deviation of log(σ_t / σ_r).
-    information += np.array([[1, -1], [-1, 1]]) / (2 * RATIO_STD) ** 2
+    information += np.array([[1, -1], [-1, 1]]) / (2 * RATIO_STD) ** 2 + RELATIVE_ROUNDING * np.eye(2)
     return NoiseShare(share, np.linalg.inv(information))
 
 
-def degrees_of_freedom(
-    share: Float[ndarray, "*k 2"], log_variance_covariance: Float[ndarray, "2 2"]
-) -> Float[ndarray, "*k"] | np.floating:
-    """Of variances that hang on σ_t² and σ_r² by `share` of them each; infinite where nothing is unknown."""
-    variance = np.einsum("...i,ij,...j->...", share, log_variance_covariance, share)
-    return 2 / np.maximum(variance, 2e-9)
+def directions(
+    covariance: Float[ndarray, "k k"], noise: NoiseShare
+) -> tuple[Float[ndarray, "k k"], Float[ndarray, " k"]]:
+    """Independent directions (columns; their outer products sum to the covariance), and the degrees of freedom of each.
+
+    From those that hang on one of the robot's noises to those that hang on the other.
+    """
+    # Of motions that show too little, rounding leaves no positive definite matrix.
+    std = np.sqrt(np.abs(np.diag(covariance)))
+    values, vectors = np.linalg.eigh(covariance / std[:, None] / std)
+    root = vectors * np.sqrt(np.maximum(values, RELATIVE_ROUNDING))
+    to_unit = np.linalg.inv(root) / std
+    relative = to_unit @ noise.by_log_variance @ to_unit.T
+    axes = np.linalg.eigh(relative[0] - relative[1])[1]
+    share = np.clip(np.einsum("ij,cik,kj->jc", axes, relative, axes), 0, 1)
+    of_log = np.einsum("jc,cd,jd->j", share, noise.log_variance_covariance, share)
+    return std[:, None] * root @ axes, 2 / np.clip(of_log, 2 / MANY, 2 / FEWEST)
 
 
 def widened(covariance: Float[ndarray, "k k"], noise: NoiseShare) -> Float[ndarray, "k k"]:
     """The covariance whose 95 % ellipsoid holds 95 % though the robot's noise in it was estimated."""
-    # Independent directions of unit variance, from those that hang on one noise to those that hang on the other.
-    axes = eigh(noise.by_log_variance[0] - noise.by_log_variance[1], covariance)[1]
-    share = np.einsum("ij,cik,kj->jc", axes, noise.by_log_variance, axes)
-    nu = degrees_of_freedom(share, noise.log_variance_covariance)
+    axes, nu = directions(covariance, noise)
     k = len(covariance)
     factor = k * f.ppf(COVERED, k, nu) / chi2.ppf(COVERED, k)
-    extent = covariance @ axes
-    return (extent * factor) @ extent.T
+    return (axes * factor) @ axes.T

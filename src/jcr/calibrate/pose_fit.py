@@ -53,8 +53,9 @@ class PoseFit:
     """Rotation vector from reported to predicted gripper (rad), gripper axes."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) per axis, given or estimated."""
+    noise_estimated: bool
     degrees_of_freedom: tuple[float, float]
-    """Of the two estimates; infinite when the noise was given."""
+    """Of the two estimates; infinite where a noise was given that explains the residuals."""
     hessian: Float[ndarray, "13 13"]
     """Of the negative log likelihood, prior included."""
     noise_share: NoiseShare
@@ -89,20 +90,18 @@ def fit_poses(
 ) -> PoseFit:
     """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon) on the `used` poses.
 
-    `noise` is the robot's in (m, rad). `camera_covariance` is that of the twists (v, ω) of the cameras in recon
-    axes, T ← [exp(ω) R, exp(ω) c + v]; None where the cameras are exact beside the robot.
+    `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the
+    twists (v, ω) of the cameras in recon axes, T ← [exp(ω) R, exp(ω) c + v]; None where the cameras are exact
+    beside the robot.
     """
     unknowns, cues = start, cues or Cues()
     robot = noise or (5e-4, np.radians(0.1))
-    dof = (np.inf, np.inf)
     poses = (base_from_gripper, recon_from_camera, used, camera_covariance, cues)
     for _ in range(iterations):
         system = _system(unknowns, robot, *poses)
-        settled = True
-        if noise is None:
-            before, (robot, dof) = robot, _estimated_noise(system, robot)
-            settled = bool(np.allclose(robot, before, rtol=1e-6, atol=0.0))
-            system = _system(unknowns, robot, *poses)
+        before, (robot, dof) = robot, _estimated_noise(system, robot, noise)
+        settled = bool(np.allclose(robot, before, rtol=1e-6, atol=0.0))
+        system = _system(unknowns, robot, *poses)
         step = -np.linalg.solve(system.hessian, system.gradient)
         # A wild start on nearly unobservable motions must not throw rotations around the circle.
         step *= min(1.0, 0.5 / max(np.abs(step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300))
@@ -111,14 +110,16 @@ def fit_poses(
             break
     system = _system(unknowns, robot, *poses)
     missed, missed_covariance = _missed(system, robot)
+    share = noise_share(*system.passed_on(), robot, noise)
     return PoseFit(
         *unknowns,
         system.residual[:, :3],
         system.residual[:, 3:],
         robot,
-        dof,
+        robot != noise,
+        dof if share.log_variance_covariance.any() else (np.inf, np.inf),
         system.hessian,
-        noise_share(*system.passed_on(), robot, estimated=noise is None),
+        share,
         missed,
         missed_covariance,
     )
@@ -194,7 +195,7 @@ def _system(
 
 
 def _estimated_noise(
-    system: _System, robot: tuple[float, float]
+    system: _System, robot: tuple[float, float], given: tuple[float, float] | None
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """One step of restricted maximum likelihood for the robot's noise, and its degrees of freedom."""
     told, own = system.projected()
@@ -202,7 +203,7 @@ def _estimated_noise(
     squares = ((variance * told) ** 2).sum(0)
     degrees = (variance * np.einsum("mii->mi", own)).sum(0)
     dof = max(float(degrees[:3].sum()), 0.1), max(float(degrees[3:].sum()), 0.1)
-    return robot_noise((float(squares[:3].sum()), float(squares[3:].sum())), dof, robot), dof
+    return robot_noise((float(squares[:3].sum()), float(squares[3:].sum())), dof, robot, given), dof
 
 
 def _missed(

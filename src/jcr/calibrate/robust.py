@@ -47,7 +47,7 @@ def robust_fit(
     trusted = _least_trimmed(base_from_gripper, recon_from_camera)
     fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
     for _ in range(10):
-        agreeing = _agreeing(fit, noise)
+        agreeing = _agreeing(fit)
         if agreeing.sum() < 4 or (agreeing == trusted).all():
             break
         trusted = agreeing
@@ -70,11 +70,11 @@ def _fit(
     return fit_poses(base_from_gripper, recon_from_camera, start, trusted, noise, cues, camera_covariance)
 
 
-def _agreeing(fit: PoseFit, noise: tuple[float, float] | None) -> Bool[ndarray, " n"]:
+def _agreeing(fit: PoseFit) -> Bool[ndarray, " n"]:
     """Images whose distance from a fit *without them* is within what noise explains."""
     gap = np.linalg.solve(fit.missed_covariance, fit.missed[..., None])[..., 0]
     distance = np.einsum("ni,ni->n", fit.missed, gap)
-    nu = min(min(fit.degrees_of_freedom), 1e6) if noise is None else 1e6
+    nu = min(*fit.degrees_of_freedom, 1e6)
     within_noise = distance < 6 * f_distribution.isf(REJECT_AT, 6, nu)
     small = (np.linalg.norm(fit.translation_residual, axis=1) < TOLERANCE[0]) & (
         np.linalg.norm(fit.rotation_residual, axis=1) < TOLERANCE[1]
