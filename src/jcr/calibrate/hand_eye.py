@@ -58,13 +58,14 @@ def solve_hand_eye(
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
 
-    # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit.
-    order = np.lexsort(gripper.reshape(n, 16).T)
+    # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image
+    # that was given twice is one: its error counted as two would pass for agreement.
+    pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
+    _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
     if camera_covariance is not None:
         rows = (6 * order[:, None] + np.arange(6)).ravel()
         camera_covariance = camera_covariance[np.ix_(rows, rows)]
     fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues, camera_covariance)
-    back = np.argsort(order)
     used = used_sorted[back]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     held_out = _held_out(fit, used_sorted)
