@@ -95,7 +95,7 @@ def fit_poses(
     beside the robot.
     """
     unknowns, cues = start, cues or Cues()
-    robot = noise or (5e-4, np.radians(0.1))
+    robot, dof = noise or (5e-4, np.radians(0.1)), (np.inf, np.inf)
     poses = (base_from_gripper, recon_from_camera, used, camera_covariance, cues)
     for _ in range(iterations):
         system = _system(unknowns, robot, *poses)
