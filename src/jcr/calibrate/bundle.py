@@ -52,7 +52,8 @@ class Adjusted:
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     noise: tuple[float, float]
-    noise_estimated: bool
+    given_noise: tuple[float, float] | None
+    """As `adjust` was told it."""
     sigma_px: float
     robot_residual: Float[ndarray, "m 6"]
     """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
@@ -396,11 +397,8 @@ def _summary(
     covariance[:6, 6] = covariance[6, :6] = cross[:6]
     covariance[6, 6] = variance - coupling @ cross
 
-    # How errors of the reported poses pass into the seven, and what is told of them once all is adjusted.
-    precision = np.tile(np.repeat(np.asarray(robot) ** -2.0, 3), m)
-    of_gripper = camera_covariance[:, -6 * m :]
-    gain = np.concatenate([of_gripper[:6], -coupling[None] @ of_gripper]) * precision
-    told = np.diag(precision) - precision[:, None] * of_gripper[-6 * m :] * precision
+    gain, told = _passed_on(camera_covariance, robot, m)
+    gain = np.concatenate([gain[:6], -coupling[None] @ gain])
 
     hat = np.stack(
         [camera_covariance[i : i + 6, i : i + 6] for i in range(len(cross) - 6 * m, len(cross), 6)]
@@ -412,7 +410,7 @@ def _summary(
         base_from_recon,
         widened(covariance, noise_share(gain, told, robot, given)),
         robot,
-        robot != given,
+        given,
         sigma_px,
         _robot_residual(bundle, problem.reported),
         hat / sigma[:, None] / sigma[None],
@@ -421,13 +419,22 @@ def _summary(
     )
 
 
+def _passed_on(
+    covariance: Float[ndarray, "d d"], robot: tuple[float, float], m: int
+) -> tuple[Float[ndarray, "d r"], Float[ndarray, "r r"]]:
+    """How errors of the m reported poses pass into the unknowns, and P of noise.noise_share."""
+    precision = np.tile(np.repeat(np.asarray(robot) ** -2.0, 3), m)
+    gain = covariance[:, -6 * m :] * precision
+    return gain, np.diag(precision) - precision[:, None] * gain[-6 * m :]
+
+
 def free_lens(
     adjusted: Adjusted, intrinsics: Intrinsics
 ) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
     """The camera one Gauss-Newton step on, with its lens free and before it at `intrinsics`, and the covariance.
 
-    In the order of projection.CAMERA_PARAMETERS; the covariance is not widened for the estimated noise. None where
-    there are too few observations to free a lens.
+    In the order of projection.CAMERA_PARAMETERS; the covariance is widened for an estimated noise. None where there
+    are too few observations to free a lens.
     """
     problem, bundle = adjusted.problem, adjusted.bundle
     if len(problem.image) < MIN_OBSERVATIONS_FOR_LENS:
@@ -439,7 +446,9 @@ def free_lens(
     normal = _normal_equations(bundle, view, problem, weights, adjusted.noise, 0.0)
     covariance, free = np.linalg.inv(normal.schur), slice(6, 6 + lens.shape[1])
     step = covariance[free] @ normal.right
-    return bundle.camera + lens @ step, lens @ covariance[free, free] @ lens.T
+    gain, told = _passed_on(covariance, adjusted.noise, len(problem.reported))
+    share = noise_share(gain[free], told, adjusted.noise, adjusted.given_noise)
+    return bundle.camera + lens @ step, lens @ widened(covariance[free, free], share) @ lens.T
 
 
 def median_reprojection(

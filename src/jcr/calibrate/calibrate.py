@@ -254,7 +254,7 @@ def _refined(
         covariance=adjusted.covariance,
         translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
         rotation_residual_rad=rotation_angle(turn),
-        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise_estimated, hand_eye.robot_noise.given),
+        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibrate.bundle import LENS_STD, Adjusted, adjust, free_lens
-from jcr.calibrate.pose_fit import widening
 from jcr.calibrate.projection import CAMERA_PARAMETERS, parameters
 from jcr.geometry import rotation_log
 from jcr.information import Poses
@@ -79,7 +78,6 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float
     if found is None:
         return []
     camera, covariance = found
-    covariance = covariance * widening(adjusted.degrees_of_freedom, len(adjusted.robot_residual))
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))
     off = []
