@@ -12,7 +12,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
 from jcr.reconstruct.dust3r.align import align
-from jcr.reconstruct.dust3r.align_equations import Layout
+from jcr.reconstruct.dust3r.align_equations import ImageEquations, Layout, PairTies, ReducedEquations
 from jcr.reconstruct.dust3r.align_fast import FreeCameras, Problem, gauss_newton, moved
 from jcr.reconstruct.dust3r.align_residuals import State
 from jcr.reconstruct.dust3r.alignment import Alignment, AlignOptions, pinhole_of
@@ -313,3 +313,15 @@ def test_yardstick(tmp_path):
         assert turn.mean() < 0.091
         np.testing.assert_allclose(file["focals"], made["gt_focal"], rtol=9e-4)
         assert np.median(np.abs(file["depth"] * scale / made["gt_depth"] - 1)) < 3e-3
+
+
+def test_pairs_whose_errors_cannot_be_solved_for_come_to_nothing(monkeypatch: pytest.MonkeyPatch):
+    """A network with random weights, 40 images and near pairs alone, gave such equations."""
+
+    def singular(equations: ImageEquations, ties: PairTies) -> ReducedEquations:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(ImageEquations, "reduced", singular)
+    predictions, _ = synthetic_pairs(complete_pairs(3), (32, 24))
+    with pytest.raises(NotTrustedError, match="came to nothing"):
+        align(predictions)

@@ -50,6 +50,8 @@ CONTRADICTION = 4.0
 USELESS = 0.2
 """Residual of the middle pair, relative to the distance, that no network worth its weights comes near."""
 
+NOTHING = "the alignment of the pairs came to nothing; their pointmaps have too little in common"
+
 
 @runtime_checkable
 class Cameras(Protocol):
@@ -201,7 +203,10 @@ def gauss_newton(
             PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
             for o in images
         ]
-        reduced = [own.reduced(tie) for own, tie in zip(equations, ties, strict=True)]
+        try:
+            reduced = [own.reduced(tie) for own, tie in zip(equations, ties, strict=True)]
+        except np.linalg.LinAlgError:
+            raise NotTrustedError(NOTHING) from None
 
         hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
         for selection, own in zip(selections, reduced, strict=True):
@@ -215,9 +220,7 @@ def gauss_newton(
         except np.linalg.LinAlgError:
             step = np.full(layout.size, np.nan)
         if not np.isfinite(step).all():
-            raise NotTrustedError(
-                "the alignment of the pairs came to nothing; their pointmaps have too little in common"
-            )
+            raise NotTrustedError(NOTHING)
 
         log_depth, pair_error = [], np.zeros_like(state.pair_error)
         variance = np.zeros_like(state.pair_error)
