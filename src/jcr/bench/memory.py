@@ -1,6 +1,7 @@
 """`jcr bench memory`: peak resident set of the whole job against the budget, and what was said of it before."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -159,5 +160,7 @@ def _jcr(command: Sequence[str], capture: Path, folder: Path, budget_gb: float) 
         name, *options = command
         place = f"{out}/pairs.npz" if name == "predict" else f"{out}/run"
         arguments = [name, str(capture), place, *options, "--memory-gb", str(budget_gb), "--device", "cpu"]
-        done = subprocess.run([sys.executable, "-c", CHILD, *arguments], capture_output=True, text=True)
+        environment = os.environ | {"XDG_CACHE_HOME": out}  # no pairs from a run before
+        child = [sys.executable, "-c", CHILD, *arguments]
+        done = subprocess.run(child, env=environment, capture_output=True, text=True)
     return done.returncode, done.stderr

@@ -188,7 +188,7 @@ class _Predictor:
             self._say(
                 f"{damaged} of the pairs in the cache {self.cache.folder} were damaged: predicted again"
             )
-        if missing:
+        if missing or self.aligned:
             where = "" if in_memory else f", and {estimate.pointmaps / GB:.2g} GB of pointmaps in a file"
             announce(needed, self.budget, where)
         unseen = np.setdiff1d(edges[missing], list(self.features))
