@@ -300,3 +300,22 @@ def test_poses_that_belong_to_other_pictures_are_not_trusted():
 def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
     with pytest.raises(jcr.InputError, match=words):
         jcr.solve_hand_eye(gripper, camera)
+
+
+def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
+    """The larger half of what three images leave open is how far the robot's poses scatter."""
+    noise = (5e-4, np.radians(0.1))
+    trusted = {"estimated": 0, "given": 0}
+    for seed in range(12):
+        problem = hand_eye_problem(np.random.default_rng(seed), 3, robot_noise=noise)
+        poses = problem.base_from_gripper, problem.recon_from_camera
+        estimated, given = jcr.solve_hand_eye(*poses), jcr.solve_hand_eye(*poses, robot_noise=noise)
+        trusted["estimated"] += estimated.converged
+        trusted["given"] += given.converged
+        for answer in (estimated, given):
+            uncertain = [warning for warning in answer.warnings if "is known to ±" in warning]
+            assert all(("--robot-noise" in warning) == (answer is estimated) for warning in uncertain)
+            if answer.converged:
+                off = error(problem, answer.gripper_from_camera, answer.scale)
+                assert (np.abs(off) < 5 * np.sqrt(np.diag(answer.covariance))).all()
+    assert trusted["given"] > 2 * trusted["estimated"]

@@ -20,6 +20,8 @@ MAX_NOISE = (0.02, np.radians(3.0))
 MAX_STD = (0.02, np.radians(3.0), 0.05)
 """m, rad, relative scale: an answer less certain than this is none."""
 MIN_SHARE_USED = 0.6
+FEW = 5
+"""Images, below which a wrong one cannot be outvoted and the robot's noise is hardly known."""
 SURPRISE = 1.5
 """Times the robot noise that was given; more is worth saying."""
 
@@ -125,7 +127,10 @@ def _doubts(hand_eye: HandEye):
             (std[6], MAX_STD[2], f"the scale is known to ±{100 * std[6]:.0f} % only"),
         ):
             if value > limit:
-                yield text + "; add images, turned by 20° or more about different axes"
+                # Of few images half the uncertainty may be that the robot's noise is hardly known.
+                tell = ", or say how well the robot repeats (--robot-noise MM DEG)"
+                unknown = noise.given is None and used < FEW
+                yield f"{text}; add images, turned by 20° or more about different axes{tell if unknown else ''}"
 
 
 def _remarks(hand_eye: HandEye):
@@ -147,7 +152,7 @@ def _remarks(hand_eye: HandEye):
                 f"images left out are missed by {held_out.translation_mm:.1f} mm though the fit's residual "
                 f"is {typical:.1f} mm: too few images for this motion; add some"
             )
-    if len(hand_eye.inliers) < 5:
+    if len(hand_eye.inliers) < FEW:
         yield f"{len(hand_eye.inliers)} images cannot outvote a wrong one; take 8 or more"
 
 
