@@ -64,8 +64,9 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     assert "nonsense" in outcomes[0].trouble and "nowhere" in outcomes[1].trouble
     assert outcomes[2].seconds is None and not outcomes[2].trouble  # newer than the sources: left out
     assert len(told) == 2
-    write_index(outcomes, tmp_path, "jcr bench all", "a machine.", ["a network: no weights"])
+    write_index(outcomes, tmp_path, "jcr bench all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
+    assert "2 of 3 benches were run this time, in 1.5 minutes" in index
     assert "- the map is good ([map](map.md))" in index
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 

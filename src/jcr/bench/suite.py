@@ -87,17 +87,21 @@ def claims(page: Path) -> list[str]:
 
 
 def write_index(
-    outcomes: Sequence[Outcome], out: Path, command: str, machine: str, absent: Sequence[str]
+    outcomes: Sequence[Outcome],
+    out: Path,
+    command: str,
+    machine: str,
+    absent: Sequence[str],
+    wall_s: float,
 ) -> None:
     """README.md in `out`: the claims of every page, what failed, and what is `absent` and why."""
     ran = [outcome for outcome in outcomes if outcome.seconds is not None]
-    whole = sum(outcome.seconds or 0.0 for outcome in ran)
     lines = [
         "# Results",
         "",
         f"Written by `{command}`, {date.today().isoformat()}. {machine} {len(ran)} of {len(outcomes)} benches were "
-        f"run this time, {whole / 60:.0f} minutes of them together, those that are not timed two at a time. Each "
-        "page says above its tables which command writes them.",
+        f"run this time, in {wall_s / 60:.1f} minutes; those that are not timed ran two at a time. Each page says "
+        "above its tables which command writes them.",
         "",
         *(
             f"- {claim} ([{outcome.name}]({outcome.name}.md))"

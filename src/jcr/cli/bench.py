@@ -4,6 +4,7 @@ import os
 import platform
 import shlex
 import sys
+import time
 from dataclasses import dataclass, field
 from datetime import date
 from importlib import import_module
@@ -163,9 +164,10 @@ def _all(arguments: Arguments) -> int:
         if not arguments.output.quiet:
             sys.stderr.write(f"{outcome.name}: {outcome.trouble or 'done'}, {outcome.seconds or 0.0:.0f} s\n")
 
+    begun = time.perf_counter()
     outcomes = run(names, arguments.out, given, arguments.resume, report)
     command = " ".join(["jcr bench all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"])
-    write_index(outcomes, arguments.out, command, machine(), absent)
+    write_index(outcomes, arguments.out, command, machine(), absent, time.perf_counter() - begun)
     if arguments.readme is not None:
         link = os.path.relpath(arguments.out, arguments.readme.parent)
         text = between_marks(arguments.readme.read_text(), arguments.out, list(names), link)
