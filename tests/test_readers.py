@@ -14,7 +14,7 @@ import capture_writers as writers
 import jcr
 from jcr.capture import capture_json
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_npy
+from jcr.capture.plain_files import read_npy, read_yaml
 from jcr.capture.pose_table import stamp_ns
 from jcr.capture.read import FORMATS, format_of, read_source
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
@@ -433,3 +433,15 @@ def test_an_archive_named_as_an_array_is_refused(tmp_path: Path):
     for read in (read_npy, read_points):
         with pytest.raises(jcr.InputError, match=r"points\.npy: not a NumPy array"):
             read(tmp_path / "points.npy")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['"\\U99999999"', "2001-99-99", "1" * 5000, "[" * 3000, "{a: b", "&a [*a", "!!python/name:os.system"],
+)
+def test_yaml_that_cannot_be_is_refused(text: str, tmp_path: Path):
+    """The character beyond Unicode was found by fuzzing."""
+    file = tmp_path / "poses.yaml"
+    file.write_text(text)
+    with pytest.raises(jcr.InputError, match=r"poses\.yaml: "):
+        read_yaml(file)

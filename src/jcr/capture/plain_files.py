@@ -43,7 +43,7 @@ def read_yaml(file: Path) -> Any:
         raise InputError(f"{file}: not YAML{place}: {problem}; correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply; write it plainly") from None
-    except ValueError as error:  # dates that are none, numbers of thousands of digits
+    except (ValueError, OverflowError) as error:  # dates and characters that are none, thousands of digits
         raise InputError(f"{file}: a value that cannot be ({error}); correct it there") from None
 
 
