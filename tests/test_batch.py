@@ -121,6 +121,9 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
                 cluster.remove_node(nodes.pop(), allow_graceful=False)
 
         options = replace(COMPLETE, ray=cluster.address)
+        greedy = replace(options, cpus_per_task=64)
+        with pytest.raises(module.InputError, match="no node has the 64 cores"):
+            batch([tmp_path / "0"], tmp_path / "none", RunOptions(), greedy)
         rows = batch([tmp_path / f"{k}" for k in range(6)], tmp_path / "out", RunOptions(), options, kill)
     finally:
         cluster.shutdown()

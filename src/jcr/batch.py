@@ -257,9 +257,15 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
         except (ConnectionError, ValueError) as error:
             raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
     try:
-        remote = ray.remote(
-            num_cpus=options.cpus_per_task, num_gpus=options.gpus_per_task, max_retries=RETRIES
-        )(run_one)
+        cpus, gpus = options.cpus_per_task, options.gpus_per_task
+        room = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in room):
+            # Ray would wait for such a node without end.
+            raise InputError(
+                f"--ray {options.ray}: no node has the {cpus} cores and {gpus:g} GPUs that a capture takes; "
+                "lower --cpus-per-task or --gpus-per-task, or add the node first"
+            )
+        remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=RETRIES)(run_one)
         task_of = {remote.remote(task): task for task in tasks}
         waiting = list(task_of)
         while waiting:
