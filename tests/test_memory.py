@@ -142,3 +142,12 @@ def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.Monk
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(InputError, match="no room for pointmaps.*TMPDIR"):
         predict._new_array((4, 4), False)
+
+
+def test_objects_in_a_mapped_file_are_refused(tmp_path: Path) -> None:
+    """What stands in the file would be taken for addresses."""
+    path = tmp_path / "pairs.npz"
+    np.savez(path, edges=np.array([[0, 1], [1, None]], dtype=object))
+    for in_memory in (0.0, 1e9):
+        with pytest.raises(InputError, match=r"pairs\.npz"):
+            read_arrays(path, in_memory)

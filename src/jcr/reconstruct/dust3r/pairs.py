@@ -166,7 +166,10 @@ def _map_arrays(path: Path) -> dict[str, ndarray]:
                 start = member.tell()
                 while member.read(1 << 20):  # to the end, where its checksum is compared
                     pass
-            if info.compress_type != zipfile.ZIP_STORED or by_columns or not math.prod(shape):
+            plain = info.compress_type == zipfile.ZIP_STORED and not by_columns and math.prod(shape)
+            if (
+                not plain or dtype.hasobject
+            ):  # objects in a file are addresses: mapped, they would be followed
                 with archive.open(info) as member:
                     arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
                 continue
