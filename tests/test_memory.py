@@ -19,7 +19,7 @@ from jcr.bench.align import CHILD
 from jcr.bench.pairs import random_network
 from jcr.bench.synthetic_pairs import synthetic_pairs
 from jcr.errors import InputError
-from jcr.memory import GB, give_back, resident
+from jcr.memory import GB, give_back, require, resident
 from jcr.reconstruct.dust3r import predict
 from jcr.reconstruct.dust3r.align import align
 from jcr.reconstruct.dust3r.matches import tracks_from_pairs
@@ -151,3 +151,8 @@ def test_objects_in_a_mapped_file_are_refused(tmp_path: Path) -> None:
     for in_memory in (0.0, 1e9):
         with pytest.raises(InputError, match=r"pairs\.npz"):
             read_arrays(path, in_memory)
+
+
+def test_a_budget_that_is_no_number_is_refused() -> None:
+    with pytest.raises(InputError, match="--memory-gb nan"):
+        require(10**9, float("nan"), "a run")

@@ -51,7 +51,7 @@ def announce(needed: int, budget: float, beside: str = "") -> None:
 
 def require(needed: int, budget: float, what: str) -> None:
     """Raise InputError where `what` needs more bytes than the budget."""
-    if needed > budget:
+    if not needed <= budget:  # not a number, too
         least = math.ceil(10 * needed / GB) / 10
         raise InputError(
             f"--memory-gb {budget / GB:.2g}: {what} needs {needed / GB:.2g} GB; raise --memory-gb to {least:g}, or "
