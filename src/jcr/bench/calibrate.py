@@ -210,7 +210,7 @@ def _outliers(spoilt: Spoilt, named: dict[int, int]) -> list[str]:
 
 def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
     """PNG: median errors of the offset by robot noise, number of images and share of wrong gripper poses."""
-    figure = Figure(figsize=(13, 4.4), layout="constrained")
+    figure = Figure(figsize=(14, 4.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for name in _solvers():
         style = {"linewidth": 2.5} if name.startswith("jcr") else {"linewidth": 1, "linestyle": "--"}
@@ -231,7 +231,10 @@ def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
         axis.set(xlabel=title, yscale="log")
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("median error of the offset, mm")
-    axes[2].legend(fontsize=7, title="* scale given", title_fontsize=7)
+    lines, names = axes[0].get_legend_handles_labels()
+    figure.legend(
+        lines, names, loc="outside right center", fontsize=7, title="* scale given", title_fontsize=7
+    )
     return png(figure, 100)
 
 

@@ -121,7 +121,7 @@ def _figure(picture: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
     for axis, cloud in zip(others, dense, strict=True):
         _from_above(axis, cloud)
         axis.scatter(*sparse.x_in_base[:, 1::-1].T * [[-1], [1]], s=1.5, c="red", linewidths=0)
-        axis.set_title(f"{cloud.name}; red: COLMAP's points", fontsize=9)
+        axis.set_title(f"{cloud.name}\nred: COLMAP's points", fontsize=9)
     return png(figure, 110)
 
 

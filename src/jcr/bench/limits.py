@@ -218,7 +218,8 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
     """PNG: a row for each thing that is made worse, a picture for each level, framed by what came of it."""
     kinds = list(dict.fromkeys(v.trial.what for v in verdicts))
     across = max(sum(v.trial.what == kind for v in verdicts) for kind in kinds)
-    figure = Figure(figsize=(2.3 * across, 2.0 * len(kinds)), layout="constrained")
+    figure = Figure(figsize=(2.3 * across, 2.1 * len(kinds)))
+    figure.set_layout_engine("constrained", h_pad=0.07)  # inches: a caption stays with the picture above it
     axes = figure.subplots(len(kinds), across, squeeze=False)
     for row, kind in zip(axes, kinds, strict=True):
         chosen = [v for v in verdicts if v.trial.what == kind]
