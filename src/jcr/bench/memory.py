@@ -18,6 +18,7 @@ from jcr.bench.align import CHILD
 from jcr.bench.pairs import random_network
 from jcr.files import write_text
 from jcr.memory import GB
+from jcr.reconstruct.dust3r.pairs import PairOptions
 from jcr.simulate.capture import SimulateOptions, simulate
 
 IMAGES = (8, 20, 40)
@@ -92,7 +93,8 @@ def run() -> str:
         "",
         f"Simulated tabletop, images of {WIDTH}x{WIDTH * 3 // 4}, a process each. The least budget is the one that the "
         f"refusal of {TOO_LITTLE_GB:g} GB names. The small networks have random weights and see every pair at "
-        f"{GRID[0]}x{GRID[1]}. Peak: VmHWM, the program itself included.",
+        f"{GRID[0]}x{GRID[1]}; *near pairs*, those of images up to {PairOptions.window} apart. Peak: VmHWM, the program "
+        "itself included.",
         "",
         "| job | images | budget | announced | pointmaps in a file | peak |",
         "|---|---|---|---|---|---|",
