@@ -135,12 +135,33 @@ def test_pairs_left_in_their_file_align_and_match_to_the_same_bits(tmp_path: Pat
         read_arrays(path, 0.0)
 
 
+@pytest.mark.parametrize("system", ["linux", "macos"])
+def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, system: str
+) -> None:
+    if system == "macos":
+        monkeypatch.delattr(os, "posix_fallocate")
+    size = 4 * 3 * 400_001
+    with (tmp_path / "reserved").open("w+b") as stream:
+        monkeypatch.setattr(predict.tempfile, "TemporaryFile", lambda: stream)
+        array = predict._new_array((400_001, 3), False)
+    written = (tmp_path / "reserved").stat()
+    assert written.st_size == size and 512 * written.st_blocks >= size
+    array[-1] = 1.0
+    assert array.sum() == 3.0
+
+
 def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    named = r"no room for pointmaps.*No space left.*TMPDIR"
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(InputError, match="no room for pointmaps.*TMPDIR"):
+    with pytest.raises(InputError, match=named):
+        predict._new_array((4, 4), False)
+    monkeypatch.delattr(os, "posix_fallocate")
+    with Path("/dev/full").open("r+b") as stream, pytest.raises(InputError, match=named):
+        monkeypatch.setattr(predict.tempfile, "TemporaryFile", lambda: stream)
         predict._new_array((4, 4), False)
 
 

@@ -307,10 +307,21 @@ def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
         return np.empty(shape, np.float32)
     with tempfile.TemporaryFile() as stream:
         try:  # to write on a full disk through a mapping would kill the process
-            os.posix_fallocate(stream.fileno(), 0, 4 * math.prod(shape))
+            _reserve(stream.fileno(), 4 * math.prod(shape))
         except OSError as error:
             raise InputError(
                 f"{tempfile.gettempdir()}: no room for pointmaps that do not fit --memory-gb ({error.strerror}); make "
                 "room, name another folder in TMPDIR, or raise --memory-gb"
             ) from None
         return np.memmap(stream, np.float32, "w+", shape=shape)
+
+
+def _reserve(file: int, size: int) -> None:
+    """Take `size` bytes of the disk for an open, empty file; raises OSError where they are not free."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+        return
+    # macOS has no such call: zeros reserve as much room, but take the time of writing them.
+    zeros = bytes(1 << 20)
+    while size:
+        size -= os.write(file, zeros[:size])
