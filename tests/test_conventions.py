@@ -1,14 +1,18 @@
 """Each way of writing poses wrongly is named, and sound poses never are."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jcr.calibrate.calibrate import calibrate_poses
 from jcr.calibrate.conventions import better_reading, explained
+from jcr.calibrate.file import calibration_file
 from jcr.calibrate.next_poses import next_poses
 from jcr.geometry import inverse, transform
+from jcr.records import PosePairs
 from jcr.simulate.problem import hand_eye_problem
 
 
@@ -97,3 +101,16 @@ def test_a_planar_capture_is_told_to_tilt():
     tilt = [np.degrees(np.arccos(pose.base_from_gripper[2, :3] @ down)) for pose in proposed]
     assert max(tilt) > 10.0
     assert proposed[-1].expected_std[:3].max() < 0.02 * now[:3].max()
+
+
+def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
+    noise = (0.03, np.radians(4.0))
+    problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
+    names = tuple(f"{k}.png" for k in range(12))
+    pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    found = calibrate_poses(pairs)
+    assert not found.converged
+    promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
+    used = problem.base_from_gripper[found.inliers]
+    _, proposed = next_poses(used, 2, problem.gripper_from_camera, noise)
+    assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from jcr.calibrate.calibrate import CalibrateOptions, calibrate
+from jcr.calibrate.file import calibration_file
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
 
-def calibrated(
-    seed: int, images: int, lens: Intrinsics | None, options: CalibrateOptions | None = None, **motion
-) -> tuple[HandEyeProblem, HandEye]:
-    """Of pictures that LENS made, told that `lens` did; None: told nothing."""
+def pictured(
+    seed: int, images: int, lens: Intrinsics | None, **motion
+) -> tuple[HandEyeProblem, Capture, Reconstruction]:
+    """Pictures that LENS made, of which it is told that `lens` did; None: told nothing."""
     rng = np.random.default_rng([seed, images])
     problem = hand_eye_problem(
         rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
@@ -36,6 +37,13 @@ def calibrated(
         tracks,
         "test",
     )
+    return problem, capture, reconstruction
+
+
+def calibrated(
+    seed: int, images: int, lens: Intrinsics | None, options: CalibrateOptions | None = None, **motion
+) -> tuple[HandEyeProblem, HandEye]:
+    problem, capture, reconstruction = pictured(seed, images, lens, **motion)
     return problem, calibrate(capture, reconstruction, options)
 
 
@@ -78,6 +86,20 @@ def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
     std = np.sqrt(np.diag(hand_eye.covariance))
     assert "focal length" in said(hand_eye)
     assert np.abs(off / std)[:6].max() < 3
+
+
+@pytest.mark.parametrize("factor", [1.03, 0.95, 1.2])
+def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) -> None:
+    offset, promised, reported = [], [], []
+    for lens in (LENS, scaled(factor)):
+        _, capture, reconstruction = pictured(0, 5, lens)
+        hand_eye = calibrate(capture, reconstruction)
+        content = calibration_file(capture, reconstruction, hand_eye, {}, "")
+        offset.append(hand_eye.gripper_from_camera[:3, 3])
+        promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
+        reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))
+    assert promised[0] < 0.7 * reported[0]
+    assert np.linalg.norm(offset[1] - offset[0]) < promised[1] < reported[1]
 
 
 def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:

@@ -120,7 +120,7 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
 def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
     """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
     covariance = hand_eye.covariance + np.outer(doubt.shift, doubt.shift)
-    widened = judged(replace(hand_eye, covariance=covariance))
+    widened = judged(replace(hand_eye, covariance=covariance, lens_shift=doubt.shift))
     if hand_eye.converged and widened.converged:
         return replace(widened, warnings=(*widened.warnings, doubt.text))
     # More images, the cure for a large covariance, do not mend a lens.

@@ -15,6 +15,7 @@ from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
+from jcr.information import ASSUMED_NOISE
 from jcr.records import (
     COVARIANCE_ORDER,
     Capture,
@@ -195,15 +196,20 @@ def _proposals(
     """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used.
 
     What they would leave is the reported standard deviation, less by the share by which their information shrinks
-    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ.
+    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ. No views make
+    up for a given lens that is wrong, nor for a robot that is worse than assumed.
     """
     used = capture.base_from_gripper[reconstruction.image_index[hand_eye.inliers]]
     noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    if not hand_eye.converged:
-        return next_poses(used, PROPOSED)[1]
-    expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
-    reported = np.sqrt(np.diag(hand_eye.covariance))
-    return [replace(pose, expected_std=pose.expected_std * reported / expected) for pose in proposed]
+    by_lens = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
+    if hand_eye.converged:
+        expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
+        share = np.sqrt(np.diag(hand_eye.covariance) - by_lens**2) / expected
+    else:
+        at_least = max(noise[0], ASSUMED_NOISE[0]), max(noise[1], ASSUMED_NOISE[1])
+        _, proposed = next_poses(used, PROPOSED, noise=at_least)
+        share = 1.0
+    return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
 
 
 def failed_file(
