@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr.calibrate.calibrate import calibrate_poses
 from jcr.calibrate.conventions import better_reading, explained
 from jcr.calibrate.file import calibration_file
+from jcr.calibrate.hand_eye import solve_hand_eye
 from jcr.calibrate.next_poses import next_poses
 from jcr.geometry import inverse, transform
 from jcr.records import PosePairs
@@ -108,7 +108,7 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
     names = tuple(f"{k}.png" for k in range(12))
     pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
-    found = calibrate_poses(pairs)
+    found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     assert not found.converged
     promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
     used = problem.base_from_gripper[found.inliers]
