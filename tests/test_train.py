@@ -17,7 +17,15 @@ from jcr.train import train as training
 from jcr.train.loss import attention_miss, confident_regression, true_attention
 from jcr.train.options import TrainOptions
 from jcr.train.raycast import Counts, Solids, first_hits, is_blocked
-from jcr.train.scenes import SceneOptions, Views, draw_views, pairs_of, points_in_camera, seen_by
+from jcr.train.scenes import (
+    SceneOptions,
+    Views,
+    disguised,
+    draw_views,
+    pairs_of,
+    points_in_camera,
+    seen_by,
+)
 from jcr.train.textures import SIDE, TEXELS, make_textures, sample
 from jcr.train.train import Training, train, true_points
 from jcr.train.validate import area_under_curve, capture_views, pair_errors, summary
@@ -120,6 +128,22 @@ def test_what_one_view_shows_the_other_shows_there_or_hides(views: Views):
     assert torch.equal(seen_by(views, second, first)[0], inside & ((z - there).abs() < 0.02 * z))
 
 
+def test_mirrored_views_are_of_a_world_that_can_be(views: Views):
+    other = disguised(views, 3, torch.Generator().manual_seed(0))
+    mirrored = (other.depth != views.depth).flatten(1).any(1)
+    assert 0 < mirrored.sum() < len(mirrored)
+    assert torch.equal(mirrored, mirrored[::3].repeat_interleave(3))
+    torch.testing.assert_close(torch.linalg.det(other.world_from_camera), torch.ones(len(mirrored)))
+    torch.testing.assert_close(other.images.sum((1, 2, 3)), views.images.sum((1, 2, 3)))
+    # What one view shows the other shows too, as before, at the mirrored pixel.
+    first, second = pairs_of(views, SceneOptions(views=3))
+    kept, turned = ((mirrored[first] == x).nonzero()[:, 0] for x in (False, True))
+    seen, there = (seen_by(x, first, second)[0] for x in (other, views))
+    assert torch.equal(seen[kept], there[kept]) and seen[turned].float().mean() > 0.2
+    # A pixel of the other view may round to its neighbour.
+    assert (seen[turned].flip(-1) != there[turned]).float().mean() < 5e-3
+
+
 def test_views_differ_as_little_as_their_light_where_they_see_the_same(views: Views):
     first, second = pairs_of(views, SceneOptions(views=3))
     seen, pixel = seen_by(views, first, second, tolerance=0.005)
@@ -164,7 +188,7 @@ def test_nothing_is_drawn_on_another_device_than_the_generator_is_on(monkeypatch
         true_points(found, first, first),
         0.2,
     )
-    for x in (*found, *seen, true_attention(*seen, (64, 48)), loss):
+    for x in (*found, *seen, true_attention(*seen, (64, 48), 16), loss):
         assert x.device.type == "meta"
 
 
@@ -220,11 +244,11 @@ def test_the_best_confidence_is_alpha_over_the_error(views: Views):
 
 def test_attention_is_told_where_the_same_points_are(views: Views):
     every = torch.arange(len(views.depth))
-    alone = true_attention(*seen_by(views, every, every, stride=4), (128, 96))
+    alone = true_attention(*seen_by(views, every, every, stride=4), (128, 96), 16)
     torch.testing.assert_close(alone, torch.eye(48).expand(len(every), 48, 48))
     first, second = pairs_of(views, SceneOptions(views=3))
     seen, pixel = seen_by(views, first, second, stride=4)
-    share = true_attention(seen, pixel, (128, 96))
+    share = true_attention(seen, pixel, (128, 96), 16)
     torch.testing.assert_close(share.sum((1, 2)) / 48, seen.float().mean((1, 2)))
     network = training.new_network(TrainOptions(Path(), embed=48, encoder_depth=1, decoder_depth=1))
     attention = network.dec_blocks[0].cross_attn
@@ -283,13 +307,40 @@ TINY = TrainOptions(
     encoder_depth=1,
     decoder_depth=2,
     textures=4,
-    bank_steps=3,
+    pool_steps=2,
+    replays=2,
+    bank_pools=2,
     warmup=2,
     muon_rate=1e-2,
     adam_rate=1e-2,
     save_every=3,
     validate_every=1000,
 )
+
+
+def test_a_scene_is_seen_in_every_replay_and_then_no_more():
+    options = replace(TINY, pool_steps=3, replays=2)
+    drawn = Training(options)
+    colors = [
+        set(drawn.views(step).images[::3].double().sum((1, 2, 3)).round(decimals=2).tolist())
+        for step in range(7)
+    ]
+    once, twice, then = set().union(*colors[:3]), set().union(*colors[3:6]), colors[6]
+    assert len(once) == 6 and once == twice and not once & then
+
+
+def test_a_shared_decoder_gives_both_orders_at_once(views: Views):
+    network = training.new_network(replace(TINY, precision="float32"))
+    first, second = torch.tensor([0, 4]), torch.tensor([1, 5])
+    images = views.images[:, :, ::2, ::2]
+    with torch.no_grad():
+        both = training.predict(network, images, first, second, both_orders=True)
+        apart = training.predict(network, images, torch.cat([first, second]), torch.cat([second, first]))
+    for found, expected in zip(both, apart, strict=True):
+        torch.testing.assert_close(found.points, expected.points)
+        torch.testing.assert_close(found.confidence, expected.confidence)
+    of_both = training.new_network(replace(TINY, shared_decoder=False))
+    assert of_both.dec_blocks2 is not of_both.dec_blocks
 
 
 def test_stopping_and_going_on_gives_the_same_bits(tmp_path: Path):
@@ -320,7 +371,7 @@ def test_twenty_steps_lower_the_loss_and_leave_weights_that_jcr_reads(tmp_path: 
     assert after.step == 20
 
     def held_out(training_: Training) -> float:
-        views = training_.views(1000, scenes=6)
+        views = training_.views(1000)
         first, second = pairs_of(views, options.scene)
         with torch.no_grad():
             found = training.predict(training_.network.eval(), views.images, first, second)

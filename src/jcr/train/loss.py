@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from jcr.reconstruct.dust3r.network import PATCH, CrossAttention, Pointmap, rotate
+from jcr.reconstruct.dust3r.network import CrossAttention, Pointmap, rotate
 
 
 def confident_regression(
@@ -41,14 +41,16 @@ def true_attention(
     seen: Bool[Tensor, "e rows columns"],
     pixel: Float[Tensor, "e rows columns 2"],
     size: tuple[int, int],
+    patch: int,
 ) -> Float[Tensor, "e n m"]:
     """The share of each first token's samples that the second image shows in each of its tokens.
 
     `seen` and `pixel` are samples of the first image on a regular grid, whole numbers of them a token, as
-    `scenes.seen_by` gives them; `size` (width, height) is that of both images.
+    `scenes.seen_by` gives them; `size` (width, height) is that of both images, `patch` the side of a token,
+    both in pixels.
     """
-    columns, rows = size[0] // PATCH, size[1] // PATCH
-    x, y = (pixel / PATCH + 0.5 / PATCH).floor().long().unbind(-1)
+    columns, rows = size[0] // patch, size[1] // patch
+    x, y = (pixel / patch + 0.5 / patch).floor().long().unbind(-1)
     token = (y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)).where(seen, rows * columns)
     of_first = token.unflatten(2, (columns, -1)).unflatten(1, (rows, -1))  # e rows i columns j
     of_first = of_first.transpose(2, 3).reshape(len(seen), rows * columns, -1)

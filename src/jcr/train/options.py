@@ -27,10 +27,20 @@ class TrainOptions:
     heads: int = 6
     encoder_depth: int = 4
     decoder_depth: int = 4
+    patch: Literal[4, 8, 16] = 8
+    """Pixels along the side of what one token sees."""
+    stem: Literal["convolutions", "linear"] = "convolutions"
+    """What makes a token of its pixels."""
+    shared_decoder: bool = True
+    """One decoder for both views, so that a pair gives its two orders at once; the heads stay two."""
+    pool_steps: int = 32
+    """Steps whose scenes are drawn at once, to be seen again in another order."""
+    replays: int = 4
+    """How often a scene is seen, mirrored or with its colours exchanged; 1: once."""
     textures: int = 96
     """In the bank that surfaces draw from."""
-    bank_steps: int = 200
-    """Steps after which a new bank is made."""
+    bank_pools: int = 2
+    """Pools after which a new bank is made."""
     muon_rate: float = 2e-3
     """Peak learning rate of the weight matrices inside the blocks (Muon)."""
     adam_rate: float = 1e-3

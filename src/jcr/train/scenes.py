@@ -78,6 +78,25 @@ class Views(NamedTuple):
     """(n,)"""
 
 
+def disguised(views: Views, of_scene: int, generator: torch.Generator) -> Views:
+    """The same views with half of the scenes mirrored and the colours of all exchanged: as good as new ones.
+
+    A mirror turns left and right about in the images and in the world.
+    """
+    draw, scenes = _Draw(generator), len(views.depth) // of_scene
+    mirror = draw.chance(0.5, scenes).repeat_interleave(of_scene)
+    channel = draw.uniform(0, 1, scenes, 3).argsort(1).repeat_interleave(of_scene, 0)
+    images = views.images.gather(1, channel[..., None, None].expand_as(views.images))
+    sign = torch.ones(len(mirror), 4, device=mirror.device)
+    sign[mirror, 0] = -1
+    return Views(
+        torch.where(mirror[:, None, None, None], images.flip(-1), images),
+        torch.where(mirror[:, None, None], views.depth.flip(-1), views.depth),
+        sign[:, :, None] * views.world_from_camera * sign[:, None],
+        views.focal_px,
+    )
+
+
 class Surfaces(NamedTuple):
     """How the solids of n views look."""
 

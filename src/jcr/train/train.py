@@ -14,10 +14,10 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from jcr.errors import InputError
 from jcr.files import write_text, written_whole
-from jcr.reconstruct.dust3r.network import Dust3r, Features
+from jcr.reconstruct.dust3r.network import Dust3r, Features, Pointmap
 from jcr.train.loss import attention_miss, confident_regression, true_attention
 from jcr.train.options import TrainOptions
-from jcr.train.scenes import Views, draw_views, narrowed, pairs_of, points_in_camera, seen_by
+from jcr.train.scenes import Views, disguised, draw_views, narrowed, pairs_of, points_in_camera, seen_by
 from jcr.train.textures import make_textures
 from jcr.train.validate import capture_views, pair_errors, summary
 
@@ -25,8 +25,8 @@ FREE = {"steps", "minutes", "save_every", "validate_every", "captures", "device"
 """Options that may change when a training goes on."""
 HELD_OUT_SEED = 1 << 31
 """Of scenes that no training draws; torch's CPU generator tells only the lowest 32 bits apart."""
-SAMPLE = 4
-"""Every how many rows and columns of pixels it is found out what the other view sees."""
+SAMPLES = 4
+"""Rows and columns of a token's pixels for which it is found out where the other view sees them."""
 
 
 class Training:
@@ -58,13 +58,15 @@ class Training:
             ),
             torch.optim.AdamW(outer, options.adam_rate, (0.9, 0.98), weight_decay=options.weight_decay),
         ]
-        self.bank: tuple[int, Tensor] | None = None
+        self.pool: tuple[int, Views] | None = None
 
     def advance(self) -> dict[str, float]:
         """One step: its losses."""
         options = self.options
         views = self.views(self.step)
         first, second = pairs_of(views, options.scene)
+        if options.shared_decoder:
+            first, second = (x[first < second] for x in (first, second))
         self._set_rates()
         decoders = (self.network.dec_blocks, self.network.dec_blocks2)
         attended = [
@@ -73,14 +75,18 @@ class Training:
             for decoder in decoders
         ]
         inputs: list[tuple[Tensor, ...]] = []
-        hooks = [a.register_forward_pre_hook(lambda _, args: inputs.append(args)) for a in attended]
+        # A shared decoder is one module, which has one hook and is called once for each view.
+        hooks = [
+            a.register_forward_pre_hook(lambda _, args: inputs.append(args)) for a in dict.fromkeys(attended)
+        ]
         # Of these few tokens plain attention is the quickest on a CPU.
         backend = SDPBackend.MATH if self.device.type == "cpu" else SDPBackend.EFFICIENT_ATTENTION
         with sdpa_kernel([backend, SDPBackend.MATH]):
-            predicted = predict(self.network, views.images, first, second)
+            predicted = predict(self.network, views.images, first, second, options.shared_decoder)
             for hook in hooks:
                 hook.remove()
-            true = true_points(views, first, second)
+            orders = ((first, second), (second, first))[: 1 + options.shared_decoder]
+            true = true_points(views, *(torch.cat(x) for x in zip(*orders, strict=True)))
             loss, distance = confident_regression(predicted, true, options.alpha)
             log = {"loss": loss, "distance": distance}
             if options.attention:
@@ -97,17 +103,31 @@ class Training:
         decay = min(options.ema, self.step / (10 + self.step))
         for key, value in self.network.state_dict().items():
             self.averaged[key].lerp_(value, 1 - decay)
-        return {key: value.item() for key, value in log.items()} | {"pairs": len(first)}
+        return {key: value.item() for key, value in log.items()} | {"pairs": len(true[0])}
 
-    def views(self, step: int, scenes: int | None = None) -> Views:
+    def views(self, step: int) -> Views:
         """The views that a step trains on."""
         options = self.options
-        number = step // options.bank_steps
-        if self.bank is None or self.bank[0] != number:
-            self.bank = number, make_textures(options.textures, self._generator(2 * number + 1))
-        count = scenes or options.scenes_per_step
+        number, step_of_pool = divmod(step, options.pool_steps * options.replays)
+        if self.pool is None or self.pool[0] != number:
+            self.pool = number, self._draw_pool(number)
+        replay, turn = divmod(step_of_pool, options.pool_steps)
+        generator = self._generator(2, step - turn)
+        scenes = options.scenes_per_step
+        order = torch.randperm(options.pool_steps * scenes, generator=generator, device=self.device)
+        here = order[turn * scenes : (turn + 1) * scenes]
+        rows = here[:, None] * options.scene.views + torch.arange(options.scene.views, device=self.device)
+        return disguised(
+            Views(*(x[rows.flatten()] for x in self.pool[1])), options.scene.views, self._generator(3, step)
+        )
+
+    def _draw_pool(self, number: int) -> Views:
+        options = self.options
+        bank = make_textures(options.textures, self._generator(1, number // options.bank_pools))
+        step = number * options.pool_steps * options.replays
         width = min(1.0, (1 + 2 * step / max(1.0, options.widen * options.steps)) / 3)
-        return draw_views(count, narrowed(options.scene, width), self.bank[1], self._generator(2 * step))
+        scenes = options.pool_steps * options.scenes_per_step
+        return draw_views(scenes, narrowed(options.scene, width), bank, self._generator(0, number))
 
     def averaged_network(self) -> Dust3r:
         """The network with the averaged weights."""
@@ -157,10 +177,10 @@ class Training:
         for optimizer, value in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(value)
 
-    def _generator(self, number: int) -> torch.Generator:
-        """For one purpose at one step of one seed."""
+    def _generator(self, purpose: int, number: int) -> torch.Generator:
+        """For one of four purposes at one step, or of one pool or bank, of one seed."""
         return torch.Generator(self.device).manual_seed(
-            (self.options.seed * 100_003_001 + number) % HELD_OUT_SEED
+            (self.options.seed * 100_003_001 + 4 * number + purpose) % HELD_OUT_SEED
         )
 
     def _set_rates(self) -> None:
@@ -173,11 +193,13 @@ class Training:
                 group["lr"] = rate * rise * fall
 
     def _attention_miss(self, views: Views, first: Tensor, second: Tensor, attended, inputs) -> Tensor:
-        size = (self.options.scene.width, self.options.scene.height)
+        options = self.options
+        size, sample = (options.scene.width, options.scene.height), max(1, options.patch // SAMPLES)
         there, back = (
-            true_attention(*seen_by(views, a, b, SAMPLE), size) for a, b in ((first, second), (second, first))
+            true_attention(*seen_by(views, a, b, sample), size, options.patch)
+            for a, b in ((first, second), (second, first))
         )
-        trues = (there, back) * len(self.options.attention_blocks)
+        trues = (there, back) * len(options.attention_blocks)
         misses = [attention_miss(a, x, true) for a, x, true in zip(attended, inputs, trues, strict=True)]
         return torch.stack(misses).mean()
 
@@ -214,6 +236,8 @@ def train(options: TrainOptions) -> None:
 def new_network(options: TrainOptions) -> Dust3r:
     """An untrained network whose points all lie a unit ahead of the camera."""
     network = Dust3r(**configuration(options))
+    if options.shared_decoder:
+        network.dec_blocks2 = network.dec_blocks
     for module in network.modules():
         if isinstance(module, nn.Linear):
             nn.init.trunc_normal_(module.weight, std=0.02)
@@ -235,6 +259,8 @@ def configuration(options: TrainOptions) -> dict[str, Any]:
         "dec_num_heads": options.heads,
         "head_type": "linear",
         "pos_embed": "RoPE100+cosine",
+        "patch_size": options.patch,
+        "patch_embed_cls": "ConvolutionalStem" if options.stem == "convolutions" else "PatchEmbedDust3R",
     }
 
 
@@ -242,7 +268,12 @@ def write_weights(folder: Path, state: dict[str, Tensor], options: TrainOptions)
     """model.safetensors in half precision and config.json, whole or not at all."""
     from safetensors.torch import save_file
 
-    half = {key: value.detach().to("cpu", torch.float16).contiguous() for key, value in state.items()}
+    half = {
+        key: value.detach().to("cpu", torch.float16).contiguous()
+        for key, value in state.items()
+        # Where there is no second decoder, the first one is read for it.
+        if not (options.shared_decoder and key.startswith("dec_blocks2."))
+    }
     with written_whole(folder / "model.safetensors") as temporary:
         save_file(half, temporary)
     size = [options.scene.width, options.scene.height]
@@ -250,10 +281,16 @@ def write_weights(folder: Path, state: dict[str, Tensor], options: TrainOptions)
     write_text(folder / "config.json", json.dumps(content, indent=1) + "\n")
 
 
-def predict(network: Dust3r, images: Tensor, first: Tensor, second: Tensor):
-    """Pointmaps of pairs of images (n,3,h,w), each image being encoded once."""
+def predict(
+    network: Dust3r, images: Tensor, first: Tensor, second: Tensor, both_orders: bool = False
+) -> tuple[Pointmap, Pointmap]:
+    """Pointmaps of pairs of images (n,3,h,w), each image being encoded once.
+
+    `both_orders`, of a shared decoder: the pairs, and then the same ones the other way round.
+    """
     features = network.encode(images)
-    return network.decode(*(Features(features.tokens[rows], features.grid) for rows in (first, second)))
+    pairs = (Features(features.tokens[rows], features.grid) for rows in (first, second))
+    return (network.decode_both_orders if both_orders else network.decode)(*pairs)
 
 
 def true_points(views: Views, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

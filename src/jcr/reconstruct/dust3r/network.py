@@ -5,11 +5,15 @@ Weinzaepfel et al., ICCV 2023); a head per view turns tokens into a 3D point and
 either linear or a dense prediction transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are those of
 the published checkpoints, because they are the keys of the state dict.
 
-Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
+Beside the published shapes there are two for small networks: patches of 4 or 8 pixels, and a stem of
+convolutions that makes the tokens (Xiao et al., NeurIPS 2021).
+
+Shapes: b images or pairs, n tokens = h/p · w/p with patches of p pixels (16 where published), c channels.
 """
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -69,13 +73,17 @@ class Dust3r(nn.Module):
         landscape_only: bool = False,
         freeze: str = "none",
     ) -> None:
-        """The last four say how the published network was trained and change nothing here."""
+        """The last three say how the published network was trained and change nothing here."""
         super().__init__()
         frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)(\+cosine)?", pos_embed)
         expected = {
             "pos_embed": (pos_embed, frequency, "RoPE100 or RoPE100+cosine"),
             "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
-            "patch_size": (patch_size, patch_size == PATCH, PATCH),
+            "patch_size": (
+                patch_size,
+                patch_size == PATCH or (patch_size in (4, 8) and head_type == "linear"),
+                f"{PATCH}, or with a linear head 4 or 8",
+            ),
             "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
             "depth_mode": (
                 depth_mode,
@@ -96,7 +104,9 @@ class Dust3r(nn.Module):
         self.mixed_precision: bool | None = None
         """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
 
-        self.patch_embed = PatchEmbed(enc_embed_dim)
+        self.patch = patch_size
+        stem = patch_embed_cls == "ConvolutionalStem"
+        self.patch_embed = (ConvolutionalStem if stem else PatchEmbed)(enc_embed_dim, patch_size)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_embed_dim))  # only its pre-training used it
         self.enc_blocks = nn.ModuleList(
             EncoderBlock(enc_embed_dim, enc_num_heads, mlp_ratio) for _ in range(enc_depth)
@@ -108,9 +118,12 @@ class Dust3r(nn.Module):
             for _ in range(2)
         )
         self.dec_norm = nn.LayerNorm(dec_embed_dim, eps=1e-6)
-        head = LinearHead if head_type == "linear" else DptHead
-        self.downstream_head1 = head(enc_embed_dim, dec_embed_dim, dec_depth)
-        self.downstream_head2 = head(enc_embed_dim, dec_embed_dim, dec_depth)
+        self.downstream_head1, self.downstream_head2 = (
+            LinearHead(dec_embed_dim, patch_size)
+            if head_type == "linear"
+            else DptHead(enc_embed_dim, dec_embed_dim, dec_depth)
+            for _ in range(2)
+        )
 
     def forward(
         self,
@@ -119,7 +132,7 @@ class Dust3r(nn.Module):
         true_shape1: Int[Tensor, "b 2"] | None = None,
         true_shape2: Int[Tensor, "b 2"] | None = None,
     ) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16.
+        """Pointmaps of images in [-1, 1] whose height and width are multiples of the patch.
 
         A row whose true (height, width) is the transpose of the tensor's is a portrait image that was laid
         down to batch it with landscape ones; it is stood up for the network, its pointmap laid down again.
@@ -146,12 +159,12 @@ class Dust3r(nn.Module):
 
         With `many_pairs` the heads' finest level is made here too, a fifth of a head's work, and kept.
         """
-        if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
+        if images.shape[-2] % self.patch or images.shape[-1] % self.patch:
             raise ValueError(
-                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
+                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {self.patch}"
             )
         with self._autocast(images):
-            grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
+            grid = (images.shape[-2] // self.patch, images.shape[-1] // self.patch)
             rotary = rotary_embedding(grid_positions(grid, images.device), self.head_dims[0], self.rope_base)
             # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
             x = self.patch_embed(images).float()
@@ -173,6 +186,16 @@ class Dust3r(nn.Module):
             return (
                 self.downstream_head1(layers1, features1.grid, features1.finest[0]),
                 self.downstream_head2(layers2, features2.grid, features2.finest[1]),
+            )
+
+    def decode_both_orders(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
+        """What `decode` gives for (1, 2), and below it that for (2, 1), where one decoder serves both views."""
+        with self._autocast(features1.tokens):
+            last = [layers[-1] for layers in self.decoder_layers(features1, features2)]
+            one, other = torch.cat(last), torch.cat(last[::-1])
+            return (
+                self.downstream_head1([one], features1.grid),
+                self.downstream_head2([other], features1.grid),
             )
 
     def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
@@ -223,20 +246,44 @@ def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -
 
 def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b heads n d"]:
     """Turn queries or keys by their position: the first half of a head's channels by y, the second by x."""
-    cos, sin = rotary
-    a, b = x.unflatten(-1, (2, 2, -1)).unbind(-2)
-    return torch.stack([a * cos - b * sin, b * cos + a * sin], -2).flatten(-3).to(x.dtype)
+    # Each half of the channels holds pairs (a, b), all a before all b: a cos - b sin and b cos + a sin. Whole rows
+    # and a small matrix are several times as quick as slices of a few channels.
+    cos, sin = rotary.to(x.dtype).repeat_interleave(2, -2).flatten(-2)
+    frequencies = rotary.shape[-1]
+    quarter = torch.eye(2 * frequencies, dtype=x.dtype, device=x.device).roll(frequencies, 1)
+    quarter[frequencies:] *= -1
+    return torch.addcmul(x * cos, x @ torch.block_diag(quarter, quarter), sin)
 
 
 class PatchEmbed(nn.Module):
-    """A token per 16x16 patch."""
+    """A token per patch, linear in its pixels."""
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, patch: int) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
+        self.proj = nn.Conv2d(3, dim, patch, patch)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
         return self.proj(images).flatten(2).mT
+
+
+class ConvolutionalStem(nn.Module):
+    """A token per patch from convolutions that halve the image until a patch is left: learnt from fewer images."""
+
+    def __init__(self, dim: int, patch: int) -> None:
+        super().__init__()
+        halvings = patch.bit_length() - 1
+        widths = [3, *(dim >> k for k in reversed(range(halvings)))]
+        self.layers = nn.Sequential(
+            *(
+                layer
+                for wide, wider in pairwise(widths)
+                for layer in (nn.Conv2d(wide, wider, 3, 2, 1), nn.GroupNorm(1, wider), nn.GELU())
+            )
+        )
+        self.proj = nn.Conv2d(dim, dim, 3, 1, 1)
+
+    def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
+        return self.proj(self.layers(images)).flatten(2).mT
 
 
 class Attention(nn.Module):
@@ -315,11 +362,12 @@ def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
 
 
 class LinearHead(nn.Module):
-    """A 16x16 block of raw outputs from each token of the last layer."""
+    """A patch of raw outputs from each token of the last layer."""
 
-    def __init__(self, enc_dim: int, dec_dim: int, dec_depth: int) -> None:
+    def __init__(self, dec_dim: int, patch: int) -> None:
         super().__init__()
-        self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
+        self.patch = patch
+        self.proj = nn.Linear(dec_dim, 4 * patch**2)
 
     def finest(self, tokens: FeatureMap) -> None:
         """Nothing here comes from one image alone."""
@@ -327,7 +375,7 @@ class LinearHead(nn.Module):
     def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
-        return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
+        return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), self.patch))
 
 
 class DptHead(nn.Module):

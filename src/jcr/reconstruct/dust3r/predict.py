@@ -18,7 +18,7 @@ from jcr.errors import InputError
 from jcr.memory import ALLOWANCE, GB, MAP, announce, relieve, require, resident
 from jcr.progress import Progress, silent
 from jcr.reconstruct.dust3r.alignment import AlignOptions
-from jcr.reconstruct.dust3r.network import PATCH, DptHead, Dust3r, Features
+from jcr.reconstruct.dust3r.network import DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
 from jcr.reconstruct.dust3r.pairs import (
     FEW_IMAGES,
@@ -64,7 +64,7 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
     weights = sum(
         x.numel() * x.element_size() * (2 if twice and x.ndim == 4 else 1) for x in network.parameters()
     )
-    pixels, tokens = height * width, height * width // PATCH**2
+    pixels, tokens = height * width, height * width // network.patch**2
     enc_dim, dec_dim = network.decoder_embed.in_features, network.decoder_embed.out_features
     # Every layer of both views is kept for the heads; a block works on about 12 arrays of its width.
     blocks = 4 * tokens * (2 * (len(network.dec_blocks) + 1) * dec_dim + 12 * max(enc_dim, dec_dim))
