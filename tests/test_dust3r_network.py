@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +12,7 @@ import pytest
 import torch
 from torch import nn
 
+from jcr.memory import give_back
 from jcr.reconstruct.dust3r.network import (
     Dust3r,
     Features,
@@ -44,6 +46,14 @@ def seeded_network(config: str, seed: int) -> Dust3r:
     weights = seeded_weights().fill(network.state_dict(), seed)
     network.load_state_dict({key: torch.from_numpy(value) for key, value in weights.items()}, assign=True)
     return network.eval()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def networks_given_back() -> Iterator[None]:
+    """The published network holds 2.3 GB, which the tests that follow in the process need not carry along."""
+    yield
+    seeded_network.cache_clear()
+    give_back()
 
 
 def fixture(name: str) -> tuple[dict[str, torch.Tensor], Dust3r]:
