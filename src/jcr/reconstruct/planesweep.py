@@ -9,8 +9,6 @@ twice as many confident points were off by more than 2 %, all around the objects
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import repeat
 from typing import TypeVar
@@ -25,6 +23,7 @@ from torch.nn import functional as F
 from jcr.geometry import inverse
 from jcr.memory import ALLOWANCE, GB, relieve, resident
 from jcr.reconstruct.lens import rays, resized
+from jcr.reconstruct.threads import threads_of_one_core
 from jcr.records import Intrinsics
 
 _T = TypeVar("_T")
@@ -136,7 +135,7 @@ def plane_sweep(
         room -= threads * pixels * BYTES_OF_THREAD
         together = max(1, min(m, int(room // (pixels * sweep.shape[1] * BYTES_OF_PLANE))))
 
-    with _threads_over_images(device, threads) as pool:
+    with threads_of_one_core(device, threads) as pool:
         groups = [range(start, min(start + together, m)) for start in range(0, m, together)]
         found = []
         for rows in groups:
@@ -157,21 +156,6 @@ def plane_sweep(
         believed &= count > 2 * through
     confidence = torch.where(believed, score.clamp(max=1) * count, 0.0)
     return (1 / inverse_depth).double().cpu().numpy(), confidence.double().cpu().numpy()
-
-
-@contextmanager
-def _threads_over_images(device: torch.device, count: int) -> Iterator[Executor]:
-    """So many threads, each to work on images of its own.
-
-    Torch's own threads wait for each other after every one of thousands of short steps.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(count if device.type == "cpu" else 1) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _told(results: Iterable[_T], report: Callable[[float], None], start: float, share: float) -> Iterator[_T]:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
+from jcr.reconstruct.threads import threads_of_one_core
 from jcr.records import PointCloud
-from jcr.represent.chunks import threads_of_one_core
 from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions

@@ -1,9 +1,8 @@
 """Many points in pieces that fit a processor's cache, on all its cores."""
 
 import itertools
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from torch import Tensor
@@ -31,19 +30,3 @@ def in_chunks(ask: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple
             answers = list(pool.map(answer, pieces))
     with torch.inference_mode(not wanted):
         return tuple(torch.cat(column) for column in itertools.zip_longest(*answers))
-
-
-@contextmanager
-def threads_of_one_core(device: torch.device) -> Iterator[Executor]:
-    """A thread for each core, in which torch works without threads of its own.
-
-    Those wait for each other, spinning, after each of thousands of short operations: where another process takes
-    one core, the training that should last a second lasted a minute.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads if device.type == "cpu" else 1) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
