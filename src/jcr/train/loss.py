@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from jcr.reconstruct.dust3r.network import CrossAttention, Pointmap, rotate
+from jcr.reconstruct.dust3r.network import CrossAttention, Pointmap
 
 
 def confident_regression(
@@ -69,11 +69,6 @@ def attention_miss(
     Not in the paper: a network this small, trained this little, is slow to find out on its own that
     correspondences are worth looking for.
     """
-    x, y, rotary_x, rotary_y = inputs
-    q, k = (
-        project(tokens).unflatten(-1, (attention.heads, -1)).transpose(1, 2)[:, : attention.heads // 2 or 1]
-        for project, tokens in ((attention.projq, x), (attention.projk, y))
-    )
-    logits = (rotate(q, rotary_x) @ rotate(k, rotary_y).mT).float() / q.shape[-1] ** 0.5
+    logits = attention.matching_scores(*inputs)
     miss = -(true[:, None] * F.log_softmax(logits, -1)).sum((2, 3)).mean(1)
     return miss.sum() / true.sum().clamp(min=1)

@@ -213,6 +213,28 @@ class Dust3r(nn.Module):
         layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
         return layers1, layers2
 
+    def matching_attention(
+        self, features1: Features, features2: Features, block: int
+    ) -> tuple[Float[Tensor, "b n m"], Float[Tensor, "b m n"]]:
+        """Where a decoder block's cross-attention looks from each token of one image in the other, both ways round.
+
+        Of the heads that `jcr.train` teaches to look where the same points are; published networks have none.
+        """
+        with self._autocast(features1.tokens):
+            rotary = [
+                rotary_embedding(grid_positions(f.grid, f.tokens.device), self.head_dims[1], self.rope_base)
+                for f in (features1, features2)
+            ]
+            x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
+            for block1, block2 in zip(self.dec_blocks[:block], self.dec_blocks2[:block], strict=True):
+                x1, x2 = block1(x1, x2, *rotary), block2(x2, x1, *rotary[::-1])
+            one, other = (blocks.get_submodule(str(block)) for blocks in (self.dec_blocks, self.dec_blocks2))
+            assert isinstance(one, DecoderBlock) and isinstance(other, DecoderBlock)
+            return (
+                one.matching_scores(x1, x2, *rotary).softmax(-1).mean(1),
+                other.matching_scores(x2, x1, *rotary[::-1]).softmax(-1).mean(1),
+            )
+
     @property
     def device(self) -> torch.device:
         """Where the weights are."""
@@ -317,6 +339,16 @@ class CrossAttention(nn.Module):
         out = F.scaled_dot_product_attention(rotate(q, rotary_x), rotate(k, rotary_y), v)
         return self.proj(out.transpose(1, 2).flatten(2))
 
+    def matching_scores(
+        self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary
+    ) -> Float[Tensor, "b half n m"]:
+        """Logits of the first half of the heads, those that are taught to look where the same points are."""
+        q, k = (
+            project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)[:, : self.heads // 2 or 1]
+            for project, tokens in ((self.projq, x), (self.projk, y))
+        )
+        return (rotate(q, rotary_x) @ rotate(k, rotary_y).mT).float() / q.shape[-1] ** 0.5
+
 
 class Mlp(nn.Module):
     def __init__(self, dim: int, ratio: float) -> None:
@@ -352,6 +384,13 @@ class DecoderBlock(nn.Module):
         x = x + self.attn(self.norm1(x), rotary_x)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
+
+    def matching_scores(
+        self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary
+    ) -> Float[Tensor, "b half n m"]:
+        """Those of the cross-attention."""
+        x = x + self.attn(self.norm1(x), rotary_x)
+        return self.cross_attn.matching_scores(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
 
 
 def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
