@@ -278,7 +278,7 @@ def test_jcr_models_lists_licences_scale_and_what_is_present(capsys: pytest.Capt
 def test_the_weights_in_a_folder_say_their_licence_size_and_accuracy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = TrainOptions(tmp_path, embed=48, encoder_depth=1, decoder_depth=1, licence="MIT")
+    options = TrainOptions(tmp_path, embed=48, encoder_depth=1, decoder_depth=2, licence="MIT")
     write_weights(tmp_path, new_network(options).state_dict(), options)
     loaded = load_weights(tmp_path)
     assert loaded.licence == "MIT" and loaded.size == (128, 96) and loaded.network.absolute_position
@@ -286,7 +286,11 @@ def test_the_weights_in_a_folder_say_their_licence_size_and_accuracy(
     monkeypatch.setitem(CHECKPOINTS, "compact", checkpoint)
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | {"accuracy": "9 mm"}))
-    assert checkpoint.is_cached() and load_weights(tmp_path).size == (128, 96)
+    assert checkpoint.is_cached() and load_weights(tmp_path).matching_block == 1
+    (tmp_path / "config.json").write_text(json.dumps(config | {"matching_block": 2}))
+    with pytest.raises(InputError, match="matching_block"):
+        load_weights(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(config | {"accuracy": "9 mm"}))
     assert dispatch(["models"]) == 0
     assert f"compact      {tmp_path}" in (listed := capsys.readouterr().out) and "accuracy: 9 mm" in listed
     (tmp_path / "model.safetensors").unlink()

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, rotation_between_deg, transform
+from jcr.reconstruct.dust3r.attended import of_pairs
 from jcr.reconstruct.epipolar import EpipolarHandEye, Matches, hand_eye_from_matches
 from jcr.records import Intrinsics
 
@@ -66,10 +67,27 @@ def test_matches_pixels_off_and_wrong_by_a_third_do_too(seed: int):
     assert mm < 20 and deg < 2.5
 
 
+def test_tokens_that_look_at_each_other_are_matches_and_others_are_not():
+    """Two images of 2 x 3 tokens: token 1 is seen as 4, a little towards 5; token 0 looks where nobody looks back."""
+    there, back = np.full((1, 6, 6), 0.01), np.full((1, 6, 6), 0.01)
+    there[0, 1, [4, 5]] = 0.75, 0.2
+    back[0, 4, 1] = 0.95
+    there[0, 0, 2] = 0.9
+    first, second, place1, place2, weight = of_pairs(np.array([3]), np.array([7]), there, back, (2, 3))
+    assert first.tolist() == [3, 3] and second.tolist() == [7, 7]
+    np.testing.assert_allclose(weight, np.sqrt(0.75 * 0.95))
+    np.testing.assert_allclose(place1[0], [1, 0])
+    np.testing.assert_allclose(place2[1], [1, 1])
+    # All columns are within one of the middle column: (0.75 * 1 + 0.2 * 2 + ...) over the sum.
+    row = there[0, 1]
+    np.testing.assert_allclose(place2[0], [row @ [0, 1, 2, 0, 1, 2] / row.sum(), row[3:].sum() / row.sum()])
+    assert 1.1 < place2[0, 0] < 1.3
+
+
 def test_what_does_not_fit_the_motion_is_refused():
-    matches, base_from_gripper, _ = seen(0, 1.0, 0.0)
+    matches, base_from_gripper, _ = seen(0, 1.0, 0.9)
     with pytest.raises(NotTrustedError, match="fit the robot's motion"):
-        hand_eye_from_matches(matches, base_from_gripper[::-1], PINHOLE)
+        hand_eye_from_matches(matches, base_from_gripper, PINHOLE)
     with pytest.raises(NotTrustedError, match="places were found again"):
         hand_eye_from_matches(matches.rows(np.arange(10)), base_from_gripper)
     with pytest.raises(InputError, match="3 or more"):

@@ -259,6 +259,20 @@ def test_attention_is_told_where_the_same_points_are(views: Views):
     assert miss.item() == pytest.approx(np.log(48), abs=0.1)
 
 
+def test_what_is_asked_for_matches_is_what_is_taught(views: Views):
+    network = training.new_network(TrainOptions(Path(), embed=48, encoder_depth=1, decoder_depth=2, patch=16))
+    features = network.encode(views.images[:4])
+    seen: list[tuple[torch.Tensor, ...]] = []
+    attention = network.dec_blocks[1].cross_attn
+    hook = attention.register_forward_pre_hook(lambda _, args: seen.append(args))
+    network.decode(features, features)
+    hook.remove()
+    there, back = network.matching_attention(features, features, 1)
+    torch.testing.assert_close(there, attention.matching_scores(*seen[0]).softmax(-1).mean(1))
+    torch.testing.assert_close(back, attention.matching_scores(*seen[1]).softmax(-1).mean(1))
+    torch.testing.assert_close(there.sum(-1), torch.ones(4, 48))
+
+
 def test_perfect_predictions_have_no_error_and_turned_ones_the_angle(views: Views):
     first, second = pairs_of(views, SceneOptions(views=3))
 
@@ -379,7 +393,7 @@ def test_twenty_steps_lower_the_loss_and_leave_weights_that_jcr_reads(tmp_path: 
 
     assert held_out(after) < 0.9 * held_out(before)
     loaded = load_weights(tmp_path / "run" / "weights")
-    assert loaded.size == (64, 48) and loaded.licence == "Apache-2.0"
+    assert loaded.size == (64, 48) and loaded.licence == "Apache-2.0" and loaded.matching_block == 1
     for key, value in loaded.network.state_dict().items():
         torch.testing.assert_close(value, after.averaged[key], atol=2e-3, rtol=2e-3)
     lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()

@@ -69,7 +69,7 @@ class EpipolarOptions:
     """Matches of the first round; the last one has all."""
     independent: float = 0.1
     """Share of the matches that errs on its own: neighbours err alike."""
-    least_share: float = 0.5
+    least_share: float = 0.3
     """Of the matches (by weight) that must lie within three times the last scale of their epipolar line, with the
     point ahead of both cameras."""
     seed: int = 0
@@ -113,7 +113,7 @@ def hand_eye_from_matches(
         np.zeros((options.starts, 3)),
         np.full(options.starts, np.log(FOCAL_PRIOR[0] * matches.size[0])),
     )
-    last = len(options.kept) - 1
+    last, noise_px = len(options.kept) - 1, 0.0
     for step, (noise, kept) in enumerate(zip(options.noise_px, options.kept, strict=True)):
         part, sample = problem, options.sample * (step + 1)
         if step < last and sample < len(matches):

@@ -53,7 +53,7 @@ class TrainOptions:
     attention: float = 0.5
     """Weight of the supervision of cross-attention; 0: none."""
     attention_blocks: tuple[int, ...] = (0, 1)
-    """Decoder blocks whose cross-attention is supervised."""
+    """Decoder blocks whose cross-attention is supervised; the last of them is asked for matches."""
     widen: float = 0.4
     """Share of the steps over which the views of a scene grow apart, from a third of their range to all of it."""
     ema: float = 0.999

@@ -278,6 +278,8 @@ def write_weights(folder: Path, state: dict[str, Tensor], options: TrainOptions)
         save_file(half, temporary)
     size = [options.scene.width, options.scene.height]
     content = configuration(options) | {"only_size": size, "licence": options.licence}
+    if options.attention:
+        content["matching_block"] = options.attention_blocks[-1]
     write_text(folder / "config.json", json.dumps(content, indent=1) + "\n")
 
 

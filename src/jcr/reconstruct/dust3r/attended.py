@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -26,9 +26,9 @@ def attended_matches(
     first, second = (torch.from_numpy(x) for x in np.triu_indices(len(images), 1))
     found = []
     for rows in torch.arange(len(first)).split(batch):
-        pair = (Features(features.tokens[x[rows]], features.grid) for x in (first, second))
-        there, back = (x.double().cpu().numpy() for x in network.matching_attention(*pair, block))
-        found.append(_of_pairs(first[rows].numpy(), second[rows].numpy(), there, back, features.grid))
+        one, other = (Features(features.tokens[x[rows]], features.grid) for x in (first, second))
+        there, back = (x.double().cpu().numpy() for x in network.matching_attention(one, other, block))
+        found.append(of_pairs(first[rows].numpy(), second[rows].numpy(), there, back, features.grid))
     rows, columns = features.grid
     i, j, px_i, px_j, weight = (np.concatenate(x) for x in zip(*found, strict=True))
     patch = network.patch
@@ -36,10 +36,14 @@ def attended_matches(
     return Matches(i, j, px_i, px_j, weight, (columns * patch, rows * patch))
 
 
-def _of_pairs(
-    first: ndarray, second: ndarray, there: Float[ndarray, "e n m"], back: Float[ndarray, "e m n"], grid
+def of_pairs(
+    first: Int[ndarray, " e"],
+    second: Int[ndarray, " e"],
+    there: Float[ndarray, "e n n"],
+    back: Float[ndarray, "e n n"],
+    grid: tuple[int, int],
 ) -> tuple[ndarray, ...]:
-    """Images, places (column, row in tokens) and weights of the matches of some pairs."""
+    """Images, places (column, row in tokens) and weights of the matches of some pairs, given both attentions."""
     rows, columns = grid
     both = there * back.transpose(0, 2, 1)
     of_one, of_other = both.argmax(2), both.argmax(1)

@@ -35,6 +35,8 @@ class LoadedNetwork:
     """Its points are meant to be in metres."""
     size: tuple[int, int] | None = None
     """Width and height of the images that it was trained on, where it knows no others."""
+    matching_block: int | None = None
+    """The decoder block whose cross-attention was taught to look where the same points are; None: there is none."""
 
 
 def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
@@ -57,6 +59,7 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
     licence = str(config.pop("licence", None) or licence_of(str(source)))
     size = _only_size(config)
     config.pop("accuracy", None)
+    matching = config.pop("matching_block", None)
     # MASt3R is this network with one more head, for matching, which we do without; its points are metric.
     mast3r = [key for key in state if ".head_local_features." in key]
     network = _build(config, {key: state[key] for key in state if key not in mast3r}, path)
@@ -65,8 +68,10 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
+    if matching is not None and not (isinstance(matching, int) and 0 <= matching < len(network.dec_blocks)):
+        raise InputError(f"{path}: its config.json names no decoder block by matching_block; fetch it again")
     _announce(str(source), licence)
-    return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r), size=size)
+    return LoadedNetwork(network, str(source), licence, bool(mast3r), size, matching)
 
 
 def _only_size(config: dict[str, object]) -> tuple[int, int] | None:
