@@ -6,7 +6,7 @@ robust weight that leaves out occluded views and gloss.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -64,8 +64,14 @@ class Points:
     x_px: Float[ndarray, "k 2"]
     color: Float32[ndarray, "k 3"]
     depth: Float[ndarray, " k"]
-    trusted: Bool[ndarray, " k"]
+    agreed: Bool[ndarray, " k"]
     """Whether most of the images that should see the point show its colour."""
+
+    def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
+        """Some of them."""
+        return Points(
+            self.host[kept], self.x_px[kept], self.color[kept], self.depth[kept], self.agreed[kept]
+        )
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,7 @@ def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[nda
     return host, np.column_stack([u, v])
 
 
-def along_ray(
+def on_rays(
     level: Level,
     cameras: Cameras,
     host: Int[ndarray, " k"],
@@ -129,30 +135,33 @@ def along_ray(
 ) -> tuple[Points, float]:
     """Points at those depths, of the ones tried for their host, at which the other images agree best with their colour.
 
-    `sigma` is the difference of colours that counts half. Trusted are points whose cost, a mean of r²/(r² + sigma²)
-    over the best views, is below `least`. Also returns the mean cost of all points.
+    `sigma` is the difference of colours that counts half. Points are agreed on whose cost, a mean of
+    r²/(r² + sigma²) over the best views, is below `least`. Also returns the mean cost of all points.
     """
     color = level.color.reshape(level.count, level.grid.height, level.grid.width, 3)[host, x_px[:, 1], x_px[:, 0]]
     points = Points(host, x_px.astype(float), color, depths[0, host], np.ones(len(host), bool))
-    cost = np.stack([_cost(level, cameras, _at(points, depth[host]), sigma) for depth in depths])
+    cost = np.stack([_cost(level, cameras, replace(points, depth=depth[host]), sigma) for depth in depths])
     best = cost.argmin(0)
     found = cost[best, np.arange(len(host))]
     return Points(host, points.x_px, color, depths[best, host], found < least), float(found.mean())
 
 
-def _at(points: Points, depth: Float[ndarray, " k"]) -> Points:
-    return Points(points.host, points.x_px, points.color, depth, points.trusted)
-
-
 def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
     """Mean cost of the views that agree best; 1 where fewer than two look there."""
     _, u, v, seen = project(level, cameras, points)
-    misfit = _squared(_sample(level.color, level, u, v) - points.color)
+    misfit = squared_misfit(level, points, u, v)
     misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
     count = seen.sum(0)
     kept = np.maximum(np.ceil(SEEN_BY * count), 2)
     total = np.where(np.arange(len(misfit))[:, None] < kept, misfit, 0).sum(0)
     return np.where(count < 2, 1.0, total / kept)
+
+
+def squared_misfit(
+    level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
+) -> Float32[ndarray, "n k"]:
+    """Squared difference of the colours at those pixels from the points' own."""
+    return _squared(_sample(level.color, level, u, v) - points.color)
 
 
 def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
@@ -198,10 +207,10 @@ def _sample(stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndar
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
-    """Mean robust misfit, 0 to 1, of the views of trusted points."""
+    """Mean robust misfit, 0 to 1, of the views of points agreed on."""
     _, u, v, seen = project(level, cameras, points)
-    misfit = _squared(_sample(level.color, level, u, v) - points.color)
-    weight = seen & points.trusted
+    misfit = squared_misfit(level, points, u, v)
+    weight = seen & points.agreed
     return float((weight * misfit / (misfit + np.float32(sigma**2))).sum() / max(weight.sum(), 1))
 
 
@@ -245,14 +254,12 @@ def _linearised(
     turn = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
     for start in range(0, len(points.host), _CHUNK):
         rows = slice(start, start + _CHUNK)
-        some = Points(
-            points.host[rows], points.x_px[rows], points.color[rows], points.depth[rows], points.trusted[rows]
-        )
+        some = points.where(rows)
         x, u, v, seen = project(level, cameras, some)
         residual, by_u, by_v = (_sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
         residual = residual - some.color
         # Geman and McClure's weight.
-        weight = (seen & some.trusted) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
+        weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
         root = np.sqrt(weight, dtype=np.float32)[..., None]
         x_in_host = in_host(level, cameras, some).astype(np.float32)
         other_from_host = turn[:, some.host]
