@@ -69,9 +69,7 @@ class Points:
 
     def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
         """Some of them."""
-        return Points(
-            self.host[kept], self.x_px[kept], self.color[kept], self.depth[kept], self.agreed[kept]
-        )
+        return Points(self.host[kept], self.x_px[kept], self.color[kept], self.depth[kept], self.agreed[kept])
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,9 @@ def on_rays(
     `sigma` is the difference of colours that counts half. Points are agreed on whose cost, a mean of
     r²/(r² + sigma²) over the best views, is below `least`. Also returns the mean cost of all points.
     """
-    color = level.color.reshape(level.count, level.grid.height, level.grid.width, 3)[host, x_px[:, 1], x_px[:, 0]]
+    color = level.color.reshape(level.count, level.grid.height, level.grid.width, 3)[
+        host, x_px[:, 1], x_px[:, 0]
+    ]
     points = Points(host, x_px.astype(float), color, depths[0, host], np.ones(len(host), bool))
     cost = np.stack([_cost(level, cameras, replace(points, depth=depth[host]), sigma) for depth in depths])
     best = cost.argmin(0)
@@ -183,9 +183,7 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
 
 def project(
     level: Level, cameras: Cameras, points: Points
-) -> tuple[
-    Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]
-]:
+) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
     """Points in every camera's frame, their pixels u and v, and whether they are in view; their host does not count."""
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
@@ -199,7 +197,9 @@ def project(
     return x, u, v, seen
 
 
-def _sample(stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray) -> Float32[ndarray, "n k 3"]:
+def _sample(
+    stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
+) -> Float32[ndarray, "n k 3"]:
     """Bilinear samples of every image at its own pixels."""
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
@@ -221,7 +221,9 @@ def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied
     normal = np.zeros((p, p))
     gradient, by_depth = np.zeros((k, p)), np.zeros((k, p))
     depth_gradient, information = np.zeros(k), np.zeros(k)
-    for rows, residual, by_target, by_host, by_focal, by_log_depth in _linearised(level, cameras, points, sigma):
+    for rows, residual, by_target, by_host, by_focal, by_log_depth in _linearised(
+        level, cameras, points, sigma
+    ):
         if tied:
             a = np.concatenate([by_target + by_host, by_focal[..., None]], -1)
         else:
@@ -268,7 +270,9 @@ def _linearised(
         moves[..., 3:6] = skew(x)
         moves[..., 6:9] = other_from_host
         moves[..., 9:12] = -other_from_host @ skew(x_in_host).astype(np.float32)
-        moves[..., 12] = (other_from_host @ (x_in_host * np.float32([-1, -1, 0]))[..., None])[..., 0]
+        moves[..., 12] = (other_from_host @ (x_in_host * np.array([-1, -1, 0], np.float32))[..., None])[
+            ..., 0
+        ]
         moves[..., 13] = (other_from_host @ x_in_host[..., None])[..., 0]
         z = np.maximum(x[..., 2:], np.float32(NEAREST))
         shift_u = (moves[..., 0, :] - x[..., :1] / z * moves[..., 2, :]) / z
@@ -277,5 +281,7 @@ def _linearised(
         shift_v *= np.float32(level.grid.fy * cameras.zoom)
         shift_u[..., 12] += u - np.float32(level.grid.cx)
         shift_v[..., 12] += v - np.float32(level.grid.cy)
-        j = (by_u * root)[..., None] * shift_u[..., None, :] + (by_v * root)[..., None] * shift_v[..., None, :]
+        j = (by_u * root)[..., None] * shift_u[..., None, :] + (by_v * root)[..., None] * shift_v[
+            ..., None, :
+        ]
         yield rows, residual * root, j[..., :6], j[..., 6:12], j[..., 12], j[..., 13]
