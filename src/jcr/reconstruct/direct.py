@@ -5,6 +5,11 @@ not known). That is little enough to find it from nothing: the cameras look at a
 viewing direction in the gripper's frame, and turns about it and tilts are tried all around, on images 15 pixels high.
 From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
 that what disagrees with the robot's motion shows.
+
+Measured without any start: 19 simulated captures of 5 to 15 images without texture, five of them without the lens, were
+calibrated to 0.1 to 5.6 mm (median 0.4 mm, 0.05°), each in less than 20 s of one core. Of four real ones three, to
+1.4, 1.8 and 17 mm of their references (the last says 12 mm itself: its views hardly turn); one, a chessboard alone,
+was refused.
 """
 
 from collections.abc import Sequence
