@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jcr.calibrate.calibrate import calibrate
 from jcr.capture.read import read_capture
@@ -64,6 +65,15 @@ def test_pictures_of_other_poses_are_refused(plain):
     )
     with pytest.raises(NotTrustedError, match="direct alignment"):
         reconstruct(mixed, SPARSE)
+
+
+def test_pictures_of_nothing_are_refused(plain, tmp_path):
+    capture, _ = plain
+    for name in capture.images:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", capture.image_size, (120, 110, 100)).save(tmp_path / name)
+    with pytest.raises(NotTrustedError, match="one colour"):
+        reconstruct(replace(capture, folder=tmp_path), SPARSE)
 
 
 def test_two_images_are_too_few(plain):

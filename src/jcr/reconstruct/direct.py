@@ -46,6 +46,8 @@ GUESSED_FOCAL = 0.8
 """In long sides, where nothing is known of the lens."""
 LEAST_AGREED = 0.25
 """Share of the points that the views must agree on in the end."""
+LEAST_POINTS = 100
+"""Fewer than this count as this many."""
 REGION = 0.05
 """m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
 
@@ -85,7 +87,7 @@ def reconstruct(
     level = levels[FINEST.height]
     cameras, points = aligned(level, cameras, FINEST, free_directions(cameras, held))
     report("direct alignment", 1.0)
-    if (agreed := points.agreed.mean()) < LEAST_AGREED:
+    if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
         raise NotTrustedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
             "take pictures that overlap more, of a scene that does not move or shine"

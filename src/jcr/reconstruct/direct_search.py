@@ -11,7 +11,7 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.direct_align import Found, Stage, aligned, axes_meet, judged, tied_directions
-from jcr.reconstruct.photometric import Cameras, Level
+from jcr.reconstruct.photometric import Cameras, Level, strongest
 
 TURNS, TILTS, TILT_DEG = 24, 6, 15.0
 """Starts about the viewing direction that the robot's poses suggest, which was off by 4 to 22° in five captures."""
@@ -38,6 +38,10 @@ def search(
     report: Progress,
 ) -> Found:
     """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
+    if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
+        raise NotTrustedError(
+            "direct alignment: the pictures show one colour and no edges; put different objects in view"
+        )
     directions = tied_directions(lens_held)
     screen = replace(COARSEST, per_image=SCREENED_POINTS)
 
