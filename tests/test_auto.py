@@ -49,13 +49,13 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 
 def test_the_best_whose_weights_are_here_comes_first(present: set[str], monkeypatch: pytest.MonkeyPatch):
-    assert candidates(ReconstructOptions()) == ("colmap",)
+    assert candidates(ReconstructOptions()) == ("colmap", "direct")
     present |= {"dust3r", "mapanything"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "mapanything", "colmap")
+    assert candidates(ReconstructOptions()) == ("dust3r", "mapanything", "colmap", "direct")
     present.add("mast3r")
     assert candidates(ReconstructOptions())[0] == "mast3r"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
-    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap")
+    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
     present.add("compact")
     assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "compact")
     assert candidates(ReconstructOptions("colmap")) == ("colmap",)
@@ -97,7 +97,8 @@ def auto_result(
     monkeypatch.setattr(auto, "reconstruct", door)
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
     capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
-    return auto.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions()), tried
+    best = auto.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
+    return best.reconstruction, tried
 
 
 def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
@@ -149,20 +150,22 @@ def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
         assert f"nor is colmap; {name} (held-out error" in kept.notes[0]
 
 
-def test_the_network_in_this_package_runs_only_where_colmap_has_nothing(
+def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
-    present.add("compact")
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good = problem.recon_from_camera
     shuffled = good[np.random.default_rng(4).permutation(8)]
-    kept, tried = auto_result(problem, {"colmap": shuffled, "compact": good}, monkeypatch)
-    assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
     nothing = NotTrustedError("0 of 8 images registered")
-    kept, tried = auto_result(problem, {"colmap": nothing, "compact": good}, monkeypatch)
-    assert tried == ["colmap", "compact"] and kept.backend == "compact"
-    assert "colmap gave nothing (0 of 8 images registered)" in kept.notes[0]
-    assert "far less accurate" in kept.notes[0]
+    for second in ("direct", "compact"):
+        kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
+        assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
+        kept, tried = auto_result(problem, {"colmap": shuffled, second: good}, monkeypatch)
+        assert tried == ["colmap", second] and kept.backend == second
+        kept, tried = auto_result(problem, {"colmap": nothing, second: good}, monkeypatch)
+        assert tried == ["colmap", second] and kept.backend == second
+        assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
+        present.add("compact")
 
 
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(

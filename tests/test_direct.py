@@ -56,6 +56,17 @@ def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     assert np.mean((height > -0.01) & (height < 0.25)) > 0.8
 
 
+def test_a_picture_of_another_pose_is_left_out_and_named(plain):
+    capture, truth = plain
+    poses = capture.base_from_gripper.copy()
+    poses[4] = poses[0]
+    reconstruction = reconstruct(replace(capture, base_from_gripper=poses), SPARSE)
+    assert reconstruction.image_index.tolist() == [0, 1, 2, 3, 5]
+    assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
+    x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
+    assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
+
+
 def test_pictures_of_other_poses_are_refused(plain):
     capture, truth = plain
     mixed = replace(

@@ -183,9 +183,10 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
     start = time.perf_counter()
     try:
         if state.get("reconstruct") == made_from:
-            reconstruction = read_reconstruction(folder / "reconstruction.npz")
+            reconstruction, hand_eye = read_reconstruction(folder / "reconstruction.npz"), None
         else:
-            reconstruction = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
+            best = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
+            reconstruction, hand_eye = best.reconstruction, best.hand_eye
             (folder / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
             give_back()  # what the back end worked with
             write_reconstruction(folder / "reconstruction.npz", reconstruction)
@@ -197,7 +198,7 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         write_text(folder / STATE, json.dumps(state, indent=2) + "\n")
         reconstructed = time.perf_counter()
         report("calibrate", 0.0)
-        hand_eye = calibrate_stage(capture, reconstruction, options.calibrate)
+        hand_eye = hand_eye or calibrate_stage(capture, reconstruction, options.calibrate)
         give_back()
         report("calibrate", 1.0)
     except NotTrustedError as error:

@@ -24,6 +24,7 @@ import torch
 from PIL import Image
 
 from jcr import pipeline
+from jcr.auto import Attempt
 from jcr.calibrate.calibrate import calibrate
 from jcr.calibrate.file import read_calibration
 from jcr.capture.read import read_capture
@@ -442,7 +443,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     out = tmp_path / "out"
     shutil.copytree(done, out)
     monkeypatch.setattr(
-        pipeline, "best_reconstruction", lambda *_: read_reconstruction(done / "reconstruction.npz")
+        pipeline, "best_reconstruction", lambda *_: Attempt(read_reconstruction(done / "reconstruction.npz"))
     )
     monkeypatch.setattr(pipeline, "write_reconstruction", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):

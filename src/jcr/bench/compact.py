@@ -1,4 +1,8 @@
-"""`jcr bench compact`: a small network on captures that it was not trained on, beside COLMAP."""
+"""`jcr bench compact`: a small network on captures that it was not trained on, beside COLMAP.
+
+Four ways to calibrate: its pointmaps aligned as DUSt3R's are; its matches alone; the back end `compact`, which is
+direct alignment started by these; and direct alignment without a network.
+"""
 
 import tempfile
 import time
@@ -17,6 +21,7 @@ from jcr.geometry import apply, inverse, rotation_between_deg, rotation_log
 from jcr.pipeline import RunOptions, RunResult, calibrate
 from jcr.reconstruct.backends import BackendName, ReconstructOptions
 from jcr.reconstruct.checkpoints import CHECKPOINTS
+from jcr.reconstruct.compact import CompactOptions, rough_hand_eye
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.truth import read_truth, true_depth, true_labels
@@ -25,6 +30,14 @@ from jcr.train.validate import PairErrors, capture_views, pair_errors, summary
 SEEDS = range(200, 203)
 """Of the scenes; validation while training looks at others."""
 IMAGES = 10
+WAYS: dict[str, BackendName | None] = {
+    "pointmaps": "dust3r",
+    "matches alone": None,
+    "compact": "compact",
+    "direct": "direct",
+    "colmap": "colmap",
+}
+"""Ways to calibrate, and the back end of each; None: no back end, the rough start of one."""
 
 
 @dataclass(frozen=True)
@@ -59,24 +72,24 @@ def run(captures: Path | None = None, weights: str | None = None) -> str:
         for texture in (True, False):
             surface = "textured" if texture else "untextured"
             errors: list[PairErrors] = []
-            found: dict[BackendName, list[Calibrated]] = {"compact": [], "colmap": []}
+            found: dict[str, list[Calibrated]] = {way: [] for way in WAYS}
             for seed in SEEDS:
                 folder = Path(name) / f"{surface}{seed}"
                 simulate(folder, SimulateOptions(images=IMAGES, seed=seed, texture=texture))
                 views = capture_views(folder, loaded.size)
                 first, second = (~torch.eye(IMAGES, dtype=torch.bool)).nonzero().T
                 errors.append(pair_errors(loaded.network, views, first, second))
-                for backend, of_backend in found.items():
-                    of_backend.append(calibrated(folder, backend, weights))
-                    rows.append(_line(f"{surface} {seed}", backend, of_backend[-1]))
+                for way, of_way in found.items():
+                    of_way.append(calibrated(folder, way, weights))
+                    rows.append(_line(f"{surface} {seed}", way, of_way[-1]))
             pairs = PairErrors(*(np.concatenate(values) for values in zip(*errors, strict=True)))
             pair_rows.append(f"| {surface} | " + " | ".join(str(v) for v in summary(pairs).values()) + " |")
-            for backend, of_backend in found.items():
-                middle = _median(of_backend)
-                rows.append(_line(f"**{surface}, median**", backend, middle))
-                found_all = np.isfinite(middle.mm)
-                off = f"{middle.mm:.1f} mm and {middle.deg:.2f}° off" if found_all else "nothing"
-                said.append(f"{backend} on {surface} scenes {off}")
+            for way, of_way in found.items():
+                middle = _median(of_way)
+                rows.append(_line(f"**{surface}, median**", way, middle))
+                off = f"{middle.mm:.2g} mm and {middle.deg:.2g}° off" if np.isfinite(middle.mm) else "nothing"
+                if way in ("matches alone", "compact", "colmap"):
+                    said.append(f"{way} on {surface} scenes {off}")
     real = _real(captures, weights) if captures is not None else []
     return "\n".join(
         [
@@ -90,7 +103,7 @@ def run(captures: Path | None = None, weights: str | None = None) -> str:
             "",
             "Points: median relative error. AUC: of the larger of both angles.",
             "",
-            "| capture | back end | offset mm | orientation ° | scale % | heights % | error in σ | trusted | s |",
+            "| capture | way | offset mm | orientation ° | scale % | heights % | error in σ | trusted | s |",
             "|---|---|---|---|---|---|---|---|---|",
             *rows,
             *real,
@@ -99,10 +112,25 @@ def run(captures: Path | None = None, weights: str | None = None) -> str:
     )
 
 
-def calibrated(folder: Path, backend: BackendName, weights: str) -> Calibrated:
-    """A simulated capture calibrated with a back end."""
-    result, seconds = _run(folder, backend, weights)
+def calibrated(folder: Path, way: str, weights: str) -> Calibrated:
+    """A simulated capture calibrated in one of the ways."""
+    if way == "matches alone":
+        return _by_matches(folder, weights, read_truth(folder).gripper_from_camera)
+    result, seconds = _run(folder, way, weights)
     return Calibrated(seconds=seconds) if result is None else scored(result, folder, seconds)
+
+
+def _by_matches(folder: Path, weights: str, true: Float[ndarray, "4 4"]) -> Calibrated:
+    """What the network's matches and the robot's motion say, before any colour is compared."""
+    begun = time.perf_counter()
+    found, _ = rough_hand_eye(read_capture(folder), CompactOptions(weights))
+    seconds = time.perf_counter() - begun
+    if isinstance(found, NotTrustedError):
+        return Calibrated(seconds=seconds)
+    x = found.gripper_from_camera
+    millimetres = 1e3 * float(np.linalg.norm(true[:3, 3] - x[:3, 3]))
+    degrees = float(rotation_between_deg(x[:3, :3], true[:3, :3]))
+    return Calibrated(millimetres, degrees, np.nan, np.nan, np.nan, False, seconds)
 
 
 def scored(result: RunResult, folder: Path, seconds: float = 0.0) -> Calibrated:
@@ -122,8 +150,12 @@ def scored(result: RunResult, folder: Path, seconds: float = 0.0) -> Calibrated:
     )
 
 
-def _run(folder: Path, backend: BackendName, weights: str) -> tuple[RunResult | None, float]:
-    options = RunOptions(ReconstructOptions(backend, weights=weights if backend == "compact" else None))
+def _run(folder: Path, way: str, weights: str) -> tuple[RunResult | None, float]:
+    backend = WAYS[way]
+    assert backend is not None
+    options = RunOptions(
+        ReconstructOptions(backend, weights=weights if backend in ("dust3r", "compact") else None)
+    )
     begun = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as out:
@@ -176,11 +208,11 @@ def _median(rows: list[Calibrated]) -> Calibrated:
     return replace(Calibrated(*np.median(numbers, axis=0).tolist()), trusted=bool(numbers[:, 5].all()))
 
 
-def _line(capture: str, backend: str, row: Calibrated) -> str:
+def _line(capture: str, way: str, row: Calibrated) -> str:
     numbers = (row.mm, row.deg, row.scale_percent, row.height_percent, row.sigmas)
     shown = ("" if np.isnan(x) else f"{x:.3g}" if np.isfinite(x) else "nothing" for x in numbers)
     trusted = "yes" if row.trusted else "no"
-    return f"| {capture} | {backend} | {' | '.join(shown)} | {trusted} | {row.seconds:.1f} |"
+    return f"| {capture} | {way} | {' | '.join(shown)} | {trusted} | {row.seconds:.1f} |"
 
 
 def _real(captures: Path, weights: str) -> list[str]:
@@ -188,10 +220,13 @@ def _real(captures: Path, weights: str) -> list[str]:
     rows = []
     for folder in sorted(path.parent for path in captures.glob("*/reference.json")):
         reference, _ = read_hand_eye(folder / "reference.json")
-        for backend in ("compact", "colmap"):
-            result, seconds = _run(folder, backend, weights)
+        for way in WAYS:
+            if way == "matches alone":
+                rows.append(_line(folder.name, way, _by_matches(folder, weights, reference)))
+                continue
+            result, seconds = _run(folder, way, weights)
             if result is None:
-                rows.append(_line(folder.name, backend, Calibrated(seconds=seconds)))
+                rows.append(_line(folder.name, way, Calibrated(seconds=seconds)))
                 continue
             x = result.hand_eye.gripper_from_camera
             off = np.concatenate([reference[:3, 3] - x[:3, 3], rotation_log(reference[:3, :3] @ x[:3, :3].T)])
@@ -205,5 +240,5 @@ def _real(captures: Path, weights: str) -> list[str]:
                 result.converged,
                 seconds,
             )
-            rows.append(_line(folder.name, backend, row))
+            rows.append(_line(folder.name, way, row))
     return rows

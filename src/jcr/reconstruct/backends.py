@@ -17,7 +17,7 @@ from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 BackendName = Literal[
-    "auto", "colmap", "compact", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"
+    "auto", "colmap", "compact", "direct", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"
 ]
 
 
@@ -26,8 +26,8 @@ class ReconstructOptions:
     """What turns images into camera poses and pointmaps."""
 
     backend: BackendName = "auto"
-    """auto takes the best one whose weights are on this machine (without downloaded ones: colmap), and a second
-    one, colmap or compact, where that is not to be trusted."""
+    """auto takes the best one whose weights are on this machine (without downloaded ones: colmap), and the next,
+    colmap or compact, where that is not to be trusted."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks and dense matching run."""
     seed: int = 0
@@ -77,7 +77,8 @@ BACKENDS = {
     row.name: row
     for row in (
         Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),
-        Backend("compact", CHECKPOINTS["compact"].licence, False, "jcr.reconstruct.backends:_dust3r"),
+        Backend("direct", "Apache-2.0", False, "jcr.reconstruct.backends:_direct"),
+        Backend("compact", CHECKPOINTS["compact"].licence, False, "jcr.reconstruct.backends:_compact"),
         Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
         Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
         Backend(
@@ -145,8 +146,9 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """What `auto` stands for here, the best first, or the one back end that was asked for.
 
     Networks whose uncertainty is known come before the one whose is not, metric ones before others; only those
-    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not. The
-    compact network comes last: it is far less accurate than COLMAP, where COLMAP finds anything.
+    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not. Direct
+    alignment comes last, started by the compact network where its weights are here: COLMAP matches what is printed
+    on things, it the colours of plain ones.
     """
     if options.backend != "auto":
         return (options.backend,)
@@ -158,7 +160,7 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     return (
         *(name for name in ranking if CHECKPOINTS[name].is_cached() and BACKENDS[name].is_installed()),
         "colmap",
-        *(("compact",) if CHECKPOINTS["compact"].is_cached() else ()),
+        "compact" if CHECKPOINTS["compact"].is_cached() else "direct",
     )
 
 
@@ -185,8 +187,26 @@ def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | 
     from jcr.reconstruct.dust3r.pairs import PairOptions
 
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
-    model = options.backend if options.backend in ("compact", "mast3r") else "dust3r"
+    model = "mast3r" if options.backend == "mast3r" else "dust3r"
     return reconstruct(capture, Dust3rOptions(model, options.weights, device_of(options), pairs), progress)
+
+
+def _direct(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.direct import DirectOptions, reconstruct
+
+    made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
+
+
+def _compact(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.compact import CompactOptions, reconstruct
+    from jcr.reconstruct.direct import DirectOptions
+    from jcr.reconstruct.epipolar import EpipolarOptions
+
+    device = device_of(options)
+    made = DirectOptions(device=device, memory_gb=options.memory_gb)
+    epipolar = EpipolarOptions(seed=options.seed)
+    return reconstruct(capture, CompactOptions(options.weights, device, epipolar, made), progress)
 
 
 def _mapanything(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:

@@ -47,6 +47,14 @@ class Level:
         """Number of images."""
         return len(self.color) // self.grid.height
 
+    def rows(self, which: Int[ndarray, " m"]) -> "Level":
+        """Some of the images."""
+        color, by_u, by_v = (
+            x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
+            for x in (self.color, self.by_u, self.by_v)
+        )
+        return Level(color, by_u, by_v, self.grid)
+
 
 @dataclass(frozen=True)
 class Cameras:
