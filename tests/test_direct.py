@@ -7,10 +7,11 @@ import pytest
 from PIL import Image
 
 from jcr.calibrate.calibrate import calibrate
+from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
-from jcr.reconstruct.direct import DirectOptions, reconstruct
+from jcr.reconstruct.direct import DirectOptions, evening, pyramid, reconstruct
 from jcr.reconstruct.direct_align import axes_meet, free_directions, moved
 from jcr.reconstruct.direct_search import starts_from_nothing
 from jcr.reconstruct.lens import rays
@@ -76,6 +77,18 @@ def test_pictures_of_other_poses_are_refused(plain):
     )
     with pytest.raises(NotTrustedError, match="direct alignment"):
         reconstruct(mixed, SPARSE)
+
+
+def test_images_of_different_exposure_are_evened(plain):
+    capture, truth = plain
+    images = [read_image(capture.folder / name) for name in capture.images]
+    level = pyramid(images, truth.intrinsics)[60]
+    cameras = Cameras(truth.base_from_camera)
+    np.testing.assert_array_equal(evening(level, cameras), 1)  # what differs is shading
+    factor = np.array([0.75, 1.3, 1.0, 0.9, 1.1, 1.0])
+    found = evening(level.times(factor), cameras) * factor
+    left = np.abs(np.log(found) - np.log(found).mean()).max()
+    assert left < 0.1 < 0.25 < np.abs(np.log(factor)).max()
 
 
 def test_pictures_of_nothing_are_refused(plain, tmp_path):

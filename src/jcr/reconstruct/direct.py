@@ -33,6 +33,7 @@ from jcr.reconstruct.photometric import (
     Level,
     Points,
     equations,
+    exposures,
     in_base,
     make_level,
     project,
@@ -43,6 +44,12 @@ from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tra
 FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
 """The robot has no say in these any more."""
 FINEST = Stage(240, 300, 3, 0.1)
+UNEVEN = Stage(60, 300, 1, 0.2)
+"""The same while the images may still be of different brightness."""
+EVENINGS = 3
+"""How often brightness is evened: each time more points agree."""
+EVEN_ENOUGH = 0.05
+"""Difference of log brightness below which it is left alone: shading and gloss look like as much."""
 GUESSED_FOCAL = 0.8
 """In long sides, where nothing is known of the lens."""
 LEAST_AGREED = 0.25
@@ -84,6 +91,8 @@ def reconstruct(
     levels = pyramid(images, lens)
     held = given is not None
     found = search(levels, capture.base_from_gripper, gripper_from_camera, held, report)
+    factor = evening(levels[FREED[0].height], found.cameras)
+    levels = {height: level.times(factor) for height, level in levels.items()}
     rows, cameras = fitting_images(levels[FREED[0].height], found.cameras, held)
     if len(rows) < len(capture):
         names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
@@ -109,6 +118,16 @@ def reconstruct(
     sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes)
     reconstruction = with_pointmaps(sparse, images, options, report, backend="direct")
     return replace(reconstruction, evidence=CameraEvidence(recon_from_camera, covariance))
+
+
+def evening(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
+    """By what to multiply the images so that they are equally bright, though the camera chose its exposure anew."""
+    factor = np.ones(level.count)
+    for _ in range(EVENINGS):
+        even = level.times(factor)
+        _, points = aligned(even, cameras, UNEVEN, np.zeros((7, 0)))
+        factor /= exposures(even, cameras, points, UNEVEN.sigma)
+    return factor if np.abs(np.log(factor)).max() > EVEN_ENOUGH else np.ones(level.count)
 
 
 def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int[ndarray, " m"], Cameras]:

@@ -26,6 +26,8 @@ NEAREST = 0.05
 _FAINT = 2.0 / 255
 """Change of colour per pixel below which a pixel says nothing of where it is."""
 _BORDER_PX = 2
+_SHARED = 5
+"""Points that two images must share before their brightness is compared."""
 _KEEP_DEPTH = 1e-3
 """Information that keeps a depth of which the images say nothing where it is."""
 _CHUNK = 500
@@ -54,6 +56,11 @@ class Level:
             for x in (self.color, self.by_u, self.by_v)
         )
         return Level(color, by_u, by_v, self.grid)
+
+    def times(self, factor: Float[ndarray, " n"]) -> "Level":
+        """With each image brighter or darker."""
+        of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
+        return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
 
 
 @dataclass(frozen=True)
@@ -212,6 +219,25 @@ def _sample(
     u = np.clip(u, 0, level.grid.width - 1)
     v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
+    """How bright each image is beside the others (their geometric mean is 1), from points that they share."""
+    _, u, v, seen = project(level, cameras, points)
+    shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
+    dark = 10 * _FAINT
+    used = seen & points.agreed & (shown > dark) & (own > dark)
+    used &= squared_misfit(level, points, u, v) < (2 * sigma) ** 2
+    ratio = np.log(np.maximum(shown, dark) / np.maximum(own, dark))
+    rows, values = [np.full(level.count, 1.0)], [0.0]
+    for image, host in np.ndindex(level.count, level.count):
+        of_pair = used[image] & (points.host == host)
+        if (count := of_pair.sum()) >= _SHARED:
+            row = np.zeros(level.count)
+            row[image], row[host] = np.sqrt(count), -np.sqrt(count)
+            rows.append(row)
+            values.append(np.sqrt(count) * np.median(ratio[image, of_pair]))
+    return np.exp(np.linalg.lstsq(np.stack(rows), np.array(values), rcond=None)[0])
 
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
