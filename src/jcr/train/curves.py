@@ -31,7 +31,7 @@ def draw(png: Path, folders: list[Path]) -> None:
                 [v["rotation_deg"] for k, v in look.items() if (k == "held-out scenes") == (style == "-")]
                 for _, look in looks
             ]
-            if all(found):
+            if all(found) and len(found) > 1:
                 medians = [np.median(values) for values in found]
                 rotation.plot(
                     [x for x, _ in looks], medians, f"C{number}.{style}", label=f"{folder.name}, {name}"
@@ -42,7 +42,7 @@ def draw(png: Path, folders: list[Path]) -> None:
     for axes in (losses, attention, rotation):
         axes.set_xlabel("thousand pairs seen")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc="upper right")
     with written_whole(png) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)
