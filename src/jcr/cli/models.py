@@ -57,7 +57,7 @@ def models() -> list[Model]:
         scale = "metres" if checkpoint.is_metric else "arbitrary"
         present = "yes" if checkpoint.is_cached() else "no: downloaded on first use"
         if name == "compact" and not checkpoint.is_cached():
-            present = "no: none in this version (docs/compact-model.md)"
+            present = "no: python -m jcr.train makes them (docs/compact-model.md)"
         if not BACKENDS[name].is_installed():
             present = "no: its package is missing"
         rows.append(Model(name, checkpoint.hub_id, checkpoint.licence, scale, present, checkpoint.accuracy()))
