@@ -1,6 +1,10 @@
-"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth."""
+"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth.
+
+BACKEND=compact in the environment shows the network that comes with the package instead of COLMAP.
+"""
 
 import json
+import os
 import time
 from pathlib import Path
 
@@ -14,8 +18,9 @@ from jcr.progress import progress_bars
 root = Path(__file__).parent.parent
 start = time.perf_counter()
 capture = jcr.read_capture(root / "examples/tabletop")
+backend = os.environ.get("BACKEND", "auto")
 with progress_bars() as progress:
-    result = jcr.run(capture, root / "out/demo", progress=progress)
+    result = jcr.run(capture, root / "out/demo", backend=backend, progress=progress)
 seconds = time.perf_counter() - start
 
 hand_eye = result.hand_eye

@@ -51,7 +51,8 @@ class Calibrated:
     height_percent: float = np.inf
     """Median over the objects of the error of the height above the table."""
     sigmas: float = np.inf
-    """Error of the seven parameters in reported standard deviations: root of the mean square."""
+    """Error of the camera's pose in reported standard deviations: root of the mean square of its six parameters. The
+    scale does not count here, for it is that of pointmaps, whose errors no calibration reports."""
     trusted: bool = False
     seconds: float = 0.0
 
@@ -138,13 +139,13 @@ def scored(result: RunResult, folder: Path, seconds: float = 0.0) -> Calibrated:
     truth, hand_eye = read_truth(folder), result.hand_eye
     log_scale, height = _depth_errors(result, folder)
     x, true = hand_eye.gripper_from_camera, truth.gripper_from_camera
-    off = np.concatenate([true[:3, 3] - x[:3, 3], rotation_log(true[:3, :3] @ x[:3, :3].T), [log_scale]])
+    off = np.concatenate([true[:3, 3] - x[:3, 3], rotation_log(true[:3, :3] @ x[:3, :3].T)])
     return Calibrated(
         1e3 * float(np.linalg.norm(off[:3])),
         float(rotation_between_deg(x[:3, :3], true[:3, :3])),
         100 * abs(float(np.expm1(-log_scale))),
         height,
-        float(np.sqrt(off @ np.linalg.solve(hand_eye.covariance, off) / 7)),
+        float(np.sqrt(off @ np.linalg.solve(hand_eye.covariance[:6, :6], off) / 6)),
         result.converged,
         seconds,
     )
@@ -220,7 +221,7 @@ def _real(captures: Path, weights: str) -> list[str]:
     rows = []
     for folder in sorted(path.parent for path in captures.glob("*/reference.json")):
         reference, _ = read_hand_eye(folder / "reference.json")
-        for way in WAYS:
+        for way in ("matches alone", "compact", "colmap"):
             if way == "matches alone":
                 rows.append(_line(folder.name, way, _by_matches(folder, weights, reference)))
                 continue
