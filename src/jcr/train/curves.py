@@ -42,7 +42,8 @@ def draw(png: Path, folders: list[Path]) -> None:
     for axes in (losses, attention, rotation):
         axes.set_xlabel("thousand pairs seen")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, loc="upper right")
+        if axes.get_legend_handles_labels()[0]:  # a short training has no curve of validation
+            axes.legend(fontsize=8, loc="upper right")
     with written_whole(png) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)
