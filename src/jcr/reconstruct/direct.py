@@ -6,11 +6,8 @@ viewing direction in the gripper's frame, and turns about it and tilts are tried
 From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
 that what disagrees with the robot's motion shows.
 
-Measured without any start: 14 simulated captures of 5 to 15 images without texture, two of them with a robot's noise
-and five once more without the lens, were calibrated to 0.1 to 5.6 mm (median 0.6 mm, 0.06°), each in less than 20 s of
-one core. Of four real ones three, to 1.4, 1.8 and 17 mm of their references (the last says 12 mm itself: its views
-hardly turn); one, a chessboard alone, was refused. Pointmaps come from the plane sweep, which knows depth near edges
-only: on plain tables a tenth of the pixels.
+Pointmaps come from the plane sweep, which knows depth near edges only: on plain tables a tenth of the pixels.
+docs/results/compact.md says what it gives with and without a start, on simulated and real captures.
 """
 
 from collections.abc import Sequence
@@ -45,7 +42,7 @@ FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
 """The robot has no say in these any more."""
 FINEST = Stage(240, 300, 3, 0.1)
 UNEVEN = Stage(60, 300, 1, 0.2)
-"""The same while the images may still be of different brightness."""
+"""Where brightness is compared, before it is even."""
 EVENINGS = 3
 """How often brightness is evened: each time more points agree."""
 EVEN_ENOUGH = 0.05
