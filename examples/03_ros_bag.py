@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import jcr
-from jcr.bench.bag import write_bag
+from benchmarks.bag import write_bag
 from jcr.capture.options import ReadOptions
 from jcr.check import check
 

@@ -12,8 +12,7 @@ from PIL import Image
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
-
-ROOT = Path(__file__).parent.parent
+from places import ROOT, SHARED
 
 
 def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
@@ -79,7 +78,7 @@ def true_mesh(tabletop: Path) -> trimesh.Trimesh:
 @pytest.fixture(scope="session")
 def real_captures() -> Path:
     """Real captures with references, which live beside the project and not in it."""
-    folder = ROOT.parent / "shared" / "data"
+    folder = SHARED / "data"
     if not folder.is_dir():
         pytest.skip(f"the real captures are not at {folder}")
     return folder

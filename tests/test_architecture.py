@@ -3,7 +3,9 @@
 import ast
 from pathlib import Path
 
-SOURCE = Path(__file__).parent.parent / "src" / "jcr"
+from places import ROOT
+
+SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"errors"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},

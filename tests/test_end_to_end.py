@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jcr.bench.predictions import end_to_end
+from benchmarks.predictions import end_to_end
 from jcr.errors import InputError
 from jcr.records import Intrinsics
 from jcr.simulate.render import render

@@ -16,8 +16,9 @@ import yourdfpy
 
 import jcr
 from jcr.geometry import rotation_between_deg
+from places import ROOT
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 def example(name: str) -> ModuleType:
@@ -153,7 +154,7 @@ def test_the_api_is_called_as_it_is_shown_and_twice(done: Path, tmp_path: Path):
     first, second = (jcr.calibrate(capture, out) for _ in range(2))
     assert first.converged
     np.testing.assert_array_equal(first.hand_eye.gripper_from_camera, second.hand_eye.gripper_from_camera)
-    from jcr.calibrate.file import read_calibration
+    from jcr.calibration.calibration_json import read_calibration
 
     assert read_calibration(out).converged and callable(jcr.calibrate)
     assert callable(jcr.run) and callable(jcr.build_map)

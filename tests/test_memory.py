@@ -15,21 +15,21 @@ from PIL import Image
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
-from jcr.bench.align import CHILD
-from jcr.bench.pairs import random_network
-from jcr.bench.synthetic_pairs import synthetic_pairs
+from benchmarks.align import CHILD
+from benchmarks.pairs import random_network
+from benchmarks.synthetic_pairs import synthetic_pairs
 from jcr.errors import InputError
 from jcr.memory import GB, give_back, require, resident
 from jcr.reconstruct.dust3r import predict
-from jcr.reconstruct.dust3r.align import align
-from jcr.reconstruct.dust3r.matches import tracks_from_pairs
-from jcr.reconstruct.dust3r.pairs import (
+from jcr.reconstruct.global_alignment.align import align
+from jcr.reconstruct.global_alignment.pairs import (
     PairPredictions,
     complete_pairs,
     pairs_from_arrays,
     read_arrays,
     write_pairs,
 )
+from jcr.reconstruct.pointmap_matches import tracks_from_pairs
 
 TINY = {"enc_embed_dim": 32, "enc_depth": 1, "enc_num_heads": 2, "dec_embed_dim": 32, "dec_depth": 1}
 TINY |= {"dec_num_heads": 2}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibrate.calibrate import calibrate
+from jcr.calibration.stage import calibrate
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 

@@ -9,15 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.calibrate.calibrate import CalibrateOptions, calibrate
-from jcr.calibrate.drift import drift
-from jcr.calibrate.file import calibration_file, write_calibration
-from jcr.calibrate.pose_fit import fit_poses
+from jcr.calibration.calibration_json import calibration_file, write_calibration
+from jcr.calibration.drift import drift
+from jcr.calibration.stage import CalibrateOptions, calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, scale_translation, transform
+from jcr.handeye.fit import fit_poses
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.file import write_reconstruction
+from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.simulate.capture import with_robot_noise

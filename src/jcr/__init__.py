@@ -18,8 +18,8 @@ if "pycolmap" in sys.modules and "PIL._imaging" not in sys.modules:
 import PIL._imaging  # noqa: E402, F401
 
 if TYPE_CHECKING:
-    from jcr.calibrate.hand_eye import solve_hand_eye
     from jcr.capture.read import read_capture
+    from jcr.handeye.solve import solve_hand_eye
     from jcr.pipeline import build_map, calibrate, measure, run
     from jcr.represent.scene import load_map
 
@@ -27,7 +27,7 @@ __version__ = version("jcr")
 
 _ROOMS = {
     "read_capture": "jcr.capture.read",
-    "solve_hand_eye": "jcr.calibrate.hand_eye",
+    "solve_hand_eye": "jcr.handeye.solve",
     "run": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
@@ -53,9 +53,3 @@ def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return getattr(import_module(_ROOMS[name]), name)
     raise AttributeError(f"module 'jcr' has no attribute {name!r}")
-
-
-# Python binds a subpackage to its name in here once, when it is first imported: done now and undone, that name is
-# the function's for good, and `from jcr.calibrate.file import ...` goes on working.
-import_module("jcr.calibrate")
-globals().pop("calibrate", None)

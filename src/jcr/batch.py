@@ -19,7 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-from jcr.calibrate.file import CalibrationFile, read_calibration
+from jcr.calibration.calibration_json import CalibrationFile, read_calibration
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text

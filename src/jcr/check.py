@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibrate.conventions import better_reading, explained
-from jcr.calibrate.hand_eye import solve_hand_eye
-from jcr.calibrate.next_poses import NextPose, next_poses
-from jcr.calibrate.observability import observability
+from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
-from jcr.information import ASSUMED_NOISE
+from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.equation import ASSUMED_NOISE
+from jcr.handeye.next_poses import NextPose, next_poses
+from jcr.handeye.observability import observability
+from jcr.handeye.solve import solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
-from jcr.reconstruct.lens import fold_distance_px
 from jcr.records import Capture, HandEye, Observability, PosePairs, Reconstruction
 
 

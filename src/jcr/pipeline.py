@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import Any
 
 from jcr import __version__
-from jcr.auto import best_reconstruction
-from jcr.calibrate.calibrate import CalibrateOptions
-from jcr.calibrate.calibrate import calibrate as calibrate_stage
-from jcr.calibrate.calibrate import calibrate_poses as calibrate_poses_stage
-from jcr.calibrate.file import (
+from jcr.attempts import best_reconstruction
+from jcr.calibration.calibration_json import (
     CalibrationFile,
     calibration_file,
     failed_file,
     read_calibration,
     write_calibration,
 )
+from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.stage import calibrate as calibrate_stage
+from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.capture_json import kept
@@ -37,7 +37,7 @@ from jcr.files import remove_unfinished, write_text
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
-from jcr.reconstruct.file import FORMAT, read_reconstruction, write_reconstruction
+from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud

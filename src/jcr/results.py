@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from jcr.calibrate.file import CalibrationFile
+from jcr.calibration.calibration_json import CalibrationFile
 from jcr.records import HandEye, PointCloud, Reconstruction
 from jcr.represent.scene import SceneMap
 from jcr.segment.measure import Measured

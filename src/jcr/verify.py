@@ -8,17 +8,17 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibrate.calibrate import CalibrateOptions, calibrate
-from jcr.calibrate.drift import Cause, Drift, detectable, drift
-from jcr.calibrate.file import CalibrationFile, intrinsics_of, read_calibration
-from jcr.calibrate.pose_fit import PoseFit, fit_poses
+from jcr.calibration.calibration_json import CalibrationFile, intrinsics_of, read_calibration
+from jcr.calibration.drift import Cause, Drift, detectable, drift
+from jcr.calibration.stage import CalibrateOptions, calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_log
+from jcr.handeye.fit import PoseFit, fit_poses
 from jcr.pipeline import options_of, read_capture_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.reconstruct.file import read_reconstruction
+from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction
 

@@ -24,13 +24,13 @@ import torch
 from PIL import Image
 
 from jcr import pipeline
-from jcr.auto import Attempt
-from jcr.calibrate.calibrate import calibrate
-from jcr.calibrate.file import read_calibration
+from jcr.attempts import Attempt
+from jcr.calibration.calibration_json import read_calibration
+from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
-from jcr.reconstruct.file import read_reconstruction
+from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.simulate.problem import hand_eye_problem
 
 SIZE = (96, 72)

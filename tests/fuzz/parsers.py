@@ -14,7 +14,7 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[1]))
 READERS = [
     "jcr.capture",
-    "jcr.calibrate.file",
+    "jcr.calibration.calibration_json",
     "jcr.cli.query",
     "jcr.export.points",
     "jcr.live",
@@ -23,6 +23,7 @@ READERS = [
 READERS += ["jcr.represent", "rosbags", "safetensors", "yaml"]
 with atheris.instrument_imports(include=READERS):
     from fuzz_targets import targets
+
     from jcr.errors import InputError
     from jcr.live.line_server import parsed, pose_of
 

@@ -10,7 +10,7 @@ from jcr.capture.checks import MIN_FRAMES
 from jcr.capture.images import BLURRED
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_angle
-from jcr.information import ASSUMED_NOISE, most_informative, pose_information
+from jcr.handeye.equation import ASSUMED_NOISE, most_informative, pose_information
 from jcr.records import ARM
 
 STILL = 0.005

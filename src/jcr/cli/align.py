@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from jcr.cli.output import Output
-from jcr.reconstruct.dust3r.alignment import AlignOptions
+from jcr.reconstruct.global_alignment.alignment import AlignOptions
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def main(arguments: Arguments) -> int:
 
     from jcr.files import written_whole
     from jcr.progress import progress_bars
-    from jcr.reconstruct.dust3r.align import align
-    from jcr.reconstruct.dust3r.pairs import read_pairs
+    from jcr.reconstruct.global_alignment.align import align
+    from jcr.reconstruct.global_alignment.pairs import read_pairs
 
     predictions = read_pairs(arguments.pairs)
     with progress_bars() as progress:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jcr.batch import BatchOptions
-from jcr.calibrate.calibrate import CalibrateOptions
+from jcr.calibration.stage import CalibrateOptions
 from jcr.cli.output import Output
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.cloud import CloudOptions

@@ -117,7 +117,7 @@ def main(arguments: Arguments) -> int:
         return _all(arguments)
     from jcr.files import write_text
 
-    bench = import_module(f"jcr.bench.{arguments.name}")
+    bench = import_module(f"benchmarks.{arguments.name}")
     if arguments.name == "real":
         if arguments.captures is None:
             raise InputError(
@@ -141,7 +141,7 @@ def _all(arguments: Arguments) -> int:
     """Every bench; 1 when one of them failed."""
     if arguments.out is None:
         raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
-    from jcr.bench.suite import Outcome, absent_networks, between_marks, run, write_index
+    from benchmarks.suite import Outcome, absent_networks, between_marks, run, write_index
     from jcr.files import write_text
     from jcr.reconstruct.checkpoints import CHECKPOINTS
 

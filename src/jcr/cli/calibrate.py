@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jcr.calibrate.calibrate import CalibrateOptions
+from jcr.calibration.stage import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show
@@ -38,7 +38,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
-    from jcr.calibrate.calibrate import is_one
+    from jcr.calibration.stage import is_one
     from jcr.pipeline import RunOptions, calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs

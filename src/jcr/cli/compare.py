@@ -31,7 +31,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the difference, and how many of the calibration's own sigmas it is where they are known."""
-    from jcr.calibrate.file import read_hand_eye
+    from jcr.calibration.calibration_json import read_hand_eye
     from jcr.geometry import rotation_between_deg, rotation_log
 
     ours, covariance = read_hand_eye(arguments.out)

@@ -19,7 +19,7 @@ from jcr.files import write_text
 from jcr.geometry import transform
 
 if TYPE_CHECKING:
-    from jcr.calibrate.file import CalibrationFile
+    from jcr.calibration.calibration_json import CalibrationFile
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
     from jcr.represent.scene import SceneMap
@@ -128,7 +128,7 @@ class Run:
     @cached_property
     def calibration(self) -> "CalibrationFile":
         """calibration.json."""
-        from jcr.calibrate.file import read_calibration
+        from jcr.calibration.calibration_json import read_calibration
 
         return read_calibration(self.arguments.out)
 
@@ -203,7 +203,7 @@ class Run:
     @cached_property
     def reconstruction(self) -> "Reconstruction":
         """reconstruction.npz."""
-        from jcr.reconstruct.file import read_reconstruction
+        from jcr.reconstruct.reconstruction_npz import read_reconstruction
 
         return read_reconstruction(self.arguments.out / "reconstruction.npz")
 

@@ -30,7 +30,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is not to be trusted."""
-    from jcr.calibrate.file import read_calibration
+    from jcr.calibration.calibration_json import read_calibration
     from jcr.errors import NotTrustedError
     from jcr.pipeline import measure
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.cli.output import Output
-from jcr.reconstruct.dust3r.pairs import PairOptions
+from jcr.reconstruct.global_alignment.pairs import PairOptions
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
     from jcr.reconstruct.backends import ReconstructOptions, device_of
     from jcr.reconstruct.dust3r.backend import Dust3rOptions, predict
-    from jcr.reconstruct.dust3r.pairs import write_pairs
+    from jcr.reconstruct.global_alignment.pairs import write_pairs
 
     if arguments.out.suffix != ".npz":
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")

@@ -44,7 +44,7 @@ def summary(result: "RunResult | PosesResult") -> str:
         f"scale {hand_eye.scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
     if hand_eye.scale_check is not None:
-        from jcr.calibrate.calibrate import in_words
+        from jcr.calibration.stage import in_words
 
         lines.append(f"  {in_words(hand_eye.scale_check)}")
     if content.held_out is not None:

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
+from jcr.camera import distort, pinhole_inside, undistort, undistort_image
 from jcr.capture.images import read_image
 from jcr.errors import InputError
 from jcr.export.points import write_cloud
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
-from jcr.reconstruct.lens import distort, pinhole_inside, undistort, undistort_image
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction, Tracks
 

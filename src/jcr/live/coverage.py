@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibrate.next_poses import NextPose, next_poses
-from jcr.calibrate.observability import observability
+from jcr.handeye.next_poses import NextPose, next_poses
+from jcr.handeye.observability import observability
 from jcr.live.asks import Answer
 from jcr.live.folder import LiveFolder
 

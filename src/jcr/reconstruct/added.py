@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.camera import undistort_image
 from jcr.capture.images import read_image
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, scale_translation
 from jcr.progress import Progress
-from jcr.reconstruct.dense import dense_pointmaps
-from jcr.reconstruct.lens import undistort_image
-from jcr.reconstruct.views import choose_neighbours, sweep_planes
+from jcr.reconstruct.depth.dense import dense_pointmaps
+from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 
 NEIGHBOURS = 6

@@ -184,7 +184,7 @@ def _colmap(capture: Capture, options: ReconstructOptions, progress: Progress | 
 
 def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.dust3r.backend import Dust3rOptions, reconstruct
-    from jcr.reconstruct.dust3r.pairs import PairOptions
+    from jcr.reconstruct.global_alignment.pairs import PairOptions
 
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
     model = "mast3r" if options.backend == "mast3r" else "dust3r"
@@ -192,7 +192,7 @@ def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | 
 
 
 def _direct(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct import DirectOptions, reconstruct
+    from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
 
     made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
     return reconstruct(capture, made, progress)
@@ -200,7 +200,7 @@ def _direct(capture: Capture, options: ReconstructOptions, progress: Progress | 
 
 def _compact(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.compact import CompactOptions, reconstruct
-    from jcr.reconstruct.direct import DirectOptions
+    from jcr.reconstruct.direct.direct import DirectOptions
     from jcr.reconstruct.epipolar import EpipolarOptions
 
     device = device_of(options)

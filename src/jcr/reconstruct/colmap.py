@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 from PIL import ExifTags, Image
 
+from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.progress import Progress, silent
-from jcr.reconstruct.dense import DenseOptions, plan_memory, with_pointmaps
-from jcr.reconstruct.lens import usable_lens
+from jcr.reconstruct.depth.dense import DenseOptions, plan_memory, with_pointmaps
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27

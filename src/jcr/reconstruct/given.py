@@ -20,7 +20,7 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.dense import SparseModel, plan_memory, with_pointmaps
+from jcr.reconstruct.depth.dense import SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 

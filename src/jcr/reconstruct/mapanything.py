@@ -15,8 +15,8 @@ from jcr.errors import InputError
 from jcr.geometry import inverse, nearest_rotation, rotation_angle
 from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
-from jcr.reconstruct.dust3r.preprocess import PreparedImages, image_grid, prepare_images
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
+from jcr.reconstruct.preprocess import PreparedImages, image_grid, prepare_images
 from jcr.records import Capture, Reconstruction
 
 LONG_EDGE, PATCH = 518, 14

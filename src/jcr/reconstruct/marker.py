@@ -12,14 +12,14 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.optimize import least_squares
 
+from jcr.camera import WITHIN_FOLD, fold_distance_px
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, rotation_log, transform
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
-from jcr.reconstruct.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
-from jcr.reconstruct.lens import WITHIN_FOLD, fold_distance_px
-from jcr.reconstruct.views import sweep_planes
+from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
+from jcr.reconstruct.depth.views import sweep_planes
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 PRINTED = 0.002

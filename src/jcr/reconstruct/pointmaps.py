@@ -6,8 +6,8 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.reconstruct.dust3r.matches import tracks_from_pointmaps
-from jcr.reconstruct.dust3r.preprocess import PreparedImages
+from jcr.reconstruct.pointmap_matches import tracks_from_pointmaps
+from jcr.reconstruct.preprocess import PreparedImages
 from jcr.records import Intrinsics, Reconstruction
 
 LARGEST_MISFIT = 0.02

@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from jcr.camera import NO_DISTORTION, usable_lens
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.backend import reconstruction_from_pairs
-from jcr.reconstruct.dust3r.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
 from jcr.reconstruct.dust3r.predict import memory_after
-from jcr.reconstruct.dust3r.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
-from jcr.reconstruct.lens import NO_DISTORTION, usable_lens
+from jcr.reconstruct.global_alignment.alignment import AlignOptions
+from jcr.reconstruct.global_alignment.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
+from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.records import Capture, Reconstruction
 
 

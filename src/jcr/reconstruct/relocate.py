@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 
+from jcr.camera import resized, undistort
 from jcr.geometry import inverse, rotation_exp, skew, transform
-from jcr.reconstruct.lens import resized, undistort
 from jcr.records import Intrinsics, Reconstruction
 
 WORKING_SIZE_PX = 1600

@@ -18,12 +18,12 @@ from jaxtyping import UInt8
 from numpy import ndarray
 from PIL import Image
 
+from jcr.camera import fold_distance_px, resized
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
-from jcr.reconstruct.dense import SparseModel
-from jcr.reconstruct.lens import fold_distance_px, resized
+from jcr.reconstruct.depth.dense import SparseModel
 from jcr.records import Intrinsics, Tracks
 
 HALF_PIXEL = 0.5

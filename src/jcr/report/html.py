@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jcr.calibrate.file import CalibrationFile
+from jcr.calibration.calibration_json import CalibrationFile
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure

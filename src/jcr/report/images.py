@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibrate.file import Image
-from jcr.calibrate.hand_eye import solve_hand_eye
-from jcr.calibrate.projection import parameters, project
+from jcr.calibration.calibration_json import Image
+from jcr.calibration.projection import parameters, project
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse, rotation_between_deg
+from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Capture, HandEye, Intrinsics
 from jcr.report.figures import picture_url
 from jcr.report.markup import filled

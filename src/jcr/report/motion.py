@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibrate.file import CalibrationFile, Proposal
-from jcr.calibrate.observability import WEAK, excitation
+from jcr.calibration.calibration_json import CalibrationFile, Proposal
 from jcr.geometry import inverse, rotation_angle
+from jcr.handeye.observability import WEAK, excitation
 from jcr.records import Capture
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jcr.calibrate.projection import parameters, project
+from jcr.calibration.projection import parameters, project
 from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.problem import HandEyeProblem

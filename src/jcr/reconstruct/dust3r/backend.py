@@ -11,19 +11,19 @@ from jcr.errors import NotTrustedError
 from jcr.memory import give_back, resident
 from jcr.progress import Progress, silent
 from jcr.reconstruct.checkpoints import CHECKPOINTS
-from jcr.reconstruct.dust3r.alignment import AlignOptions
-from jcr.reconstruct.dust3r.matches import tracks_from_pairs
-from jcr.reconstruct.dust3r.pairs import PairOptions, PairPredictions
 from jcr.reconstruct.dust3r.predict import predict_pairs
-from jcr.reconstruct.dust3r.preprocess import (
+from jcr.reconstruct.dust3r.weights import load_weights
+from jcr.reconstruct.global_alignment.alignment import AlignOptions
+from jcr.reconstruct.global_alignment.pairs import PairOptions, PairPredictions
+from jcr.reconstruct.global_alignment.with_robot import align_with_robot
+from jcr.reconstruct.pointmap_matches import tracks_from_pairs
+from jcr.reconstruct.preprocess import (
     ImageGrid,
     PreparedImages,
     cover_grid,
     image_grid,
     prepare_images,
 )
-from jcr.reconstruct.dust3r.robot_align import align_with_robot
-from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 

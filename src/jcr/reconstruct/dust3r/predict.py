@@ -17,10 +17,11 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.memory import ALLOWANCE, GB, MAP, announce, relieve, require, resident
 from jcr.progress import Progress, silent
-from jcr.reconstruct.dust3r.alignment import AlignOptions
 from jcr.reconstruct.dust3r.network import DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
-from jcr.reconstruct.dust3r.pairs import (
+from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
+from jcr.reconstruct.global_alignment.alignment import AlignOptions
+from jcr.reconstruct.global_alignment.pairs import (
     FEW_IMAGES,
     PairOptions,
     PairPredictions,
@@ -28,8 +29,7 @@ from jcr.reconstruct.dust3r.pairs import (
     overlapping_pairs,
     window_pairs,
 )
-from jcr.reconstruct.dust3r.preprocess import PreparedImages
-from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
+from jcr.reconstruct.preprocess import PreparedImages
 
 logger = logging.getLogger(__name__)
 

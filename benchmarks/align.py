@@ -1,0 +1,245 @@
+"""`jcr bench align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
+from jcr.geometry import (
+    apply_similarity,
+    fit_similarity,
+    inverse,
+    rotation_between_deg,
+    rotation_exp,
+    transform,
+)
+from jcr.handeye.solve import solve_hand_eye
+from jcr.reconstruct.global_alignment.align import AlignOptions, align
+from jcr.reconstruct.global_alignment.pairs import PairPredictions, complete_pairs, write_pairs
+from jcr.reconstruct.global_alignment.with_robot import align_with_robot
+from jcr.simulate.problem import HandEyeProblem, disturbed, error
+
+SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
+SEEDS = 3
+HAND_EYE_SEEDS = 10
+FEW_STEPS = 3
+"""Of adam at the large size, whose 300 take a quarter of an hour."""
+ERRORS = {
+    "white 0.3 %, smooth distance 1 %, 2 % outliers (below: these and)": PairErrors(),
+    "pairs turned by 1° per axis": PairErrors(pair_turn_deg=1.0),
+    "smooth direction 0.6°": PairErrors(bend=0.01),
+    "20 % outliers": PairErrors(outliers=0.2),
+    "10 % of the pairs wrong": PairErrors(wrong_pairs=6),
+}
+CHILD = """
+import sys
+from jcr.cli import dispatch
+status = dispatch(sys.argv[1:])
+sys.stderr.write(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")))
+sys.exit(status)
+"""
+"""The command in a process of its own, which says its peak memory (ru_maxrss counts the parent's, too)."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean errors of the cameras after the best similarity, and the time of the alignment."""
+
+    mm: float
+    deg: float
+    seconds: float
+
+
+def run() -> str:
+    """Markdown tables: time and memory, accuracy over images, kinds of error, hand-eye from few images."""
+    return "\n\n".join([_cost(), _images(), _kinds(), _hand_eye()]) + "\n"
+
+
+def camera_errors(
+    base_from_camera: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
+) -> tuple[float, float]:
+    """Mean distance (mm) and angle (deg) of the cameras from the truth, after the best similarity."""
+    base_from_recon, scale = fit_similarity(base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3])
+    centers = apply_similarity(base_from_recon, scale, recon_from_camera[:, :3, 3])
+    turn = rotation_between_deg(
+        base_from_recon[:3, :3] @ recon_from_camera[:, :3, :3], base_from_camera[:, :3, :3]
+    )
+    return 1e3 * float(np.linalg.norm(centers - base_from_camera[:, :3, 3], axis=1).mean()), float(
+        turn.mean()
+    )
+
+
+def _cost() -> str:
+    rows = [
+        "| input | method | alignment | whole command | peak memory beside the input | error |",
+        "|---|---|---|---|---|---|",
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        predictions, truth = synthetic_pairs(complete_pairs(10), MIDDLE)
+        pairs = Path(folder) / "pairs.npz"
+        write_pairs(pairs, predictions)
+        fast, row = _command(pairs, "fast", 300, predictions, truth)
+        rows.append(f"| {_size(MIDDLE)}, 10 images | fast {row}")
+        adam, row = _command(pairs, "adam", 300, predictions, truth)
+        rows.append(f"| {_size(MIDDLE)}, 10 images | adam, 300 steps {row}")
+        predictions, truth = synthetic_pairs(complete_pairs(10), LARGE)
+        write_pairs(pairs, predictions)
+        large, row = _command(pairs, "fast", 300, predictions, truth)
+        rows.append(f"| {_size(LARGE)}, 10 images | fast {row}")
+        begin, _ = _command(pairs, "adam", 0, predictions, truth)
+        few, row = _command(pairs, "adam", FEW_STEPS, predictions, truth)
+        rows.append(f"| {_size(LARGE)}, 10 images | adam, {FEW_STEPS} steps {row}")
+    full = begin + (few - begin) * 300 / FEW_STEPS
+    rows.insert(
+        0,
+        f"> Global alignment of 90 pairs at {_size(LARGE)} takes {large:.1f} s on the processor; 300 steps of Adam "
+        f"would take {full / large:.0f} times as long.\n",
+    )
+    rows.append(
+        f"\nadam takes {adam / fast:.0f} times as long as fast at {_size(MIDDLE)}, and at {_size(LARGE)} "
+        f"{full / large:.0f} times ({full:.0f} s, 300 steps extrapolated from {FEW_STEPS})."
+    )
+    return "\n".join(rows)
+
+
+def _command(
+    pairs: Path, method: str, steps: int, predictions: PairPredictions, truth: PairTruth
+) -> tuple[float, str]:
+    """Seconds of the alignment, and the rest of a table row, of `jcr align` in a process of its own."""
+    result = pairs.with_name("aligned.npz")
+    arguments = [
+        "align",
+        str(pairs),
+        str(result),
+        "--method",
+        method,
+        "--steps",
+        str(steps),
+        "--quiet",
+        "--json",
+    ]
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, *arguments], capture_output=True, text=True, check=True
+    )
+    whole = time.perf_counter() - begin
+    seconds = json.loads(done.stdout)["seconds"]
+    peak_gb = int(done.stderr.split("VmHWM:")[1].split()[0]) * 1024 / 1e9
+    shown = (predictions.pts3d, predictions.conf, predictions.pts3d_in_other_view, predictions.conf2)
+    input_gb = sum(array.nbytes for array in shown) / 1e9
+    with np.load(result) as file:
+        mm, deg = camera_errors(truth.base_from_camera, file["poses"])
+    row = f"| {seconds:.2f} s | {whole:.1f} s | {peak_gb - input_gb:.2f} GB | {mm:.2f} mm, {deg:.3f}° |"
+    return seconds, row
+
+
+def _score(predictions: PairPredictions, truth: PairTruth, method: str) -> Score:
+    options = AlignOptions(method="adam" if method == "adam" else "fast")
+    found = align(predictions, options)
+    return Score(*camera_errors(truth.base_from_camera, found.recon_from_camera), found.seconds)
+
+
+def _mean_row(name: str, scores: dict[str, list[Score]]) -> str:
+    cells = []
+    for method in ("fast", "adam"):
+        mm = [score.mm for score in scores[method]]
+        deg = [score.deg for score in scores[method]]
+        seconds = np.mean([score.seconds for score in scores[method]])
+        cells.append(
+            f"{np.mean(mm):.2f} mm ({max(mm):.2f}), {np.mean(deg):.3f}° ({max(deg):.3f}), {seconds:.2f} s"
+        )
+    return f"| {name} | {cells[0]} | {cells[1]} |"
+
+
+def _images() -> str:
+    rows = [
+        f"Mean over seeds 0 to {SEEDS - 1} (worst in brackets), {_size(SMALL)}:\n",
+        "| images | fast | adam |",
+        "|---|---|---|",
+    ]
+    for images in (6, 10, 15):
+        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
+        for seed in range(SEEDS):
+            predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
+            for method, list_of in scores.items():
+                list_of.append(_score(predictions, truth, method))
+        rows.append(_mean_row(str(images), scores))
+    return "\n".join(rows)
+
+
+def _kinds() -> str:
+    rows = [
+        f"Mean over seeds 0 and 1 (worst in brackets), 8 images, {_size(SMALL)}:\n",
+        "| errors of the predictions | fast | adam |",
+        "|---|---|---|",
+    ]
+    for name, errors in ERRORS.items():
+        scores: dict[str, list[Score]] = {"fast": [], "adam": []}
+        for seed in range(2):
+            predictions, truth = synthetic_pairs(complete_pairs(8), SMALL, errors, seed)
+            for method, list_of in scores.items():
+                list_of.append(_score(predictions, truth, method))
+        rows.append(_mean_row(name, scores))
+    return "\n".join(rows)
+
+
+def _hand_eye() -> str:
+    rows = [
+        f"With the robot's poses, mean camera errors and median calibration errors over {HAND_EYE_SEEDS} seeds, "
+        f"{_size(SMALL)}. The robot's noise is not told but estimated. `jcr` keeps the alignment that promises the "
+        "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n",
+        "| robot noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
+        "|---|---|---|---|---|---|",
+    ]
+    for noise in ((0.0, 0.0), (5e-4, float(np.radians(0.1)))):
+        for images in (3, 4, 5, 10):
+            trials = [_hand_eye_trial(images, seed, noise) for seed in range(HAND_EYE_SEEDS)]
+            free, kept, kinematic, *_ = np.mean(trials, axis=0)
+            *_, mm, deg, percent, _ = np.median(trials, axis=0)
+            sigmas = np.sqrt(np.mean([trial[-1] for trial in trials]) / 7)
+            rows.append(
+                f"| {1e3 * noise[0]:g} mm, {np.degrees(noise[1]):g}° | {images} | {free:.2f} mm | {kept:.2f} mm "
+                f"({100 * kinematic:.0f} %) | {mm:.2f} mm, {deg:.3f}°, {percent:.3f} % | {sigmas:.1f} |"
+            )
+    return "\n".join(rows)
+
+
+def _hand_eye_trial(images: int, seed: int, noise: tuple[float, float]) -> Float[ndarray, "7"]:
+    """Camera errors (mm) free and as kept, whether kinematic, calibration errors (mm, deg, %), Mahalanobis²."""
+    predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
+    rng = np.random.default_rng(1000 + seed)
+    gripper_from_camera = transform(rotation_exp(rng.normal(0, 0.8, 3)), rng.uniform(-0.08, 0.08, 3))
+    exact = truth.base_from_camera @ inverse(gripper_from_camera)
+    base_from_gripper = disturbed(exact, noise, rng)
+    aligned = align_with_robot(predictions, base_from_gripper)
+    evidence = aligned.evidence
+    assert evidence is not None  # the default aligner knows how sure it is
+    found = solve_hand_eye(
+        base_from_gripper, evidence.recon_from_camera, camera_covariance=evidence.covariance
+    )
+    scale = float(np.exp(-np.log(truth.pair_unit).mean()))
+    problem = HandEyeProblem(base_from_gripper, evidence.recon_from_camera, gripper_from_camera, scale, exact)
+    off = error(problem, found.gripper_from_camera, found.scale)
+    return np.array(
+        [
+            camera_errors(truth.base_from_camera, evidence.recon_from_camera)[0],
+            camera_errors(truth.base_from_camera, aligned.alignment.recon_from_camera)[0],
+            aligned.alignment.method == "kinematic",
+            1e3 * np.linalg.norm(off[:3]),
+            np.degrees(np.linalg.norm(off[3:6])),
+            100 * abs(off[6]),
+            off @ np.linalg.solve(found.covariance, off),
+        ]
+    )
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

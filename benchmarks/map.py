@@ -1,0 +1,405 @@
+"""`jcr bench map`: how good and how fast the map is, against the truth of a simulated capture."""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from PIL import Image
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from jcr.camera import rays
+from jcr.capture.read import read_capture
+from jcr.errors import InputError
+from jcr.export.provenance import Provenance
+from jcr.export.volume import write_octomap
+from jcr.geometry import apply, inverse
+from jcr.pipeline import calibrate
+from jcr.records import PointCloud
+from jcr.represent.build import build_scene
+from jcr.represent.cloud import point_cloud
+from jcr.represent.options import MapOptions
+from jcr.represent.scene import SceneMap
+from jcr.segment.tabletop import label_tabletop
+from jcr.simulate.capture import SimulateOptions, simulate
+from jcr.simulate.scenes import make_scene, solid_labels
+from jcr.simulate.truth import Truth, read_truth, true_depth, true_labels
+
+VIEWS, POINTS = 12, 200_000
+QUERIES, SPHERES, FCL_SPHERES = 2_000_000, 1_000_000, 20_000
+REPEATS = 5
+PATIENCE_S = 150.0
+"""The paper's network may train so long until its plateau."""
+GRID = 0.004
+"""Metres between the places at which the map is scored."""
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """Shares, not percent."""
+
+    f_5mm: float
+    f_10mm: float
+    precision_5mm: float
+    precision_10mm: float
+    recall_5mm: float
+    recall_10mm: float
+    false_free_inside: float
+    """Of the inside of objects, what is called free with unknown="occupied"."""
+    false_free_deep: float
+    """The same more than 5 mm from the surface that the images show."""
+    false_occupied: float
+    """Of the free space that a camera saw, what is called occupied."""
+    false_occupied_far: float
+    """The same more than 10 mm from any surface."""
+    unknown_free: float
+    """Of the free space that a camera saw, what is called unknown."""
+    unknown: float
+    """Of the workspace."""
+    color_psnr: float
+    label_iou: float
+    """Mean over the labels; as `color_psnr`, on the surface where the map knows it."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """All pixels of a simulated capture as points, with the truth about each."""
+
+    x_in_base: Float[ndarray, "n 3"]
+    color: UInt8[ndarray, "n 3"]
+    label: Int[ndarray, " n"]
+    image: Int[ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a map is asked, and the truth there."""
+
+    x: Float[ndarray, "n 3"]
+    """One in each cell of a grid over the truth's workspace."""
+    inside: Bool[ndarray, " n"]
+    """Within an object."""
+    seen_free: Bool[ndarray, " n"]
+    """Above the table, within nothing, and before what a camera's pixel shows."""
+    to_surface: Float[ndarray, " n"]
+    """Metres to the nearest place that an image shows; infinite beyond 2 cm."""
+    surface: Surface
+    """Some of what the images show of table and objects."""
+
+
+def run() -> str:
+    """Markdown tables: accuracy of both presets on true and on calibrated poses, and times beside python-fcl."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        truth = read_truth(simulate(folder / "capture", SimulateOptions(images=VIEWS)))
+        clouds = {
+            "true poses and depth": true_cloud(truth),
+            "calibrated, COLMAP": calibrated_cloud(truth, folder / "run"),
+        }
+        places, rows, scenes = places_to_ask(truth), {}, {}
+        for source, cloud in clouds.items():
+            for preset in ("default", "paper"):
+                options = MapOptions(preset=preset, max_seconds=PATIENCE_S)
+                scene = scenes[source, preset] = build_scene(cloud, options)
+                rows[source, preset] = score(scene, places)
+        trained = _trained(clouds["true poses and depth"], places)
+        return "\n".join(
+            [
+                *_accuracy(rows, scenes),
+                *_things(scenes["calibrated, COLMAP", "default"], places, truth.labels),
+                *_geometric(clouds),
+                *trained,
+                *_speed(scenes["true poses and depth", "default"], folder),
+            ]
+        )
+
+
+def _accuracy(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str], SceneMap]) -> list[str]:
+    lines = [
+        f"Scene `tabletop` of `jcr simulate`, {VIEWS} views, {POINTS:,} points with true masks as labels; shares of "
+        "the workspace within 0.36 x 0.40 m of the middle, in %. F-score, precision and recall of occupied places "
+        "against the surface that the images show, at 10 mm and 5 mm; colour and labels where the map knows that "
+        "surface.",
+        "",
+        "| poses | preset | training | F 10 | P 10 | R 10 | F 5 | P 5 | R 5 | false free inside | more than 5 mm in | "
+        "false occupied in seen free space | more than 10 mm off | colour PSNR | label mIoU | unknown |",
+        "|" + "---|" * 16,
+    ]
+    for (source, preset), s in rows.items():
+        seconds = float(scenes[source, preset].history["training_s"])
+        shares = (s.f_10mm, s.precision_10mm, s.recall_10mm, s.f_5mm, s.precision_5mm, s.recall_5mm)
+        rates = (s.false_free_inside, s.false_free_deep, s.false_occupied, s.false_occupied_far)
+        lines.append(
+            f"| {source} | {preset} | {seconds:.2f} s | "
+            + " | ".join(f"{100 * share:.1f}" for share in shares)
+            + " | "
+            + " | ".join(f"{100 * rate:.3f}" for rate in rates)
+            + f" | {s.color_psnr:.1f} dB | {s.label_iou:.3f} | {100 * s.unknown:.0f} |"
+        )
+    return [*_claims(rows, scenes), "", *lines, ""]
+
+
+def _claims(rows: dict[tuple[str, str], MapScore], scenes: dict[tuple[str, str], SceneMap]) -> list[str]:
+    exact, calibrated = dict.fromkeys(source for source, _ in rows)
+    reached = [
+        f"{100 * rows[exact, preset].f_10mm:.1f} % at 10 mm after "
+        f"{float(scenes[exact, preset].history['training_s']):.1f} s of training"
+        for preset in ("default", "paper")
+    ]
+    built = rows[calibrated, "default"]
+    return [
+        f"> Map of the simulated table from true depth: F-score {reached[0]} (the paper's network: {reached[1]}); "
+        f"calibrated and reconstructed by COLMAP: precision {100 * built.precision_10mm:.1f} %, recall "
+        f"{100 * built.recall_10mm:.1f} %, for plain surfaces give no points.",
+    ]
+
+
+def _things(scene: SceneMap, places: Places, names: tuple[str, ...]) -> list[str]:
+    """How much of each thing's shown surface the map on calibrated poses knows, and how well it is labelled there."""
+    surface = places.surface
+    known = ~scene.query(surface.x_in_base).unknown
+    found = scene.query(surface.x_in_base[known]).label
+    things = np.unique(surface.label).tolist()
+    mapped = [100 * known[surface.label == k].mean() for k in things]
+    iou = [
+        mean_iou(found, surface.label[known], (k,)) if (surface.label[known] == k).any() else np.nan
+        for k in things
+    ]
+    return [
+        f"| calibrated, default preset | {' | '.join(names[k] for k in things)} |",
+        "|---" * (len(things) + 1) + "|",
+        f"| of the shown surface in the map, % | {' | '.join(f'{share:.0f}' for share in mapped)} |",
+        f"| label IoU there | {' | '.join(f'{share:.3f}' for share in iou)} |",
+        "",
+    ]
+
+
+def _geometric(clouds: dict[str, PointCloud]) -> list[str]:
+    """Labels from geometry alone, on the points: each true thing against the segment that fits it best."""
+    lines = ["| segments from geometry alone | segments | mIoU on the points |", "|---|---|---|"]
+    for source, cloud in clouds.items():
+        found, true = label_tabletop(cloud).label, cloud.label
+        things, segments = np.unique(true[true > 0]), np.unique(found[found > 0])
+        iou = np.array([[mean_iou(found == k, true == t, (True,)) for k in segments] for t in things])
+        rows, columns = linear_sum_assignment(-iou)
+        lines.append(
+            f"| {source} | {len(segments)} for {len(things)} | {iou[rows, columns].sum() / len(things):.3f} |"
+        )
+    return [*lines, ""]
+
+
+def _trained(cloud: PointCloud, places: Places) -> list[str]:
+    """What the default preset reaches when it is stopped early."""
+    lines = ["| default preset stopped after | training s | F at 10 mm, % |", "|---|---|---|"]
+    for limit in (1.0, None):
+        options = MapOptions(max_seconds=limit or PATIENCE_S)
+        scenes = [build_scene(cloud, options) for _ in range(3)]
+        seconds = np.median([float(scene.history["training_s"]) for scene in scenes])
+        f = 100 * score(scenes[-1], places).f_10mm
+        lines.append(f"| {'its plateau' if limit is None else f'{limit} s'} | {seconds:.2f} | {f:.1f} |")
+    return [*lines, ""]
+
+
+def _speed(scene: SceneMap, folder: Path) -> list[str]:
+    draw = np.random.default_rng(0)
+    low, high = scene.box
+    x = draw.uniform(low, high, (QUERIES, 3)).astype(np.float32)
+    centers, radii = x[:SPHERES], draw.uniform(0.01, 0.05, SPHERES).astype(np.float32)
+
+    def distances() -> None:
+        SceneMap(scene.fields, scene.seen, scene.label_names).distance_grid("occupied")
+
+    seen = np.resize(x[~scene.query(x).unknown], x.shape)
+    anywhere = _median_seconds(lambda: scene.query(x).occupancy)
+    where_seen = _median_seconds(lambda: scene.query(seen).occupancy)
+    spheres = _median_seconds(lambda: scene.check_spheres(centers, radii))
+    grid = _median_seconds(distances)
+    nodes = " x ".join(str(n // 2 + 1) for n in scene.seen.state.shape[::-1])
+    fcl_seconds, alike = _fcl(scene, folder, centers[:FCL_SPHERES], radii[:FCL_SPHERES])
+    ours, theirs = SPHERES / spheres, FCL_SPHERES / fcl_seconds
+    return [
+        f"> The map answers {QUERIES / anywhere / 1e6:.0f} M point queries/s and {ours / 1e6:.0f} M spheres/s, "
+        f"{ours / theirs:.0f} times as many of these as python-fcl against the same voxels.",
+        "",
+        f"Times: medians of {REPEATS}, torch on {torch.get_num_threads()} threads.",
+        "",
+        "| what | measured |",
+        "|---|---|",
+        f"| occupancy and unknown at {QUERIES:,} points anywhere in the workspace | "
+        f"{QUERIES / anywhere / 1e6:.1f} M points/s |",
+        f"| the same at places that were seen | {QUERIES / where_seen / 1e6:.1f} M points/s |",
+        f"| signed distance and gradient, {nodes} nodes of {100 * scene.cell:.1f} cm | {grid:.2f} s |",
+        f"| `check_spheres`, {SPHERES:,} spheres of 1 to 5 cm | {ours / 1e6:.2f} M spheres/s |",
+        f"| `fcl.collide`, the same spheres one by one against the map's OctoMap, same voxels | "
+        f"{theirs / 1e6:.3f} M spheres/s, {ours / theirs:.0f} times less; {100 * alike:.1f} % of answers alike |",
+    ]
+
+
+def _median_seconds(what: Callable[[], object]) -> float:
+    """Of `REPEATS` calls after one that warms up."""
+    what()
+    seconds = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        what()
+        seconds.append(time.perf_counter() - begun)
+    return float(np.median(seconds))
+
+
+def _fcl(
+    scene: SceneMap, folder: Path, centers: Float[ndarray, "n 3"], radii: Float[ndarray, " n"]
+) -> tuple[float, float]:
+    """Seconds that python-fcl takes against the map's OctoMap, and how often both say the same of surfaces."""
+    try:
+        import fcl
+    except ImportError:
+        raise InputError(
+            "bench map: needs python-fcl and pyoctomap; pip install 'jcr[dev,planning]'"
+        ) from None
+    tree: Any = fcl
+    write_octomap(folder / "map.bt", scene, Provenance("base"))
+    content = (folder / "map.bt").read_bytes()
+    voxels = np.frombuffer(content[content.index(b"\ndata\n") + 6 :], np.int8)
+    world = tree.CollisionObject(tree.OcTree(scene.cell, voxels.tolist()))
+    request = tree.CollisionRequest()
+    spheres = [
+        tree.CollisionObject(tree.Sphere(float(r)), tree.Transform(np.asarray(c, float)))
+        for c, r in zip(centers, radii, strict=True)
+    ]
+    begun = time.perf_counter()
+    hits = [tree.collide(sphere, world, request, tree.CollisionResult()) > 0 for sphere in spheres]
+    seconds = time.perf_counter() - begun
+    return seconds, float((np.array(hits) == scene.check_spheres(centers, radii, "free")).mean())
+
+
+def true_surface(truth: Truth) -> Surface:
+    """What the images show, one point a pixel."""
+    parts = []
+    for k, base_from_camera in enumerate(truth.base_from_camera):
+        depth = true_depth(truth, k)
+        shown = depth > 0
+        with Image.open(truth.folder / truth.images[k]) as picture:
+            color = np.asarray(picture)[shown]
+        x_in_base = apply(base_from_camera, depth[shown][:, None] * rays(truth.intrinsics)[shown])
+        parts.append((x_in_base, color, true_labels(truth, k)[shown].astype(int), np.full(shown.sum(), k)))
+    return Surface(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def true_cloud(truth: Truth, points: int = 200_000, noise: float = 0.0, seed: int = 0) -> PointCloud:
+    """The cloud that perfect poses and depth would give; Gaussian `noise` (m) is added along the rays."""
+    surface, draw = true_surface(truth), np.random.default_rng(seed)
+    chosen = draw.choice(len(surface.image), min(points, len(surface.image)), replace=False)
+    center = truth.base_from_camera[surface.image[chosen], :3, 3]
+    ray = surface.x_in_base[chosen] - center
+    length = np.linalg.norm(ray, axis=1, keepdims=True)
+    return PointCloud(
+        points_in_base=center + ray * (1 + noise * draw.normal(size=length.shape) / length),
+        color=surface.color[chosen],
+        confidence=np.ones(len(chosen)),
+        margin=np.zeros(len(chosen)),
+        label=surface.label[chosen],
+        image=surface.image[chosen],
+        camera_centers_in_base=truth.base_from_camera[:, :3, 3],
+        label_names=truth.labels,
+    )
+
+
+def calibrated_cloud(truth: Truth, out: Path) -> PointCloud:
+    """The cloud that COLMAP and the calibration of the capture give, labelled by the true masks."""
+    capture = read_capture(truth.folder)
+    result = calibrate(capture, out, backend="colmap")
+    size = result.reconstruction.confidence.shape[:0:-1]
+    labels = [
+        cv2.resize(true_labels(truth, row), size, interpolation=cv2.INTER_NEAREST)
+        for row in result.reconstruction.image_index
+    ]
+    return point_cloud(
+        capture,
+        result.reconstruction,
+        result.hand_eye,
+        np.stack(labels).astype(int),
+        label_names=truth.labels,
+    )
+
+
+def places_to_ask(truth: Truth) -> Places:
+    """The same for every map."""
+    draw = np.random.default_rng(0)
+    low, high = truth.workspace_in_base
+    surface = true_surface(truth)
+    there = (surface.label > 0) & ((surface.x_in_base >= low) & (surface.x_in_base <= high)).all(1)
+    some = draw.choice(np.flatnonzero(there), min(100_000, int(there.sum())), replace=False)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, GRID) for a, b in zip(low, high, strict=True))), -1)
+    x = grid.reshape(-1, 3) + draw.uniform(0, GRID, (grid.size // 3, 3))
+    solid = solid_labels(make_scene(truth.scene, truth.seed), x)  # pyright: ignore[reportArgumentType]
+    return Places(
+        x,
+        inside=solid > 1,
+        seen_free=(solid == 0) & (x[:, 2] > truth.table_height) & _seen(truth, x),
+        to_surface=_distance(KDTree(surface.x_in_base[there][::4]), x),
+        surface=Surface(
+            surface.x_in_base[some], surface.color[some], surface.label[some], surface.image[some]
+        ),
+    )
+
+
+def score(scene: SceneMap, places: Places) -> MapScore:
+    """The map of a simulated capture against its truth."""
+    x, surface = places.x, places.surface
+    sample = scene.query(x)
+    occupied = (sample.occupancy >= 0.5) & ~sample.unknown
+    to_map = _distance(KDTree(x[occupied]), surface.x_in_base)
+    rates = {}
+    for limit in (5, 10):
+        precision = (places.to_surface[occupied] < limit / 1000).mean()
+        recall = (to_map < limit / 1000).mean()
+        rates |= {f"precision_{limit}mm": float(precision), f"recall_{limit}mm": float(recall)}
+        rates[f"f_{limit}mm"] = float(2 * precision * recall / max(precision + recall, 1e-9))
+    inside, free = places.inside, places.seen_free
+    called_free = scene.query(x, unknown="occupied").occupancy < 0.5
+    mapped = ~scene.query(surface.x_in_base).unknown
+    at = scene.query(surface.x_in_base[mapped])
+    return MapScore(
+        **rates,
+        false_free_inside=float(called_free[inside].mean()),
+        false_free_deep=float(called_free[inside & (places.to_surface > 0.005)].mean()),
+        false_occupied=float(occupied[free].mean()),
+        false_occupied_far=float(occupied[free & (places.to_surface > 0.01)].mean()),
+        unknown_free=float(sample.unknown[free].mean()),
+        unknown=float(sample.unknown.mean()),
+        color_psnr=float(-10 * np.log10(((at.color - surface.color[mapped] / 255.0) ** 2).mean())),
+        label_iou=mean_iou(at.label, surface.label[mapped]),
+    )
+
+
+def mean_iou(found: ndarray, true: ndarray, labels: tuple = ()) -> float:
+    """Intersection over union of labels (n,), averaged over `labels`: by default those that are truly there."""
+    chosen = labels or tuple(np.unique(true))
+    shares = [((found == k) & (true == k)).sum() / ((found == k) | (true == k)).sum() for k in chosen]
+    return float(np.mean(shares))
+
+
+def _seen(truth: Truth, x_in_base: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+    """Which free places lie before what a camera's pixel shows."""
+    seen, camera = np.zeros(len(x_in_base), bool), truth.intrinsics
+    for k, camera_from_base in enumerate(inverse(truth.base_from_camera)):
+        x, y, z = apply(camera_from_base, x_in_base).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, row = np.round(camera.fx * x / z + camera.cx), np.round(camera.fy * y / z + camera.cy)
+        ahead = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        depth = true_depth(truth, k)[row[ahead].astype(int), column[ahead].astype(int)]
+        seen[np.flatnonzero(ahead)[z[ahead] < depth]] = True
+    return seen
+
+
+def _distance(tree: KDTree, x: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
+    """Metres to the nearest point of the tree; infinite beyond 2 cm, which keeps the search short."""
+    return np.asarray(tree.query(x, distance_upper_bound=0.02, workers=-1)[0])

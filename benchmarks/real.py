@@ -1,0 +1,214 @@
+"""`jcr bench real DIR`: real captures against the references stored beside them."""
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from benchmarks.peers import opencv
+from jcr.calibration.calibration_json import HeldOutError, read_hand_eye
+from jcr.calibration.stage import calibrate as calibrate_stage
+from jcr.capture.read import read_capture
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import (
+    Transforms,
+    inverse,
+    nearest_rotation,
+    rotation_between_deg,
+    rotation_log,
+    transform,
+)
+from jcr.pipeline import RunOptions, calibrate
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.marker import MarkerOptions, reconstruct
+from jcr.records import Capture
+
+
+@dataclass(frozen=True)
+class Row:
+    """One calibration held against its reference."""
+
+    capture: str
+    how: str
+    images: str
+    off_mm: float | None = None
+    off_deg: float | None = None
+    sigmas: float | None = None
+    """Largest distance on any axis in reported standard deviations; the reference's own error is in it."""
+    std_mm: float | None = None
+    std_deg: float | None = None
+    held_out: HeldOutError | None = None
+    trusted: bool = False
+    seconds: float = 0.0
+    says: str = ""
+
+
+def run(captures: Path, boards: Sequence[str] = ()) -> str:
+    """Markdown: every capture below `captures` that has a reference.json, without and with its board.
+
+    A board is named as CAPTURE=BOARD, in the words of `--board`. Raises InputError where no capture has a
+    reference, or a board is of a capture that is not there.
+    """
+    folders = sorted(path.parent for path in captures.glob("*/reference.json"))
+    if not folders:
+        raise InputError(f"{captures}: no folder below it holds a reference.json beside its capture.json")
+    board_of = {name: board for name, _, board in (text.partition("=") for text in boards)}
+    if unknown := board_of.keys() - {folder.name for folder in folders}:
+        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
+    rows = []
+    for folder in folders:
+        rows += _rows(folder, None)
+        if folder.name in board_of:
+            rows += _rows(folder, board_of[folder.name])
+    lines = [
+        *_claims(rows),
+        "",
+        "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
+        "own. σ: the largest reported standard deviation of an axis. Held out: each gripper pose predicted by the other "
+        "images; where two calibrations predict alike, the pictures cannot tell which is the better one.",
+        "",
+        "| capture | from | images used | off: mm | ° | in σ | ±σ: mm | ° | held out: mm / ° | trusted | s |",
+        "|---" * 11 + "|",
+        *map(_line, rows),
+        "",
+        *(f"- {row.capture}, {row.how}: {row.says}" for row in rows if row.says),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _claims(rows: Sequence[Row]) -> list[str]:
+    said = [
+        f"{row.capture} {row.off_mm:.1f} mm and {row.off_deg:.2f}° from its reference ({row.how})"
+        for row in rows
+        if row.trusted and row.off_mm is not None and row.off_deg is not None
+    ]
+    refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
+    told = f" Not trusted, and said so: {', '.join(refused)}." if refused else ""
+    return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}"]
+
+
+def _rows(folder: Path, board: str | None) -> list[Row]:
+    capture = read_capture(folder)
+    how = "pictures alone" if board is None else f"`{board}`"
+    reference, _ = read_hand_eye(folder / "reference.json")
+    options = RunOptions(ReconstructOptions(board=board))
+    begun = time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as out:
+            result = calibrate(capture, out, options)
+    except NotTrustedError as refusal:
+        seconds = time.perf_counter() - begun
+        return [Row(folder.name, how, f"0 of {len(capture)}", seconds=seconds, says=str(refusal))]
+    seconds = time.perf_counter() - begun
+    x, uncertainty = result.hand_eye.gripper_from_camera, result.calibration.uncertainty
+    assert uncertainty is not None
+    off_mm, off_deg = _off(x, reference)
+    error = np.concatenate(
+        [reference[:3, 3] - x[:3, 3], rotation_log(reference[:3, :3] @ x[:3, :3].T)]
+    ) / np.sqrt(np.diag(result.hand_eye.covariance)[:6])
+    row = Row(
+        folder.name,
+        how if board else f"{how} ({result.calibration.backend})",
+        f"{sum(image.used for image in result.calibration.images)} of {len(capture)}",
+        off_mm,
+        off_deg,
+        float(np.abs(error).max()),
+        max(uncertainty.translation_std_mm),
+        max(uncertainty.rotation_std_deg),
+        result.calibration.held_out,
+        result.converged,
+        seconds,
+        "" if result.converged else result.calibration.warnings[0],
+    )
+    if board is None:
+        return [row]
+    rows = result.reconstruction.image_index
+    gripper, camera = capture.base_from_gripper[rows], result.reconstruction.recon_from_camera
+    off_mm, off_deg = _off(_park(gripper, camera), reference)
+    park = Row(folder.name, f"{how}, OpenCV's Park", f"{len(rows)} of {len(capture)}", off_mm, off_deg)
+    return [
+        row,
+        replace(park, held_out=_park_held_out(gripper, camera)),
+        *_lens_row(capture, board, reference),
+    ]
+
+
+def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) -> list[Row]:
+    """The same with the lens found from the board: how much of the distance the stored lens may explain."""
+    if capture.intrinsics is None:
+        return []
+    blind = replace(capture, intrinsics=None)
+    try:
+        found = reconstruct(blind, MarkerOptions(board, dense=False))
+        hand_eye = calibrate_stage(blind, found)
+    except NotTrustedError:
+        return []
+    off_mm, off_deg = _off(hand_eye.gripper_from_camera, reference)
+    how = f"`{board}`, its lens ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
+    held = hand_eye.held_out
+    told = (
+        None
+        if held is None
+        else HeldOutError(
+            translation_mm=held.translation_mm,
+            rotation_deg=held.rotation_deg,
+            reprojection_px=None,
+            how=held.how,
+        )
+    )
+    images = f"{hand_eye.inliers.sum()} of {len(capture)}"
+    return [Row(capture.folder.name, how, images, off_mm, off_deg, held_out=told)]
+
+
+def _park(gripper: Transforms, camera: Transforms) -> Float[ndarray, "4 4"]:
+    """What the references were made with, on the board's poses that we found."""
+    return opencv("Park", gripper, camera, 1.0)[0]
+
+
+def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOutError:
+    """Each gripper pose predicted by Park's method from the others, as `held_out` of a calibration has it."""
+    missed = []
+    for k in range(len(gripper)):
+        others = np.arange(len(gripper)) != k
+        x = _park(gripper[others], camera[others])
+        base_from_board = gripper[others] @ x @ inverse(camera[others])
+        middle = transform(
+            nearest_rotation(base_from_board[:, :3, :3].mean(0)), base_from_board[:, :3, 3].mean(0)
+        )
+        missed.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
+    mm, deg = np.mean(missed, axis=0)
+    return HeldOutError(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
+
+
+def _off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
+    metres = float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
+    return 1e3 * metres, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
+
+
+def _line(row: Row) -> str:
+    def shown(value: float | None, digits: int) -> str:
+        return "" if value is None else f"{value:.{digits}f}"
+
+    held = (
+        "" if row.held_out is None else f"{row.held_out.translation_mm:.2f} / {row.held_out.rotation_deg:.2f}"
+    )
+    judged = "" if row.seconds == 0 else ("yes" if row.trusted else "**no**")
+    cells = (
+        row.capture,
+        row.how,
+        row.images,
+        shown(row.off_mm, 2),
+        shown(row.off_deg, 3),
+        shown(row.sigmas, 1),
+        shown(row.std_mm, 2),
+        shown(row.std_deg, 3),
+        held,
+        judged,
+        shown(row.seconds or None, 1),
+    )
+    return "| " + " | ".join(cells) + " |"

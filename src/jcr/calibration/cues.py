@@ -1,0 +1,85 @@
+"""What a user can measure with a ruler to replace what the motions do not show."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.geometry import rotation_angle
+from jcr.handeye.fit import Poses
+from jcr.records import Capture, HandEye, Reconstruction
+
+LENGTH_STD = 0.01
+"""Relative: a pixel's breadth at either end of a length of a hundred pixels."""
+HEIGHT_STD = 1e-3
+"""m, of a ruler held to a lens."""
+CONTRADICTED = (4.0, 0.02)
+"""Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
+ONE_AXIS = np.radians(6)
+"""Planar motion keeps its axis within this, on average."""
+
+
+def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, "3"], float, float]:
+    """The camera's height (m) above the gripper's origin along the axis that all rotations share.
+
+    Raises InputError where they share none: the height is then no cue, but a result.
+    """
+    u, _, vt = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
+    up = np.sign(u[2, 0]) or 1.0
+    axis_in_base, axis_in_gripper = up * u[:, 0], up * vt[0]
+    wander = np.linalg.norm(base_from_gripper[:, :3, :3] @ axis_in_gripper - axis_in_base, axis=1)
+    turn = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
+    if np.sqrt((wander**2).mean()) > ONE_AXIS or turn.max() < ONE_AXIS:
+        raise InputError(
+            "--known-height: the gripper does not turn about one common axis, along which a height could be "
+            "known; leave the option out"
+        )
+    return axis_in_gripper, height, HEIGHT_STD
+
+
+def length_cue(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    image: str,
+    ends_px: Float[ndarray, "2 2"],
+    length: float,
+) -> tuple[float, float]:
+    """Metres per recon unit from the length (m) between two pixels of one image.
+
+    Raises InputError when the image or a surface at either pixel is not there.
+    """
+    rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
+    if not rows:
+        raise InputError(f"--known-length: {image} is not among the registered images; choose another")
+    lens, grid = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
+    rays = cv2.undistortPoints(ends_px[:, None], lens.matrix, np.array(lens.distortion))[:, 0]
+    column = np.round(rays[:, 0] * grid.fx + grid.cx).astype(int)
+    row = np.round(rays[:, 1] * grid.fy + grid.cy).astype(int)
+    height, width = reconstruction.confidence.shape[1:]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    if not inside.all() or not (reconstruction.confidence[rows[0], row, column] > 0).all():
+        raise InputError(
+            f"--known-length: no surface was found at both pixels of {image}; choose textured places"
+        )
+    first, second = reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
+    return length / float(np.linalg.norm(second - first)), LENGTH_STD
+
+
+def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
+    """What to tell the user where the robot's motion excludes that the reconstruction is in metres.
+
+    `free` is a calibration that was not told so; `metric_std` is how well the metre is known (relative one
+    sigma).
+    """
+    if not free.converged:
+        return None
+    off, std = float(np.log(free.scale)), float(np.sqrt(free.covariance[6, 6]))
+    sigmas, share = CONTRADICTED
+    if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
+        return None
+    return (
+        f"by the robot's motion the board is {100 * abs(np.expm1(off)):.1f} ± {100 * std:.1f} % "
+        f"{'larger' if off > 0 else 'smaller'} than told; measure its squares, and check that the gripper poses "
+        "are in metres"
+    )

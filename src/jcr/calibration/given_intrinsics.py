@@ -1,0 +1,103 @@
+"""Are the intrinsics that were given those of the pictures?
+
+Given intrinsics are held. The pictures and the robot's motion determine them all the same: freed in the bundle
+adjustment, focal length, principal point and two radial coefficients have an estimate and a covariance, in which what
+few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.calibration.bundle import LENS_STD, Adjusted, adjust, free_lens
+from jcr.calibration.projection import CAMERA_PARAMETERS, parameters
+from jcr.geometry import rotation_log
+from jcr.handeye.equation import Poses
+from jcr.records import HandEye, Intrinsics, Tracks
+from jcr.rounding import significant
+
+SURE = 5.0
+"""Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
+true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
+OFF = 0.01
+"""Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
+OFF_CENTRE = LENS_STD["cx"]
+"""Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
+right where it is used with the same."""
+CX, CY, K1, K2 = (CAMERA_PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
+
+
+@dataclass(frozen=True)
+class LensDoubt:
+    """Why the given intrinsics cannot be those of the pictures, and what this does."""
+
+    text: str
+    shift: Float[ndarray, "7"]
+    """By how much the calibration moves when the lens is freed; in records.COVARIANCE_ORDER."""
+
+
+def lens_doubt(
+    hand_eye: HandEye,
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    held: Intrinsics,
+    tracks: Tracks,
+    noise: tuple[float, float] | None,
+    adjusted: Adjusted | None,
+) -> LensDoubt | None:
+    """What the used images say against the lens that was held; None where they say nothing.
+
+    `adjusted` is the adjustment with that lens, where there is one: only when one Gauss-Newton step from it, the lens
+    freed, leaves some doubt is the lens adjusted until it settles.
+    """
+    if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
+        return None
+    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
+    freed = adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, refine_lens=True)
+    found = _found_off(freed, held, tracks, SURE, 1.0)
+    if not found:
+        return None
+    x, before = freed.bundle.gripper_from_camera, hand_eye.gripper_from_camera
+    shift = np.r_[
+        x[:3, 3] - before[:3, 3],
+        rotation_log(x[:3, :3] @ before[:3, :3].T),
+        np.log(freed.scale / hand_eye.scale),
+    ]
+    return LensDoubt(
+        f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
+        "(null) to have them estimated",
+        shift,
+    )
+
+
+def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
+    """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
+    found = free_lens(adjusted, held)
+    if found is None:
+        return []
+    camera, covariance = found
+    by = camera - parameters(held)
+    std = np.sqrt(np.diag(covariance))
+    off = []
+    if abs(by[0]) > max(sure * std[0], share * OFF * held.fx):
+        off.append(
+            f"a focal length of {camera[0]:.0f} ± {significant(std[0])} px where {held.fx:.0f} is given"
+        )
+    used_radius = np.linalg.norm((tracks.x_px - [held.cx, held.cy]) / [held.fx, held.fy], axis=1)
+    radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
+    powers = np.stack([radius**2, radius**4])
+    bent = by[[K1, K2]] @ powers
+    bent_std = np.sqrt(np.einsum("kr,kl,lr->r", powers, covariance[np.ix_([K1, K2], [K1, K2])], powers))
+    most = int(np.abs(bent * radius).argmax())
+    if abs(bent[most]) > max(sure * bent_std[most], share * OFF):
+        px, px_std = held.fx * radius[most] * np.array([abs(bent[most]), bent_std[most]])
+        off.append(f"a distortion up to {px:.1f} ± {significant(px_std)} px from the one used")
+    centre_std = std[[CX, CY]]
+    if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * held.width)).any():
+        off.append(
+            f"a principal point of ({camera[CX]:.0f}, {camera[CY]:.0f}) ± {significant(centre_std.max())} px where "
+            f"({held.cx:.0f}, {held.cy:.0f}) is given"
+        )
+    return off

@@ -1,0 +1,282 @@
+"""The calibration stage: poses first, robustly; then images, points, lens and robot adjusted together."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.calibration.bundle import Adjusted, adjust, lens_of, median_reprojection
+from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
+from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.fit import Cues, deleted_residuals
+from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.solve import judged, solve_hand_eye
+from jcr.records import Capture, HandEye, HeldOut, PosePairs, Reconstruction, RobotNoise, ScaleCheck, Tracks
+
+FAR_SCALE = float(np.log(1.2))
+"""Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
+MIN_OBSERVATIONS = 200
+"""Fewer correspondences than this do not refine what the poses say."""
+METRIC_STD = 0.005
+"""Relative; a printed marker has the size that its maker says to half a percent."""
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """How the hand-eye calibration is found."""
+
+    robot_noise: tuple[float, float] | None = None
+    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    known_height: float | None = None
+    """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
+    known_length: tuple[str, float, float, float, float, float] | None = None
+    """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
+    bundle_adjustment: bool = True
+    """Refine with the image correspondences; without, the camera poses alone decide."""
+
+
+def calibrate(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
+) -> HandEye:
+    """Hand-eye calibration of the registered images; per-pose fields are in the reconstruction's order.
+
+    Camera poses that come with their covariance are weighed with it, and that is all. Else bundle adjustment
+    follows on correspondences found in the images; on those between pointmaps, whose errors neighbours share,
+    its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
+    images.
+    """
+    hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
+    # A unit that somebody vouches for was used for the scale, and is no check of it.
+    independent = reconstruction.is_metric and reconstruction.metric_std is None
+    return _scale_checked(hand_eye) if independent else hand_eye
+
+
+def _calibrated(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> HandEye:
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    evidence = reconstruction.evidence
+    camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
+    if len(camera) < 2:
+        few = f"{len(camera)} of {len(capture)} images registered; overlap the views more"
+        raise NotTrustedError("; ".join([few, *reconstruction.notes]))
+    noise = _noise(options)
+    cues = _cues(capture, reconstruction, options)
+    camera_covariance = None if evidence is None else evidence.covariance
+    contradiction = None
+    if cues is None and (metric_std := reconstruction.metric_std) is not None:
+        free = solve_hand_eye(gripper, camera, robot_noise=noise, camera_covariance=camera_covariance)
+        contradiction = scale_contradiction(free, metric_std)
+        cues = Cues(scale=(1.0, metric_std))
+    hand_eye = solve_hand_eye(
+        gripper, camera, robot_noise=noise, cues=cues, camera_covariance=camera_covariance
+    )
+    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
+    if contradiction is not None:
+        return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
+    used = hand_eye.inliers
+    tracks = of_images(reconstruction.tracks, used)
+    adjustable = (
+        options.bundle_adjustment
+        # What pointmaps say of the cameras is in their covariance, with the errors that neighbours share; their
+        # tracks, taken for independent, make it worse: simulated, 0.2 mm became 1.3 mm.
+        and evidence is None
+        and cues is None  # bundle adjustment knows the robot's scale and height alone
+        and len(tracks.image) >= MIN_OBSERVATIONS
+        and used.sum() >= 3
+    )
+    adjusted = None
+    if not hand_eye.converged:
+        hand_eye = _investigated(hand_eye, gripper, camera)
+    elif adjustable:
+        adjusted = adjust(
+            gripper[used],
+            (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon),
+            camera[used],
+            reconstruction.intrinsics,
+            tracks,
+            noise,
+            refine_lens=capture.intrinsics is None,
+        )
+        refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
+        if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
+            hand_eye = refined
+    # Of motions that show too little, what is missing comes first; and pointmaps were made with a lens of their own.
+    if (
+        capture.intrinsics is None
+        or not adjustable
+        or tracks.from_pointmaps
+        or not hand_eye.observability.observable
+    ):
+        return hand_eye
+    doubt = lens_doubt(
+        hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
+    )
+    return hand_eye if doubt is None else _doubted(hand_eye, doubt)
+
+
+def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
+    """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
+    covariance = hand_eye.covariance + np.outer(doubt.shift, doubt.shift)
+    widened = judged(replace(hand_eye, covariance=covariance, lens_shift=doubt.shift))
+    if hand_eye.converged and widened.converged:
+        return replace(widened, warnings=(*widened.warnings, doubt.text))
+    # More images, the cure for a large covariance, do not mend a lens.
+    return replace(widened, converged=False, warnings=(doubt.text, *hand_eye.warnings))
+
+
+def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
+    """Whether images left out are missed by less; not, where too few images tell."""
+    if one is None or other is None:
+        return False
+    return one.missed_m < other.missed_m
+
+
+def _scale_checked(hand_eye: HandEye) -> HandEye:
+    """With how far a network's own metre is from the robot's; a warning where it is far beyond its error."""
+    # A network's length of 1 is `scale` metres by the robot.
+    std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
+    check = ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
+    hand_eye = replace(hand_eye, scale_check=check)
+    if abs(np.log(hand_eye.scale)) < max(FAR_SCALE, 3 * np.sqrt(hand_eye.covariance[6, 6])):
+        return hand_eye
+    remark = f"{in_words(check)}; check the unit of the gripper poses"
+    return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+
+
+def in_words(check: ScaleCheck) -> str:
+    """How far the network's own scale is from the robot's, and how sure that is."""
+    off, std = check.off_percent, check.std_percent
+    if abs(off) < 2 * std:
+        return f"the network's own metre agrees with the robot's ({off:+.2g} ± {std:.2g} %)"
+    if off > 100:
+        return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
+    direction = "long" if off > 0 else "short"
+    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} by the robot's"
+
+
+def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
+    """Hand-eye calibration from camera poses that were given, without images.
+
+    Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
+    that do not show a scale are helped by taking it as 1.
+    """
+    options = options or CalibrateOptions()
+    gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, _noise(options)
+    if options.known_length is not None:
+        raise InputError("--known-length: there are no images in which it could be seen; leave it out")
+    offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
+    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
+    if pairs.is_metric and not hand_eye.observability.observable:
+        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues((1.0, METRIC_STD), offset))
+        remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
+        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    if not hand_eye.converged:
+        return _investigated(hand_eye, gripper, camera)
+    if pairs.is_metric and not is_one(hand_eye):
+        size = f"{100 * abs(1 / hand_eye.scale - 1):.1f} % too {'large' if hand_eye.scale < 1 else 'small'}"
+        remark = (
+            f"the scale is {hand_eye.scale:.4f} where a marker of known size gives 1: its size was given {size}, or "
+            "the camera's focal length is off"
+        )
+        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    return hand_eye
+
+
+def is_one(hand_eye: HandEye) -> bool:
+    """Whether the scale is 1 within what is known of it."""
+    off = abs(float(np.log(hand_eye.scale)))
+    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+
+
+def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
+    if options.robot_noise is None:
+        return None
+    return options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
+
+
+def _cues(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:
+    if options.known_height is None and options.known_length is None:
+        return None
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    scale = offset = None
+    if options.known_height is not None:
+        offset = height_cue(gripper, options.known_height / 1e3)
+    if options.known_length is not None:
+        image, *ends, length_mm = options.known_length
+        scale = length_cue(capture, reconstruction, image, np.array(ends).reshape(2, 2), length_mm / 1e3)
+    return Cues(scale, offset)
+
+
+def _investigated(
+    hand_eye: HandEye, gripper: Float[ndarray, "m 4 4"], camera: Float[ndarray, "m 4 4"]
+) -> HandEye:
+    """A fit that failed, with the reading of the poses that would fit, if there is one."""
+    found = better_reading(gripper, camera)
+    if found is None:
+        return hand_eye
+    if not hand_eye.observability.observable:
+        # Of motions that show too little, another reading may fit by chance: what is missing comes first.
+        return replace(hand_eye, warnings=(*hand_eye.warnings, explained(found)))
+    return replace(hand_eye, warnings=(explained(found), *hand_eye.warnings))
+
+
+def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
+    """The observations of the used images, whose rows are counted anew."""
+    kept = used[tracks.image]
+    row = np.cumsum(used) - 1
+    return replace(tracks, image=row[tracks.image[kept]], x_px=tracks.x_px[kept], point=tracks.point[kept])
+
+
+def _refined(
+    hand_eye: HandEye,
+    adjusted: Adjusted,
+    gripper: Float[ndarray, "m 4 4"],
+    camera: Float[ndarray, "m 4 4"],
+    reconstruction: Reconstruction,
+) -> HandEye:
+    used = hand_eye.inliers
+    x = adjusted.bundle.gripper_from_camera
+    # Rejected poses are measured against where their cameras say they were.
+    predicted = adjusted.base_from_recon @ scale_translation(camera, adjusted.scale) @ inverse(x)
+    predicted[used] = adjusted.bundle.base_from_gripper
+    turn = np.swapaxes(gripper[:, :3, :3], 1, 2) @ predicted[:, :3, :3]
+    reprojection = np.full(len(used), np.nan)
+    reprojection[used] = median_reprojection(adjusted)
+    delta_t, delta_r = paper_residuals(gripper, camera, x, adjusted.scale, used)
+    return replace(
+        hand_eye,
+        gripper_from_camera=x,
+        scale=adjusted.scale,
+        base_from_recon=adjusted.base_from_recon,
+        covariance=adjusted.covariance,
+        translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
+        rotation_residual_rad=rotation_angle(turn),
+        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
+        residual_translation=delta_t,
+        residual_rotation=delta_r,
+        intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),
+        held_out=_held_out(adjusted),
+        reprojection_px=reprojection,
+    )
+
+
+def _held_out(adjusted: Adjusted) -> HeldOut | None:
+    """Each image's robot pose predicted by an adjustment that was not told it."""
+    m = len(adjusted.robot_residual)
+    if m < 4:
+        return None
+    sigma = np.repeat(adjusted.noise, 3)
+    missed = deleted_residuals(adjusted.robot_residual / sigma, adjusted.robot_hat) * sigma
+    metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
+    gripper = adjusted.bundle.base_from_gripper
+    told = transform(gripper[:, :3, :3] @ rotation_exp(-missed[:, 3:]), gripper[:, :3, 3] - missed[:, :3])
+    pixels = median_reprojection(adjusted, told)
+    return HeldOut(
+        1e3 * float(metres),
+        float(np.degrees(radians)),
+        float(np.median(pixels)),
+        "each image's gripper pose predicted by the others",
+    )

@@ -1,0 +1,280 @@
+"""The convention detective: gripper poses that do not fit the pictures, read in other ways people write them.
+
+Readings are ranked by screw congruence (a gripper's rotation between two images has the angle of its
+camera's), and the best of them solved. Nothing is ever applied: a reading that fits is named.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.geometry import fit_similarity, inverse, rotation_exp, skew, transform
+from jcr.handeye.fit import Poses
+from jcr.handeye.solve import solve_hand_eye
+
+SOLVED = 24
+"""At most so many readings are solved in full, the most congruent ones."""
+SAME_ANGLE = np.radians(0.1)
+"""Relabelled axes keep every angle: among readings this alike, the usual mistakes are solved first."""
+FITS = 3.0
+"""mm; poses that agree with the pictures to this need no other reading."""
+CONGRUENT = np.radians(1.5)
+"""Readings whose angles miss the cameras' by less than this are worth solving."""
+BETTER = 3.0
+"""A reading is named when it fits so many times better than the poses as given."""
+MIN_SHARE = 0.8
+"""of the images must agree under it."""
+EULER_ORDERS = (
+    *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
+    *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
+)
+"""SciPy's names, lower case about fixed axes, upper case about moving ones; the usual ones first."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the poses, and how well it fits."""
+
+    name: str
+    translation_mm: float
+    """Noise per axis that the fit leaves; infinite when nothing fits."""
+    rotation_deg: float
+    used: int
+    """Images that agree."""
+
+    @property
+    def misfit(self) -> float:
+        """Size of the noise, a degree counted as 5 mm."""
+        return self.translation_mm + 5 * self.rotation_deg
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    name: str
+    base_from_gripper: Float[ndarray, "k 4 4"]
+    image: Int[ndarray, " k"]
+    """Row of the camera that each pose belongs to."""
+
+
+def better_reading(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Reading, Reading] | None:
+    """The reading that fits far better than the poses as given, and those; None when there is none."""
+    n = len(base_from_gripper)
+    candidates = list(_candidates(base_from_gripper))
+    as_given = _solved(candidates[0], recon_from_camera)
+    if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
+        return None
+    others = candidates[1:]
+    camera_angle = _angles(recon_from_camera)
+    gaps = [_incongruence(candidate, camera_angle) for candidate in others]
+    if min(gaps) > CONGRUENT:
+        # Lost turns take seconds to find again: only where no cheaper reading has the cameras' angles.
+        unwrapped = [
+            _vectors_taken_as_radians(base_from_gripper, camera_angle),
+            *_angles_taken_as_radians(base_from_gripper, recon_from_camera),
+        ]
+        others += unwrapped
+        gaps += [_incongruence(candidate, camera_angle) for candidate in unwrapped]
+    gaps = np.array(gaps)
+    order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
+    readings = [_solved(others[k], recon_from_camera) for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
+    least = min(reading.misfit for reading in readings)
+    best = next(reading for reading in readings if reading.misfit < 1.05 * least + 0.01)
+    if best.used >= MIN_SHARE * (n - 2) and best.misfit * BETTER < as_given.misfit:
+        return best, as_given
+    return None
+
+
+def explained(found: tuple[Reading, Reading]) -> str:
+    """The finding in one sentence."""
+    best, given = (
+        f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
+        for reading in found
+    )
+    name = found[0].name
+    return f"the poses fit when read as {name}: {best}, instead of {given}; correct them at their source"
+
+
+def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
+    solved = solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
+    noise = solved.robot_noise
+    return Reading(
+        candidate.name,
+        1e3 * noise.translation,
+        float(np.degrees(noise.rotation)),
+        int(solved.inliers.sum()),
+    )
+
+
+def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
+    """Typical difference (rad) between the angles of gripper and camera motions."""
+    gap = np.abs(
+        _angles(candidate.base_from_gripper) - camera_angle[np.ix_(candidate.image, candidate.image)]
+    )
+    return float(np.quantile(gap[np.triu_indices(len(gap), 1)], 0.6))
+
+
+def _angles(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n"]:
+    """Angles (rad) of all relative rotations, by their traces: rough near 0 and π, but quick."""
+    flat = a_from_b[:, :3, :3].reshape(-1, 9)
+    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
+
+
+def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
+    """As given first; then one mistake at a time."""
+    n = len(base_from_gripper)
+    every = np.arange(n)
+    yield _Candidate("they are given", base_from_gripper, every)
+    yield _Candidate("their inverses (gripper_from_base was given)", inverse(base_from_gripper), every)
+    yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
+    for shift in (1, 2):
+        if n - shift >= 5:
+            yield _Candidate(
+                f"{shift} ahead of the images (image k has pose k + {shift})",
+                base_from_gripper[shift:],
+                every[: n - shift],
+            )
+            yield _Candidate(
+                f"{shift} behind the images (image k has pose k − {shift})",
+                base_from_gripper[: n - shift],
+                every[shift:],
+            )
+    rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
+
+    def turned(name: str, read: Rotation) -> _Candidate:
+        return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
+
+    x, y, z, w = rotation.as_quat().T
+    yield turned(
+        "quaternions w, x, y, z that were taken as x, y, z, w", Rotation.from_quat(np.stack([y, z, w, x], 1))
+    )
+    yield turned(
+        "quaternions x, y, z, w that were taken as w, x, y, z", Rotation.from_quat(np.stack([w, x, y, z], 1))
+    )
+    yield turned(
+        "rotation vectors in radians that were taken as degrees",
+        Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
+    )
+    yield turned("transposed rotations", rotation.inv())
+    angles = {order: rotation.as_euler(order, suppress_warnings=True) for order in EULER_ORDERS}
+    for order in EULER_ORDERS:
+        yield turned(
+            f"Euler angles ({order}) in radians that were taken as degrees",
+            Rotation.from_euler(order, np.degrees(angles[order])),
+        )
+    k = {order: rank for rank, order in enumerate(EULER_ORDERS)}
+    for taken, meant in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: k[pair[0]] + k[pair[1]]):
+        yield turned(
+            f"Euler angles {meant} that were taken as {taken}", Rotation.from_euler(meant, angles[taken])
+        )
+
+
+def _vectors_taken_as_radians(base_from_gripper: Poses, camera_angle: Float[ndarray, "n n"]) -> _Candidate:
+    """Rotation vectors in degrees that were taken as radians: whole turns were lost, and are found again.
+
+    Each image leaves some sixty angles; those of two images that are congruent decide the others.
+    """
+    vector = Rotation.from_matrix(base_from_gripper[:, :3, :3]).as_rotvec()
+    length = np.linalg.norm(vector, axis=1, keepdims=True)
+    axis = vector / np.maximum(length, 1e-12)
+    turns = np.arange(-29, 30)
+    value = np.radians(length + 2 * np.pi * turns)  # what was degrees, (n, 59)
+    options = rotation_exp(axis[:, None] * value[..., None])
+    options[np.abs(value) > np.pi] = np.nan  # no rotation vector is longer than half a turn
+
+    def gap(i: int, j: int) -> Float[ndarray, "59 59"]:
+        trace = np.einsum("aij,bij->ab", options[i], options[j])
+        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        return np.nan_to_num(np.abs(angle - camera_angle[i, j]), nan=np.inf)
+
+    pairs = np.argsort(gap(0, 1), axis=None)[:150]
+    first, second = np.unravel_index(pairs, (len(turns), len(turns)))
+    choice = np.stack([first, second], axis=1)
+    total = np.zeros(len(pairs))
+    for k in range(2, len(value)):
+        # The option of image k that suits both images of each pair.
+        fits = np.maximum(gap(0, k)[first], gap(1, k)[second])
+        choice = np.column_stack([choice, fits.argmin(1)])
+        total += fits.min(1)
+    chosen = options[np.arange(len(value)), choice[int(total.argmin())]]
+    rotation = np.where(np.isfinite(chosen), chosen, np.eye(3))
+    return _Candidate(
+        "rotation vectors in degrees that were taken as radians",
+        transform(rotation, base_from_gripper[:, :3, 3]),
+        np.arange(len(value)),
+    )
+
+
+def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:
+    """Euler angles in degrees that were taken as radians: each is known up to a multiple of 2π degrees.
+
+    The positions alone give the cameras' orientations in the base, hence all grippers' from any one of them.
+    Every possibility for the first image is tried, and must put the others on their multiples.
+    """
+    position = base_from_gripper[:, :3, 3]
+    base_rotation = _rotation_from_positions(position, recon_from_camera)
+    if base_rotation is None:
+        return
+    camera = base_rotation @ recon_from_camera[:, :3, :3]
+    step = 2 * np.pi
+    turns = np.arange(-29, 30)
+    for order in EULER_ORDERS[:4]:
+        read = Rotation.from_matrix(base_from_gripper[:, :3, :3]).as_euler(order, suppress_warnings=True)
+        # The same rotation has two triples, and the one that was meant is not known.
+        read = np.stack([read, read * [1, -1, 1] + np.pi], axis=1)
+        angles = np.stack(np.meshgrid(turns, turns[14:45], turns, indexing="ij"), -1).reshape(-1, 3) * step
+        angles = (angles[:, None] + read[0]).reshape(-1, 3)
+        angles = angles[(np.abs(angles) <= [180, 90, 180]).all(1)]
+        first = Rotation.from_euler(order, angles, degrees=True).as_matrix()
+        gripper_from_camera = np.swapaxes(first, 1, 2) @ camera[0]
+        for k in range(1, len(position)):
+            meant = camera[k] @ np.swapaxes(gripper_from_camera, 1, 2)
+            expected = Rotation.from_matrix(meant).as_euler(order, degrees=True, suppress_warnings=True)
+            off = np.abs((expected[:, None] - read[k] + step / 2) % step - step / 2).max(2).min(1)
+            gripper_from_camera = gripper_from_camera[off < 1.5]
+        if len(gripper_from_camera):
+            x = gripper_from_camera[0]
+            expected = Rotation.from_matrix(camera @ x.T).as_euler(
+                order, degrees=True, suppress_warnings=True
+            )
+            nearest = read + step * np.round((expected[:, None] - read) / step)
+            chosen = np.abs(nearest - expected[:, None]).max(2).argmin(1)
+            rotation = Rotation.from_euler(order, nearest[np.arange(len(chosen)), chosen], degrees=True)
+            yield _Candidate(
+                f"Euler angles ({order}) in degrees that were taken as radians",
+                transform(rotation.as_matrix(), position),
+                np.arange(len(position)),
+            )
+
+
+def _rotation_from_positions(
+    position: Float[ndarray, "n 3"], recon_from_camera: Poses
+) -> Float[ndarray, "3 3"] | None:
+    """Rotation of base_from_recon from gripper positions alone; None when they do not fit the cameras.
+
+    A gripper is at position = R_Z (λ c − R_C w) + z with w the gripper's offset in the camera: no orientation
+    of the gripper enters.
+    """
+    camera, center = recon_from_camera[:, :3, :3], recon_from_camera[:, :3, 3]
+    base_from_recon, scale = fit_similarity(position, center)
+    rotation, offset, w = base_from_recon[:3, :3], base_from_recon[:3, 3], np.zeros(3)
+    miss = np.full_like(position, np.inf)
+    for _ in range(30):
+        arm = (scale * center - camera @ w) @ rotation.T
+        miss = position - arm - offset
+        rows = np.zeros((len(position), 3, 10))
+        rows[:, :, :3] = -skew(arm)
+        rows[:, :, 3] = center @ rotation.T * scale
+        rows[:, :, 4:7] = -rotation @ camera
+        rows[:, :, 7:] = np.eye(3)
+        step = np.linalg.lstsq(rows.reshape(-1, 10), miss.ravel(), rcond=1e-9)[0]
+        step *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
+        rotation = rotation_exp(step[:3]) @ rotation
+        scale, w, offset = scale * np.exp(step[3]), w + step[4:7], offset + step[7:]
+    spread = np.sqrt(((position - position.mean(0)) ** 2).sum(1).mean())
+    left = np.sqrt((miss**2).sum(1).mean())
+    return rotation if left < 0.1 * spread and 3 * len(position) > 12 else None

@@ -1,0 +1,109 @@
+"""Which gripper poses to add: those that shrink the reported standard deviations most, before any picture.
+
+The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
+the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.handeye.equation import ASSUMED_NOISE, Poses, expected_std, most_informative, pose_information
+
+CANDIDATES = 600
+
+
+@dataclass(frozen=True)
+class NextPose:
+    """A gripper pose worth adding, and what is known with it and those before it."""
+
+    base_from_gripper: Float[ndarray, "4 4"]
+    expected_std: Float[ndarray, "7"]
+    """In records.COVARIANCE_ORDER."""
+    like: int
+    """Row of the existing pose that it is nearest to."""
+    moved_m: float
+    turned_rad: float
+
+
+def next_poses(
+    base_from_gripper: Poses,
+    count: int,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    noise: tuple[float, float] = ASSUMED_NOISE,
+    reach: Float[ndarray, "2 3"] | None = None,
+    seed: int = 0,
+) -> tuple[Float[ndarray, "7"], list[NextPose]]:
+    """Standard deviations expected now, and `count` poses to add, best first.
+
+    `reach` is the box (m, base) that gripper positions stay in; by default that of the capture and a quarter
+    more. Without a hand-eye transform the camera is taken to sit at the gripper and look along its z axis.
+    """
+    x = np.eye(4) if gripper_from_camera is None else gripper_from_camera
+    candidates = _candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
+    known = pose_information(base_from_gripper, x, noise).sum(0)
+    rows, stds = most_informative(known, pose_information(candidates, x, noise), count)
+    described = zip(candidates[rows], stds, strict=True)
+    return expected_std(known), [_described(pose, std, base_from_gripper) for pose, std in described]
+
+
+def _candidates(
+    base_from_gripper: Poses,
+    x: Float[ndarray, "4 4"],
+    reach: Float[ndarray, "2 3"] | None,
+    rng: np.random.Generator,
+) -> Float[ndarray, "k 4 4"]:
+    """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
+    camera = base_from_gripper @ x
+    axis, center = camera[:, :3, 2], camera[:, :3, 3]
+    # What was looked at: the point nearest to all optical axes.
+    across = np.eye(3) - axis[:, :, None] * axis[:, None]
+    scene = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, center), rcond=1e-3)[0]
+    distance = np.linalg.norm(center - scene, axis=1)
+    # Parallel axes meet nowhere; the scene is then taken half a metre ahead.
+    if not 0.1 < np.median(distance) < 2.0:
+        scene = (center + 0.5 * axis).mean(0)
+        distance = np.linalg.norm(center - scene, axis=1)
+    if reach is None:
+        low, high = base_from_gripper[:, :3, 3].min(0), base_from_gripper[:, :3, 3].max(0)
+        slack = np.maximum(0.25 * (high - low), 0.05)
+        reach = np.stack([low - slack, high + slack])
+    kept = np.zeros((0, 4, 4))
+    widening = 1.0
+    while len(kept) < CANDIDATES:
+        n = 4 * CANDIDATES
+        like = rng.integers(len(camera), size=n)
+        tilt = rotation_exp(rng.normal(size=(n, 3)) * np.radians(25))
+        away = np.einsum("nij,nj->ni", tilt, (center - scene)[like] / distance[like, None])
+        far = distance[like] * rng.uniform(0.7, 1.3, n)
+        aim = scene + rng.uniform(-0.04, 0.04, (n, 3))
+        position = aim + far[:, None] * away
+        rotation = _facing(tilt @ camera[like, :3, :3], aim - position)
+        roll = rotation_exp(rng.uniform(-np.pi / 3, np.pi / 3, n)[:, None] * [0.0, 0.0, 1.0])
+        gripper = transform(rotation @ roll, position) @ inverse(x)
+        inside = ((gripper[:, :3, 3] >= reach[0]) & (gripper[:, :3, 3] <= reach[1])).all(1)
+        # A box that hardly any view fits in would search for ever; it is let out little by little.
+        kept = np.concatenate([kept, gripper[inside]])
+        widening *= 1.05
+        reach = np.stack([reach[0] - 0.002 * widening, reach[1] + 0.002 * widening])
+    return kept[:CANDIDATES]
+
+
+def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
+    """The rotations with their z axis brought onto a direction by the shortest turn."""
+    z, goal = rotation[:, :, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    cross = np.cross(z, goal)
+    sine = np.linalg.norm(cross, axis=1, keepdims=True)
+    turn = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
+    return rotation_exp(cross / np.maximum(sine, 1e-12) * turn) @ rotation
+
+
+def _described(pose: Float[ndarray, "4 4"], std: Float[ndarray, "7"], existing: Poses) -> NextPose:
+    motion = inverse(existing) @ pose
+    moved = np.linalg.norm(motion[:, :3, 3], axis=1)
+    turned = np.linalg.norm(rotation_log(motion[:, :3, :3]), axis=1)
+    like = int((moved + 0.3 * turned).argmin())
+    return NextPose(pose, std, like, float(moved[like]), float(turned[like]))

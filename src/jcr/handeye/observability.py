@@ -1,0 +1,172 @@
+"""Which parts of the calibration the motions can see, in words, with the cure.
+
+The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
+the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
+well as it can; rotations count by an arm of 0.3 m, scale by the spread of the camera centres. It is about 0.4
+for general motion, and the sine of the deviation for a nearly degenerate one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.geometry import skew
+from jcr.handeye.fit import Cues, Poses
+from jcr.records import Observability
+
+ARM = 0.3
+"""Metres per radian."""
+MIN_SPREAD = 0.1
+"""Metres; camera centres closer together than this say little of scale."""
+WEAK = 0.06
+"""Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
+EXACT = 0.005
+"""Excitation below which no better measurement would help."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Principal directions of what the motions see, least seen first."""
+
+    value: Float[ndarray, "7"]
+    direction: Float[ndarray, "7 7"]
+    """Rows; unit vectors of (translation in m, rotation times ARM, log scale times `spread`)."""
+    spread: float
+    """Root mean square distance (m) of the camera centres from their mean, at least MIN_SPREAD."""
+
+
+def excitation(
+    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"] | None, cues: Cues | None = None
+) -> Excitation:
+    """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
+    n = len(base_from_gripper)
+    offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
+    # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
+    offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
+    rotation = base_from_gripper[:, :3, :3]
+    centers = base_from_gripper[:, :3, 3] + rotation @ offset
+    arm = centers - centers.mean(0)
+    spread = max(float(np.sqrt((arm**2).sum(1).mean())), MIN_SPREAD)
+    j = np.zeros((n, 6, 13))
+    j[:, :3, 0:3] = -rotation
+    j[:, :3, 3:6] = -rotation @ skew(offset) / ARM
+    j[:, :3, 6] = arm / spread
+    j[:, :3, 7:10] = np.eye(3)
+    j[:, :3, 10:] = -skew(arm - rotation @ offset) / ARM
+    j[:, 3:, 3:6] = -np.eye(3)
+    j[:, 3:, 10:] = np.swapaxes(rotation, 1, 2)
+    hessian = np.einsum("nij,nik->jk", j, j) / n
+    seen = hessian[:7, :7] - hessian[:7, 7:] @ np.linalg.pinv(hessian[7:, 7:], rcond=1e-12) @ hessian[7:, :7]
+    if cues is not None and cues.scale is not None:
+        seen[6, 6] += 1.0
+    if cues is not None and cues.offset is not None:
+        seen[:3, :3] += np.outer(cues.offset[0], cues.offset[0])
+    squared, vectors = np.linalg.eigh(seen)
+    return Excitation(np.sqrt(np.maximum(squared, 0.0)), vectors.T, spread)
+
+
+def observability(
+    base_from_gripper: Poses,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    recon_from_camera: Poses | None = None,
+    cues: Cues | None = None,
+) -> Observability:
+    """The unseen directions named, one cure each; camera poses, if given, tell an orbit from a fixed tool."""
+    n = len(base_from_gripper)
+    if n == 2:
+        return Observability(
+            False,
+            ("offset along, and turn about, the one axis that two images share",),
+            ("add one image or more, turned by 20° or more about another axis",),
+        )
+    found = excitation(base_from_gripper, gripper_from_camera, cues)
+    # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
+    few = min(1.0, (n - 2) / 4)
+    unseen = found.value < WEAK * few
+    if not unseen.any():
+        return Observability(True, (), ())
+    grade = "" if found.value[0] < EXACT * few else "nearly unseen: "
+    names, advice = _explain(base_from_gripper, recon_from_camera, found, unseen)
+    return Observability(False, tuple(grade + name for name in names), advice)
+
+
+Words = tuple[tuple[str, ...], tuple[str, ...]]
+"""Names of what is unseen, and cures."""
+
+
+def _explain(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses | None,
+    found: Excitation,
+    unseen: Bool[ndarray, "7"],
+) -> Words:
+    # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
+    u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
+    still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
+    if still.all():
+        return ("offset of the camera in x, y and z: the gripper never rotates (pure translation)",), (
+            "tilt the wrist by 20° or more, about two different axes, in at least three images",
+        )
+    loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
+    if still.any():
+        axis = _axis_words(u[:, 0], "base")
+        cure = f"tilt the wrist by 20° or more away from {axis} in two images"
+        if unseen.sum() == 1 and not loses_scale:
+            return (f"offset along {axis}: all rotations are about it (planar or SCARA motion)",), (
+                f"{cure}, or give the camera's known height along it",
+            )
+        names = (
+            f"offset along {axis}: all rotations are about it (one fixed axis)",
+            "scale: the camera moves on circles about one axis only",
+            f"turn of the camera about {axis}",
+        )
+        return names[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height as well")
+    if loses_scale:
+        return _lost_scale(base_from_gripper, recon_from_camera)
+    weakest = found.direction[0]
+    what, axis = max(
+        (("offset", weakest[:3]), ("turn", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
+    )
+    return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
+        "turn the wrist more, about axes at right angles to each other, in three or more images",
+    )
+
+
+def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Words:
+    """Scale is lost when a point fixed to the gripper stays where it is: which point, and what moves it."""
+    tool = ", ".join(f"{1e3 * x:.0f}" for x in still_point(base_from_gripper)[0])
+    nearer = "take two or more images 20 % nearer to or farther from the point you look at"
+    if recon_from_camera is None:
+        return (f"scale: all views turn about the one point ({tool}) mm in the gripper frame",), (nearer,)
+    # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
+    in_camera, moves, spread = still_point(recon_from_camera)
+    if moves > 0.5 * spread:
+        return ("scale: the camera only turns about its own centre",), (
+            "move the camera sideways by 10 cm or more between images",
+        )
+    if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
+        return (
+            "scale and the offset along the optical axis: all views turn about one point on it "
+            "(look-at orbit at a constant radius)",
+        ), (nearer,)
+    return (f"scale: all views turn about one tool point fixed at ({tool}) mm in the gripper frame",), (
+        "move that point too: take two or more images with it 10 cm away from where it was",
+    )
+
+
+def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
+    """The point of frame b that moves least in a, how far it moves, and how far b's origin does (rms)."""
+    rotation, position = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
+    rows, right = (rotation - rotation.mean(0)).reshape(-1, 3), (position - position.mean(0)).ravel()
+    point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]
+    n = len(a_from_b)
+    return point, float(np.linalg.norm(rows @ point + right)) / n**0.5, float(np.linalg.norm(right)) / n**0.5
+
+
+def _axis_words(axis: Float[ndarray, "3"], frame: str) -> str:
+    k = int(np.abs(axis).argmax())
+    if abs(axis[k]) > np.cos(np.radians(10)):
+        return f"the {frame}'s {'xyz'[k]} axis"
+    return f"the axis ({', '.join(f'{x:.2f}' for x in axis)}) of the {frame}"

@@ -1,0 +1,172 @@
+"""Which images to believe: a stale or shuffled gripper pose spoils one image, not one motion.
+
+Candidates come from triples of images whose motions are congruent (a rotation and its conjugate turn by the
+same angle, whatever X is: the screw congruence of Chen 1991). The candidate with the least trimmed squares
+over images (Rousseeuw 1984) starts a maximum-likelihood fit, which images join and leave by a test that
+knows how well it predicts each of them.
+"""
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.stats import f as f_distribution
+
+from jcr.geometry import nearest_rotation, rotation_angle
+from jcr.handeye.closed_form import closed_form, motions, sine_axis
+from jcr.handeye.equation import predict
+from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
+from jcr.records import ARM
+
+SHARE_RIGHT = 0.65
+"""Share of images that the trimmed fit relies on; up to the rest may be wrong."""
+MAX_TRIPLES = 1500
+REJECT_AT = 1e-5
+"""Chance that a sound image is rejected, by the F distribution of its deleted residual."""
+TOLERANCE = (1e-3, np.radians(0.2))
+"""No image is rejected for less than this (m, rad): smaller errors are vision's, and harm nobody."""
+
+
+def robust_fit(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    noise: tuple[float, float] | None = None,
+    cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
+) -> tuple[PoseFit, Bool[ndarray, " n"]]:
+    """The fit to the images that agree with each other, and which those are.
+
+    With fewer than five images there is nothing to vote with, and all are kept.
+    """
+    n = len(base_from_gripper)
+    given = (noise, cues, camera_covariance)
+    if n < 5:
+        everything = np.ones(n, dtype=bool)
+        return _fit(base_from_gripper, recon_from_camera, everything, *given), everything
+    trusted = _least_trimmed(base_from_gripper, recon_from_camera)
+    fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
+    for _ in range(10):
+        agreeing = _agreeing(fit)
+        if agreeing.sum() < 4 or (agreeing == trusted).all():
+            break
+        trusted = agreeing
+        fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
+    return fit, trusted
+
+
+def _fit(
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    trusted: Bool[ndarray, " n"],
+    noise: tuple[float, float] | None,
+    cues: Cues | None,
+    camera_covariance: Float[ndarray, "r r"] | None,
+) -> PoseFit:
+    start = closed_form(base_from_gripper, recon_from_camera, trusted.astype(float))
+    # A negative or vanishing scale is no reconstruction's; the fit needs a positive one to start from.
+    scale = start[1] if start[1] > 0 else max(abs(start[1]), 1e-6)
+    start = (start[0], scale, start[2])
+    return fit_poses(base_from_gripper, recon_from_camera, start, trusted, noise, cues, camera_covariance)
+
+
+def _agreeing(fit: PoseFit) -> Bool[ndarray, " n"]:
+    """Images whose distance from a fit *without them* is within what noise explains."""
+    gap = np.linalg.solve(fit.missed_covariance, fit.missed[..., None])[..., 0]
+    distance = np.einsum("ni,ni->n", fit.missed, gap)
+    nu = min(*fit.degrees_of_freedom, 1e6)
+    within_noise = distance < 6 * f_distribution.isf(REJECT_AT, 6, nu)
+    small = (np.linalg.norm(fit.translation_residual, axis=1) < TOLERANCE[0]) & (
+        np.linalg.norm(fit.rotation_residual, axis=1) < TOLERANCE[1]
+    )
+    return within_noise | small
+
+
+def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[ndarray, " n"]:
+    """The subset of images with the least trimmed squared error over all candidate triples."""
+    n = len(base_from_gripper)
+    keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
+    a, b = motions(base_from_gripper), motions(recon_from_camera)
+    triples = _congruent_triples(a, b)
+    x_rotation, x_translation, scale = _solve_triples(a, b, triples)
+
+    # Each candidate predicts every image's motion from its triple's first image.
+    first = triples[:, 0]
+    seen, moved = b[first], a[first]
+    rotation = x_rotation[:, None] @ seen[..., :3, :3] @ np.swapaxes(x_rotation, 1, 2)[:, None]
+    position = (
+        scale[:, None, None] * np.einsum("hij,hnj->hni", x_rotation, seen[..., :3, 3])
+        + x_translation[:, None]
+        - np.einsum("hnij,hj->hni", rotation, x_translation)
+    )
+    error = ((position - moved[..., :3, 3]) ** 2).sum(-1) + ARM**2 * (
+        ((rotation - moved[..., :3, :3]) ** 2).sum((-1, -2)) / 2
+    )
+    error[scale <= 0] = np.inf
+    ranked = np.argsort(np.sort(error, axis=1)[:, :keep].sum(1), kind="stable")[:5]
+
+    best, best_cost, tried = np.ones(n, dtype=bool), np.inf, set()
+    for candidate in ranked:
+        subset = error[candidate]
+        for _ in range(4):  # concentration steps (Rousseeuw and Van Driessen 1999)
+            chosen = np.zeros(n, dtype=bool)
+            chosen[np.argsort(subset, kind="stable")[:keep]] = True
+            if chosen.tobytes() in tried:
+                break
+            tried.add(chosen.tobytes())
+            weights = chosen.astype(float)
+            subset = _squared_error(
+                *closed_form(base_from_gripper, recon_from_camera, weights),
+                base_from_gripper,
+                recon_from_camera,
+            )
+            cost = float(np.sort(subset)[:keep].sum())
+            if cost < best_cost:
+                best, best_cost = chosen, cost
+    return best
+
+
+def _squared_error(
+    x: Float[ndarray, "4 4"],
+    scale: float,
+    z: Float[ndarray, "4 4"],
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+) -> Float[ndarray, " n"]:
+    """Squared distance (m²) of every reported gripper pose from its prediction, rotation counted by ARM."""
+    gap = predict(x, scale, z, recon_from_camera) - base_from_gripper
+    return (gap[:, :3, 3] ** 2).sum(1) + ARM**2 * (gap[:, :3, :3] ** 2).sum((1, 2)) / 2
+
+
+def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
+    """Triples of images whose three motions turn by the same angle in gripper and camera, best first."""
+    n = len(a)
+    gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
+    i, j, k = np.array(list(combinations(range(n), 3))).T
+    worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
+    # Two motions about one axis fix nothing: prefer triples that turn about two.
+    axes_ij, axes_ik = sine_axis(a[i, j, :3, :3]), sine_axis(a[i, k, :3, :3])
+    spread = np.linalg.norm(np.cross(axes_ij, axes_ik), axis=1)
+    # The 0.3 quantile of all gaps comes from pairs of sound images even when 30 % of the images are wrong.
+    typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
+    order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]
+    return np.stack([i[order], j[order], k[order]], axis=1)
+
+
+def _solve_triples(
+    a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"], triples: Int[ndarray, "h 3"]
+) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3"], Float[ndarray, " h"]]:
+    """X and λ of every triple at once: the closed form on three motions."""
+    i, j = triples[:, [0, 0, 1]], triples[:, [1, 2, 2]]
+    a, b = a[i, j], b[i, j]
+    axes = np.einsum("hki,hkj->hij", sine_axis(a[..., :3, :3]), sine_axis(b[..., :3, :3]))
+    rotation = nearest_rotation(axes + 1e-12 * np.eye(3))
+    rows = np.zeros((*i.shape, 3, 4))
+    rows[..., :3] = np.eye(3) - a[..., :3, :3]
+    rows[..., 3] = np.einsum("hij,hkj->hki", rotation, b[..., :3, 3])
+    length = np.sqrt((rows[..., 3] ** 2).mean((1, 2))) + 1e-300
+    rows[..., 3] /= length[:, None, None]
+    normal = np.einsum("hkri,hkrj->hij", rows, rows) + 1e-10 * np.eye(4)
+    right = np.einsum("hkri,hkr->hi", rows, a[..., :3, 3])
+    solution = np.linalg.solve(normal, right[..., None])[..., 0]
+    return rotation, solution[:, :3], solution[:, 3] / length

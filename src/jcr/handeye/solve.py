@@ -1,0 +1,194 @@
+"""From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, held-out error."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from jcr.errors import InputError
+from jcr.geometry import require_rigid
+from jcr.handeye.fit import Cues, PoseFit
+from jcr.handeye.observability import observability
+from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.robust import robust_fit
+from jcr.records import HandEye, HeldOut, RobotNoise
+
+MAX_NOISE = (0.02, np.radians(3.0))
+"""m, rad: worse than the worst servo arm; poses and pictures then do not belong together."""
+MAX_STD = (0.02, np.radians(3.0), 0.05)
+"""m, rad, relative scale: an answer less certain than this is none."""
+MIN_SHARE_USED = 0.6
+FEW = 5
+"""Images, below which a wrong one cannot be outvoted and the robot's noise is hardly known."""
+SURPRISE = 1.5
+"""Times the robot noise that was given; more is worth saying."""
+
+
+def solve_hand_eye(
+    base_from_gripper: ArrayLike,
+    recon_from_camera: ArrayLike,
+    *,
+    robot_noise: tuple[float, float] | None = None,
+    cues: Cues | None = None,
+    camera_covariance: Float[ndarray, "r r"] | None = None,
+) -> HandEye:
+    """Hand-eye calibration with unknown scale from camera poses of your own.
+
+    Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
+    the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
+    (m, rad), at least: the residuals may say more. `camera_covariance` (6n,6n) is that of the camera poses where
+    they are not exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
+    counts that cannot be poses; motion that shows too little is an answer (`observability`, `converged`), not an
+    exception.
+    """
+    gripper = _checked(base_from_gripper, "base_from_gripper")
+    camera = _checked(recon_from_camera, "recon_from_camera")
+    n = len(gripper)
+    if len(camera) != n:
+        raise InputError(
+            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
+        )
+    if n < 2:
+        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
+        raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
+
+    if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
+        raise InputError(
+            f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
+        )
+
+    # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image
+    # that was given twice is one: its error counted as two would pass for agreement.
+    pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
+    _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    if camera_covariance is not None:
+        rows = (6 * order[:, None] + np.arange(6)).ravel()
+        camera_covariance = camera_covariance[np.ix_(rows, rows)]
+    fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues, camera_covariance)
+    used = used_sorted[back]
+    seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
+    held_out = _held_out(fit, used_sorted)
+    delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
+    hand_eye = HandEye(
+        gripper_from_camera=fit.gripper_from_camera,
+        scale=fit.scale,
+        base_from_recon=fit.base_from_recon,
+        covariance=fit.covariance,
+        inliers=used,
+        translation_residual_m=np.linalg.norm(fit.translation_residual, axis=1)[back],
+        rotation_residual_rad=np.linalg.norm(fit.rotation_residual, axis=1)[back],
+        observability=seen,
+        robot_noise=RobotNoise(*fit.noise, fit.noise_estimated, robot_noise),
+        residual_translation=delta_t,
+        residual_rotation=delta_r,
+        converged=False,
+        held_out=held_out,
+    )
+    return judged(replace(hand_eye, reasons=_reasons(hand_eye)))
+
+
+def judged(hand_eye: HandEye) -> HandEye:
+    """The calibration with its verdict: `converged`, and a warning for each thing that speaks against it."""
+    doubts = list(_doubts(hand_eye))
+    remarks = list(_remarks(hand_eye))
+    return replace(hand_eye, converged=not doubts, warnings=(*doubts, *remarks))
+
+
+def _doubts(hand_eye: HandEye):
+    """Reasons not to trust the answer, worst first, each with its cure."""
+    for name, cure in zip(hand_eye.observability.unobservable, hand_eye.observability.advice, strict=False):
+        yield f"the motions do not show the {name}; {cure}"
+    used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
+    noise = hand_eye.robot_noise
+    disagree = used < max(3, MIN_SHARE_USED * n) and n > 2
+    if disagree:
+        yield (
+            f"only {used} of {n} images agree on one calibration; check that images and poses are paired, "
+            "and the convention of the poses (jcr check)"
+        )
+    if noise.translation > MAX_NOISE[0] or noise.rotation > MAX_NOISE[1]:
+        yield (
+            f"gripper poses and pictures disagree by {1e3 * noise.translation:.0f} mm and "
+            f"{np.degrees(noise.rotation):.1f}° per axis; check the pairing and the convention of the poses "
+            "(jcr check)"
+        )
+    if hand_eye.observability.observable:
+        std = np.sqrt(np.diag(hand_eye.covariance))
+        for value, limit, text in (
+            (std[:3].max(), MAX_STD[0], f"the offset is known to ±{1e3 * std[:3].max():.0f} mm only"),
+            (
+                std[3:6].max(),
+                MAX_STD[1],
+                f"the orientation is known to ±{np.degrees(std[3:6].max()):.1f}° only",
+            ),
+            (std[6], MAX_STD[2], f"the scale is known to ±{100 * std[6]:.0f} % only"),
+        ):
+            if value > limit:
+                # Of few images half the uncertainty may be that the robot's noise is hardly known.
+                tell = ", or say how well the robot repeats (--robot-noise MM DEG)"
+                unknown = noise.given is None and used < FEW
+                yield f"{text}; add images, turned by 20° or more about different axes{tell if unknown else ''}"
+
+
+def _remarks(hand_eye: HandEye):
+    """What a user should know of an answer that may still be trusted."""
+    noise = hand_eye.robot_noise
+    if noise.given is not None and (
+        noise.translation > SURPRISE * noise.given[0] or noise.rotation > SURPRISE * noise.given[1]
+    ):
+        yield (
+            f"gripper poses and pictures disagree by {1e3 * noise.translation:.2g} mm and "
+            f"{np.degrees(noise.rotation):.2g}° per axis, more than the robot noise that was given "
+            f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
+        )
+    held_out = hand_eye.held_out
+    if held_out is not None:
+        typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.translation
+        if held_out.translation_mm > max(3 * typical, 2.0):
+            yield (
+                f"images left out are missed by {held_out.translation_mm:.1f} mm though the fit's residual "
+                f"is {typical:.1f} mm: too few images for this motion; add some"
+            )
+    if len(hand_eye.inliers) < FEW:
+        yield f"{len(hand_eye.inliers)} images cannot outvote a wrong one; take 8 or more"
+
+
+def _reasons(hand_eye: HandEye) -> tuple[str | None, ...]:
+    typical_mm = 1e3 * hand_eye.robot_noise.translation
+    typical_deg = np.degrees(hand_eye.robot_noise.rotation)
+    return tuple(
+        None
+        if used
+        else (
+            f"its gripper pose is {1e3 * metres:.1f} mm and {np.degrees(radians):.2f}° from where the other "
+            f"images put it (their noise: {typical_mm:.1f} mm, {typical_deg:.2f}°)"
+        )
+        for used, metres, radians in zip(
+            hand_eye.inliers, hand_eye.translation_residual_m, hand_eye.rotation_residual_rad, strict=True
+        )
+    )
+
+
+def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
+    """Each used image predicted by a fit to the others; None when too few are left to fit."""
+    if used.sum() < 4:
+        return None
+    metres, radians = np.linalg.norm(fit.missed[used].reshape(-1, 2, 3), axis=2).mean(0)
+    return HeldOut(
+        1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
+    )
+
+
+def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:
+    try:
+        stack = np.asarray(transforms, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: not numbers; give an array (n,4,4)") from None
+    if stack.ndim != 3 or stack.shape[1:] != (4, 4):
+        raise InputError(f"{name}: shape {stack.shape}; give one 4x4 matrix per image, (n,4,4)")
+    return np.stack([require_rigid(matrix, f"{name}[{i}]") for i, matrix in enumerate(stack)] or [np.eye(4)])[
+        : len(stack)
+    ]

@@ -1,0 +1,207 @@
+"""Direct alignment: wrist cameras found by colour alone, on plain tables too, where features find nothing to match.
+
+The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the lens is
+not known). That is little enough to find it from nothing: the cameras look at a common place, which tells their
+viewing direction in the gripper's frame, and turns about it and tilts are tried all around, on images 15 pixels high.
+From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
+that what disagrees with the robot's motion shows.
+
+Pointmaps come from the plane sweep, which knows depth near edges only: on plain tables a tenth of the pixels.
+docs/results/compact.md says what it gives with and without a start, on simulated and real captures.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.camera import distort, pinhole_inside, undistort_image, usable_lens
+from jcr.capture.images import read_image
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import adjoint, apply, inverse
+from jcr.progress import Progress, silent
+from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
+from jcr.reconstruct.direct.coarse_to_fine import Stage, aligned, free_directions, tied_directions
+from jcr.reconstruct.direct.photometric import (
+    Cameras,
+    Level,
+    Points,
+    equations,
+    exposures,
+    in_base,
+    make_level,
+    project,
+    squared_misfit,
+)
+from jcr.reconstruct.direct.search import SIZES, search
+from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tracks
+
+FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
+"""The robot has no say in these any more."""
+FINEST = Stage(240, 300, 3, 0.1)
+UNEVEN = Stage(60, 300, 1, 0.2)
+"""Where brightness is compared, before it is even."""
+EVENINGS = 3
+"""How often brightness is evened: each time more points agree."""
+EVEN_ENOUGH = 0.05
+"""Difference of log brightness below which it is left alone: shading and gloss look like as much."""
+GUESSED_FOCAL = 0.8
+"""In long sides, where nothing is known of the lens."""
+LEAST_AGREED = 0.25
+"""Share of the points that the views must agree on in the end."""
+LEAST_POINTS = 100
+"""Fewer than this count as this many."""
+LEAST_SHARE = 0.4
+"""Of the points of others that an image shows, over the median of the images: those with wrong poses have 0.1 to 0.25 of
+it, those of a robot that is 5 mm and 1 degree off 0.8."""
+REGION = 0.05
+"""m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectOptions(DenseOptions):
+    """Alignment by colour."""
+
+
+def reconstruct(
+    capture: Capture,
+    options: DirectOptions | None = None,
+    progress: Progress | None = None,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+) -> Reconstruction:
+    """Camera poses by the colours of a capture's images, with the robot's poses to start from.
+
+    A rough `gripper_from_camera` (tens of degrees and centimetres off) is one start among others, none is needed. Known
+    intrinsics are held, else a focal length is estimated. The unit is the robot's metre only roughly, the frame is the
+    first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and NotTrustedError
+    where another place of the camera fits as well, or too few pixels are explained.
+    """
+    if len(capture) < 3:
+        raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
+    options, report = options or DirectOptions(), progress or silent
+    plan_memory(len(capture), capture.image_size, options)
+    images = [read_image(capture.folder / name) for name in capture.images]
+    given, notes = usable_lens(capture.intrinsics)
+    lens = given or _guessed_lens(capture.image_size)
+    levels = pyramid(images, lens)
+    held = given is not None
+    found = search(levels, capture.base_from_gripper, gripper_from_camera, held, report)
+    factor = evening(levels[FREED[0].height], found.cameras)
+    levels = {height: level.times(factor) for height, level in levels.items()}
+    rows, cameras = fitting_images(levels[FREED[0].height], found.cameras, held)
+    if len(rows) < len(capture):
+        names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
+        notes = (*notes, f"direct alignment: left out, for they fit nowhere near their poses: {names}")
+        levels = {height: level.rows(rows) for height, level in levels.items()}
+        images = [images[k] for k in rows]
+    for k, stage in enumerate(FREED):
+        report("direct alignment", 0.7 + 0.1 * k)
+        cameras, _ = aligned(levels[stage.height], cameras, stage, free_directions(cameras, held))
+    level = levels[FINEST.height]
+    cameras, points = aligned(level, cameras, FINEST, free_directions(cameras, held))
+    report("direct alignment", 1.0)
+    if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
+        raise NotTrustedError(
+            f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
+            "take pictures that overlap more, of a scene that does not move or shine"
+        )
+    covariance = twist_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
+    points = points.where(points.agreed)
+    lens = replace(lens, fx=lens.fx * cameras.zoom, fy=lens.fy * cameras.zoom)
+    tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
+    recon_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
+    sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes)
+    reconstruction = with_pointmaps(sparse, images, options, report, backend="direct")
+    return replace(reconstruction, evidence=CameraEvidence(recon_from_camera, covariance))
+
+
+def evening(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
+    """By what to multiply the images so that they are equally bright, though the camera chose its exposure anew."""
+    factor = np.ones(level.count)
+    for _ in range(EVENINGS):
+        even = level.times(factor)
+        _, points = aligned(even, cameras, UNEVEN, np.zeros((7, 0)))
+        factor /= exposures(even, cameras, points, UNEVEN.sigma)
+    return factor if np.abs(np.log(factor)).max() > EVEN_ENOUGH else np.ones(level.count)
+
+
+def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int[ndarray, " m"], Cameras]:
+    """The images that show what the others do, and their cameras on the robot's poses, which the rest do not bend.
+
+    Each image shows a share of the other images' points in their colour. One whose share is far below the others' even
+    when its camera is free is not where the robot says, or not of this scene. Raises NotTrustedError where fewer than
+    three are left.
+    """
+    rows = np.arange(level.count)
+    while True:
+        cameras, _ = aligned(level, cameras, FREED[0], tied_directions(lens_held))
+        alone, points = aligned(level, cameras, FREED[0], free_directions(cameras, lens_held))
+        _, u, v, seen = project(level, alone, points)
+        shows = seen & (squared_misfit(level, points, u, v) < FREED[0].sigma ** 2)
+        share = shows.sum(1) / np.maximum(seen.sum(1), 1)
+        fits = share > LEAST_SHARE * np.median(share)
+        if fits.all():
+            return rows, cameras
+        if fits.sum() < 3:
+            raise NotTrustedError("direct alignment: fewer than three pictures fit together; take more")
+        rows, level = rows[fits], level.rows(np.flatnonzero(fits))
+        cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
+
+
+def _guessed_lens(size: tuple[int, int]) -> Intrinsics:
+    focal = GUESSED_FOCAL * max(size)
+    return Intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, *size)
+
+
+def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics) -> dict[int, Level]:
+    """Undistorted images by height in pixels."""
+    grid = pinhole_inside(
+        lens, round(FINEST.height * max(lens.width, lens.height) / min(lens.width, lens.height))
+    )
+    stack = np.stack([undistort_image(image, lens, grid) for image in images]).astype(np.float32) / 255
+    heights = {*SIZES, *(stage.height for stage in FREED), FINEST.height}
+    return {height: make_level(stack, grid, height) for height in heights}
+
+
+def twist_covariance(
+    level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
+) -> Float[ndarray, "r r"]:
+    """Covariance (6n,6n) of the cameras' twists in the first camera's axes, as records.CameraEvidence has it.
+
+    Residuals of one region of the scene err together, in all images that look there. How far the gradients of regions
+    scatter about zero is measured, and the inverse normal matrix scaled to it on average (a sandwich estimate that has
+    one number to estimate instead of a full matrix, for which there are too few regions).
+    """
+    system = equations(level, cameras, points, sigma, tied=False)
+    inverse_normal = np.linalg.inv(directions.T @ system.normal @ directions)
+    cell = np.floor(in_base(level, cameras, points) / REGION).astype(np.int64)
+    region = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    score = np.zeros((region.max() + 1, directions.shape[1]))
+    np.add.at(score, region, system.gradient @ directions)
+    spread = np.einsum("bp,pq,bq->", score, inverse_normal, score) / directions.shape[1]
+    first_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
+    n = len(first_from_camera)
+    to_first = np.zeros((6 * n, 6 * n))
+    for k, block in enumerate(adjoint(first_from_camera)):
+        to_first[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
+    twists = to_first @ directions[:-1]
+    return spread * twists @ inverse_normal @ twists.T
+
+
+def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, lens: Intrinsics) -> Tracks:
+    """The points, where their host sees them and where the others do that show their colour."""
+    _, u, v, seen = project(level, cameras, points)
+    shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
+    image, point = np.nonzero(shown)
+    host = np.arange(len(points.host))
+    x_grid = np.concatenate([points.x_px, np.column_stack([u[shown], v[shown]])])
+    focal = np.array([level.grid.fx, level.grid.fy]) * cameras.zoom
+    return Tracks(
+        image=np.concatenate([points.host, image]),
+        x_px=distort(lens, (x_grid - [level.grid.cx, level.grid.cy]) / focal),
+        point=np.concatenate([host, point]),
+        points_in_recon=apply(inverse(cameras.base_from_camera[0]), in_base(level, cameras, points)),
+        from_pointmaps=True,
+    )

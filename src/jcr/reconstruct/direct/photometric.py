@@ -1,0 +1,321 @@
+"""Colour consistency of pixels over posed images: search along rays, and Gauss-Newton with the depths eliminated.
+
+Points are pixels of one image (their host) with a depth of their own, as in Engel et al., "Direct Sparse
+Odometry" (PAMI 2018), taken where colour changes most. Their colour is compared with all other images, in RGB, with a
+robust weight that leaves out occluded views and gloss.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numpy import ndarray
+
+from jcr.camera import resized
+from jcr.geometry import inverse, skew
+from jcr.records import Intrinsics
+
+BLUR_PX = 1.0
+"""Of every level: a step between two plain surfaces becomes a slope that linear steps can follow."""
+SEEN_BY = 0.6
+"""Share of the other images, the best ones, that judge a depth: the rest may look at something in between."""
+NEAREST = 0.05
+"""m. In front of the camera."""
+_FAINT = 2.0 / 255
+"""Change of colour per pixel below which a pixel says nothing of where it is."""
+_BORDER_PX = 2
+_SHARED = 5
+"""Points that two images must share before their brightness is compared."""
+_KEEP_DEPTH = 1e-3
+"""Information that keeps a depth of which the images say nothing where it is."""
+_CHUNK = 500
+"""Points whose equations are held at a time: less than 100 MB for 15 images."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Blurred images of one size, as one tall stack, with their derivatives."""
+
+    color: Float32[ndarray, "nh w 3"]
+    by_u: Float32[ndarray, "nh w 3"]
+    by_v: Float32[ndarray, "nh w 3"]
+    grid: Intrinsics
+    """Its focal length is a guess where the lens is not known; the cameras have it right."""
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return len(self.color) // self.grid.height
+
+    def rows(self, which: Int[ndarray, " m"]) -> "Level":
+        """Some of the images."""
+        color, by_u, by_v = (
+            x.reshape(self.count, self.grid.height, *x.shape[1:])[which].reshape(-1, *x.shape[1:])
+            for x in (self.color, self.by_u, self.by_v)
+        )
+        return Level(color, by_u, by_v, self.grid)
+
+    def times(self, factor: Float[ndarray, " n"]) -> "Level":
+        """With each image brighter or darker."""
+        of_row = np.repeat(factor, self.grid.height).astype(np.float32)[:, None, None]
+        return Level(of_row * self.color, of_row * self.by_u, of_row * self.by_v, self.grid)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Poses in metres, and one focal length for all, as a factor of the grid's."""
+
+    base_from_camera: Float[ndarray, "n 4 4"]
+    zoom: float = 1.0
+
+
+@dataclass(frozen=True)
+class Points:
+    """Pixels with a depth."""
+
+    host: Int[ndarray, " k"]
+    x_px: Float[ndarray, "k 2"]
+    color: Float32[ndarray, "k 3"]
+    depth: Float[ndarray, " k"]
+    agreed: Bool[ndarray, " k"]
+    """Whether most of the images that should see the point show its colour."""
+
+    def where(self, kept: Bool[ndarray, " k"] | slice) -> "Points":
+        """Some of them."""
+        return Points(self.host[kept], self.x_px[kept], self.color[kept], self.depth[kept], self.agreed[kept])
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Gauss-Newton equations of cameras, log focal length last, with the log depths eliminated (Schur)."""
+
+    normal: Float[ndarray, "p p"]
+    gradient: Float[ndarray, "k p"]
+    """Of each point; their sum is the gradient."""
+    by_depth: Float[ndarray, "k p"]
+    depth_gradient: Float[ndarray, " k"]
+    depth_information: Float[ndarray, " k"]
+
+    def depth_step(self, step: Float[ndarray, " p"]) -> Float[ndarray, " k"]:
+        """Step of the log depths that belongs to one of the cameras."""
+        return -(self.depth_gradient + self.by_depth @ step) / self.depth_information
+
+
+def make_level(images: Float32[ndarray, "n h w 3"], grid: Intrinsics, height: int) -> Level:
+    """The images (0 to 1) reduced to a height in pixels, and blurred."""
+    small = resized(grid, max(1, round(grid.width * height / grid.height)), height)
+    blurred = []
+    for image in images:
+        reduced = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        blurred.append(cv2.GaussianBlur(reduced, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
+    stack = np.stack(blurred)
+    by_v, by_u = np.gradient(stack, axis=(1, 2))
+    color, by_u, by_v = (x.reshape(-1, small.width, 3) for x in (stack, by_u, by_v))
+    return Level(color, by_u, by_v, small)
+
+
+def strongest(level: Level, per_image: int) -> tuple[Int[ndarray, " k"], Int[ndarray, "k 2"]]:
+    """Image and pixel of the strongest changes of colour, one from each block of pixels, so that they spread."""
+    n, h, w = level.count, level.grid.height, level.grid.width
+    block = max(2, int(np.sqrt(h * w / (3 * per_image))))
+    change = (level.by_u**2 + level.by_v**2).sum(-1).reshape(n, h, w)
+    for border in (change[:, :_BORDER_PX], change[:, -_BORDER_PX:]):
+        border[:] = 0
+    for border in (change[..., :_BORDER_PX], change[..., -_BORDER_PX:]):
+        border[:] = 0
+    rows, columns = h // block, w // block
+    blocks = change[:, : rows * block, : columns * block].reshape(n, rows, block, columns, block)
+    blocks = blocks.swapaxes(2, 3).reshape(n, rows * columns, block * block)
+    inside, best = blocks.argmax(-1), blocks.max(-1)
+    cell = np.argsort(-best, axis=1, kind="stable")[:, :per_image]
+    host, rank = np.nonzero(np.take_along_axis(best, cell, 1) > _FAINT**2)
+    cell = cell[host, rank]
+    inside = inside[host, cell]
+    u, v = cell % columns * block + inside % block, cell // columns * block + inside // block
+    return host, np.column_stack([u, v])
+
+
+def on_rays(
+    level: Level,
+    cameras: Cameras,
+    host: Int[ndarray, " k"],
+    x_px: Int[ndarray, "k 2"],
+    depths: Float[ndarray, "d n"],
+    sigma: float,
+    least: float,
+) -> tuple[Points, float]:
+    """Points at those depths, of the ones tried for their host, at which the other images agree best with their colour.
+
+    `sigma` is the difference of colours that counts half. Points are agreed on whose cost, a mean of
+    r²/(r² + sigma²) over the best views, is below `least`. Also returns the mean cost of all points.
+    """
+    color = level.color.reshape(level.count, level.grid.height, level.grid.width, 3)[
+        host, x_px[:, 1], x_px[:, 0]
+    ]
+    points = Points(host, x_px.astype(float), color, depths[0, host], np.ones(len(host), bool))
+    cost = np.stack([_cost(level, cameras, replace(points, depth=depth[host]), sigma) for depth in depths])
+    best = cost.argmin(0)
+    found = cost[best, np.arange(len(host))]
+    return Points(host, points.x_px, color, depths[best, host], found < least), float(found.mean())
+
+
+def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
+    """Mean cost of the views that agree best; 1 where fewer than two look there."""
+    _, u, v, seen = project(level, cameras, points)
+    misfit = squared_misfit(level, points, u, v)
+    misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
+    count = seen.sum(0)
+    kept = np.maximum(np.ceil(SEEN_BY * count), 2)
+    total = np.where(np.arange(len(misfit))[:, None] < kept, misfit, 0).sum(0)
+    return np.where(count < 2, 1.0, total / kept)
+
+
+def squared_misfit(
+    level: Level, points: Points, u: Float32[ndarray, "n k"], v: Float32[ndarray, "n k"]
+) -> Float32[ndarray, "n k"]:
+    """Squared difference of the colours at those pixels from the points' own."""
+    return _squared(_sample(level.color, level, u, v) - points.color)
+
+
+def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
+    return np.einsum("nkc,nkc->nk", difference, difference)
+
+
+def in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
+    """The points in the camera frame of their hosts."""
+    focal = np.array([level.grid.fx, level.grid.fy]) * cameras.zoom
+    x = (points.x_px - [level.grid.cx, level.grid.cy]) / focal
+    return points.depth[:, None] * np.column_stack([x, np.ones(len(x))])
+
+
+def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
+    """The points in the frame of the cameras' poses."""
+    pose = cameras.base_from_camera[points.host]
+    return np.einsum("kij,kj->ki", pose[:, :3, :3], in_host(level, cameras, points)) + pose[:, :3, 3]
+
+
+def project(
+    level: Level, cameras: Cameras, points: Points
+) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
+    """Points in every camera's frame, their pixels u and v, and whether they are in view; their host does not count."""
+    camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
+    x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
+    x += camera_from_base[:, None, :3, 3]
+    z = np.maximum(x[..., 2], np.float32(NEAREST))
+    u = np.float32(level.grid.fx * cameras.zoom) * x[..., 0] / z + np.float32(level.grid.cx)
+    v = np.float32(level.grid.fy * cameras.zoom) * x[..., 1] / z + np.float32(level.grid.cy)
+    seen = (x[..., 2] > NEAREST) & (u >= 0) & (u <= level.grid.width - 1)
+    seen &= (v >= 0) & (v <= level.grid.height - 1)
+    seen[points.host, np.arange(len(points.host))] = False
+    return x, u, v, seen
+
+
+def _sample(
+    stack: Float32[ndarray, "nh w 3"], level: Level, u: ndarray, v: ndarray
+) -> Float32[ndarray, "n k 3"]:
+    """Bilinear samples of every image at its own pixels."""
+    u = np.clip(u, 0, level.grid.width - 1)
+    v = np.clip(v, 0, level.grid.height - 1) + np.float32(level.grid.height) * np.arange(len(v))[:, None]
+    return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
+    """How bright each image is beside the others (their geometric mean is 1), from points that they share."""
+    _, u, v, seen = project(level, cameras, points)
+    shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
+    dark = 10 * _FAINT
+    used = seen & points.agreed & (shown > dark) & (own > dark)
+    used &= squared_misfit(level, points, u, v) < (2 * sigma) ** 2
+    ratio = np.log(np.maximum(shown, dark) / np.maximum(own, dark))
+    rows, values = [np.full(level.count, 1.0)], [0.0]
+    for image, host in np.ndindex(level.count, level.count):
+        of_pair = used[image] & (points.host == host)
+        if (count := of_pair.sum()) >= _SHARED:
+            row = np.zeros(level.count)
+            row[image], row[host] = np.sqrt(count), -np.sqrt(count)
+            rows.append(row)
+            values.append(np.sqrt(count) * np.median(ratio[image, of_pair]))
+    return np.exp(np.linalg.lstsq(np.stack(rows), np.array(values), rcond=None)[0])
+
+
+def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
+    """Mean robust misfit, 0 to 1, of the views of points agreed on."""
+    _, u, v, seen = project(level, cameras, points)
+    misfit = squared_misfit(level, points, u, v)
+    weight = seen & points.agreed
+    return float((weight * misfit / (misfit + np.float32(sigma**2))).sum() / max(weight.sum(), 1))
+
+
+def equations(level: Level, cameras: Cameras, points: Points, sigma: float, tied: bool) -> Equations:
+    """Linearised for twists (v, ω) in camera axes, T ← T·exp(ξ): one for all cameras if `tied`, else one for each."""
+    n, k = level.count, len(points.host)
+    p = 7 if tied else 6 * n + 1
+    normal = np.zeros((p, p))
+    gradient, by_depth = np.zeros((k, p)), np.zeros((k, p))
+    depth_gradient, information = np.zeros(k), np.zeros(k)
+    for rows, residual, by_target, by_host, by_focal, by_log_depth in _linearised(
+        level, cameras, points, sigma
+    ):
+        if tied:
+            a = np.concatenate([by_target + by_host, by_focal[..., None]], -1)
+        else:
+            a = np.zeros((*residual.shape, p), np.float32)
+            for i in range(n):
+                a[i, ..., 6 * i : 6 * i + 6] = by_target[i]
+            of_host = 6 * points.host[rows, None] + np.arange(6)
+            at = np.arange(len(of_host))[:, None]
+            for i in range(n):
+                a[i, at, :, of_host] += by_host[i].swapaxes(1, 2)
+            a[..., -1] = by_focal
+        # One point's rows together.
+        a, q, r = (x.swapaxes(0, 1).reshape(len(x[0]), 3 * n, -1) for x in (a, by_log_depth, residual))
+        b = (a * q).sum(1).astype(np.float64)
+        flat = a.reshape(-1, p)
+        information[rows] = (q * q).sum((1, 2)) + _KEEP_DEPTH
+        depth_gradient[rows] = (q * r).sum((1, 2))
+        by_depth[rows] = b
+        normal += (flat.T @ flat) - (b / information[rows, None]).T @ b
+        gradient[rows] = (a * r).sum(1) - b * (depth_gradient[rows] / information[rows])[:, None]
+    return Equations(normal, gradient, by_depth, depth_gradient, information)
+
+
+def _linearised(
+    level: Level, cameras: Cameras, points: Points, sigma: float
+) -> Iterator[tuple[slice, ndarray, ndarray, ndarray, ndarray, ndarray]]:
+    """Per chunk of points: weighted residuals (n,k,3), and their derivatives by the twists (…,6) of the image that
+    looks and of the host, by the log focal length and by the log depth."""
+    poses = cameras.base_from_camera
+    turn = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
+    for start in range(0, len(points.host), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        some = points.where(rows)
+        x, u, v, seen = project(level, cameras, some)
+        residual, by_u, by_v = (_sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
+        residual = residual - some.color
+        # Geman and McClure's weight.
+        weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
+        root = np.sqrt(weight, dtype=np.float32)[..., None]
+        x_in_host = in_host(level, cameras, some).astype(np.float32)
+        other_from_host = turn[:, some.host]
+        moves = np.zeros((*x.shape, 14), np.float32)
+        moves[..., 0:3] = -np.eye(3)
+        moves[..., 3:6] = skew(x)
+        moves[..., 6:9] = other_from_host
+        moves[..., 9:12] = -other_from_host @ skew(x_in_host).astype(np.float32)
+        moves[..., 12] = (other_from_host @ (x_in_host * np.array([-1, -1, 0], np.float32))[..., None])[
+            ..., 0
+        ]
+        moves[..., 13] = (other_from_host @ x_in_host[..., None])[..., 0]
+        z = np.maximum(x[..., 2:], np.float32(NEAREST))
+        shift_u = (moves[..., 0, :] - x[..., :1] / z * moves[..., 2, :]) / z
+        shift_v = (moves[..., 1, :] - x[..., 1:2] / z * moves[..., 2, :]) / z
+        shift_u *= np.float32(level.grid.fx * cameras.zoom)
+        shift_v *= np.float32(level.grid.fy * cameras.zoom)
+        shift_u[..., 12] += u - np.float32(level.grid.cx)
+        shift_v[..., 12] += v - np.float32(level.grid.cy)
+        j = (by_u * root)[..., None] * shift_u[..., None, :] + (by_v * root)[..., None] * shift_v[
+            ..., None, :
+        ]
+        yield rows, residual * root, j[..., :6], j[..., 6:12], j[..., 12], j[..., 13]

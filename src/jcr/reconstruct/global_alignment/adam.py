@@ -1,0 +1,185 @@
+"""Global alignment by gradient descent on every pixel (paper section III, eq. 1), as published with DUSt3R.
+
+The model is the published one: a depth map, a focal length and a camera per image; a rigid transform and a
+scale per pair, tied to no camera; residual norms (not their squares) weighted by log confidence; Adam from a
+spanning tree of the pairs. It stands as the baseline that `align_fast` is measured against.
+"""
+
+import math
+import time
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from jcr.geometry import inverse, transform
+from jcr.progress import Progress
+from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
+from jcr.reconstruct.global_alignment.depths import initial_depth
+from jcr.reconstruct.global_alignment.initial_estimate import initial_state
+from jcr.reconstruct.global_alignment.observations import choose_pixels, observe, weigh, weight_is_log
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.reconstruct.global_alignment.pointmap_residuals import State
+
+START_PIXELS = 2048
+FOCAL_SLOWNESS = 20.0
+"""The optimised focal parameter is this times log f, so that one step changes it by little (as published)."""
+PAIRS_AT_ONCE = 16
+"""Bounds the memory of one forward and backward pass."""
+
+
+def align_adam(
+    predictions: PairPredictions, options: AlignOptions, progress: Progress | None = None
+) -> Alignment:
+    """Align by `options.steps` Adam steps over all pixels of all pairs."""
+    begin = time.perf_counter()
+    pinhole = pinhole_of(predictions, options)
+    log_weight = weight_is_log(predictions)
+    count, height, width = predictions.image_count, *predictions.conf.shape[1:]
+    pixels = choose_pixels(predictions, START_PIXELS)
+    chosen = [observe(predictions, pinhole, k, pixels[k], log_weight) for k in range(count)]
+    start = initial_state(chosen, predictions.edges, pinhole)
+    everything = (observe(predictions, pinhole, k, slice(None), log_weight) for k in range(count))
+    model = PointmapModel(
+        start, np.stack([initial_depth(o, start) for o in everything]), predictions, pinhole
+    )
+
+    groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
+    optimizer = torch.optim.Adam(
+        [parameter for parameter in model.parameters() if parameter.requires_grad],
+        lr=options.learning_rate,
+        betas=(0.9, 0.9),
+    )
+    for step in range(options.steps):
+        cosine = math.cos(math.pi * step / options.steps)
+        optimizer.param_groups[0]["lr"] = 0.5 * options.learning_rate * (1 + cosine)
+        optimizer.zero_grad()
+        points = model.points()
+        # Each group's gradient is gathered on a copy of the points, which then passes it on once.
+        gathered = points.detach().requires_grad_()
+        for group in groups:
+            loss = torch.zeros(())
+            for view in (0, 1):
+                conf = (predictions.conf, predictions.conf2)[view][group].reshape(-1, height * width)
+                weight = torch.from_numpy(weigh(conf, log_weight))
+                loss = loss + (weight * model.distance(gathered, group, view)).mean(dim=1).sum()
+            loss.backward()
+        points.backward(gathered.grad)
+        optimizer.step()
+        if progress is not None:
+            progress("align pairs", (step + 1) / options.steps)
+
+    with torch.no_grad():
+        points = model.points()
+        relative = [
+            model.distance(points, group, view).median(dim=1).values / model.range(group, view)
+            for group in groups
+            for view in (0, 1)
+        ]
+        recon_from_camera = transform(
+            model.rotation(model.camera_quat_xyzw).double().numpy(), model.camera_center.double().numpy()
+        )
+        focal = model.focal().double().numpy()
+        depth = model.log_depth.exp().reshape(count, height, width).numpy()
+        scale = model.scale().double().numpy()
+    residual = [torch.maximum(*relative[k : k + 2]) for k in range(0, len(relative), 2)]
+    return Alignment(
+        recon_from_camera=inverse(recon_from_camera[0]) @ recon_from_camera,
+        focal_px=np.stack([focal, focal * pinhole.aspect], axis=1),
+        principal_point_px=pinhole.principal_point_px,
+        depth=depth,
+        confidence=_mean_confidence(predictions, log_weight),
+        pair_scale=scale,
+        pair_residual=torch.cat(residual).double().numpy(),
+        seconds=time.perf_counter() - begin,
+        method="adam",
+    )
+
+
+class PointmapModel(torch.nn.Module):
+    """The unknowns of eq. 1: X̂_i by camera, focal length and depth of each image; P_e and σ_e of each pair."""
+
+    def __init__(
+        self, start: State, depth: Float[ndarray, "n p"], predictions: PairPredictions, pinhole: Pinhole
+    ) -> None:
+        super().__init__()
+        self.images = torch.from_numpy(predictions.edges)
+        self.shown = (predictions.pts3d, predictions.pts3d_in_other_view)
+        height, width = predictions.conf.shape[1:]
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        cx, cy = pinhole.principal_point_px
+        offset = np.stack([(x - cx).ravel(), (y - cy).ravel() / pinhole.aspect], axis=1)
+        self.offset = torch.from_numpy(offset.astype(np.float32))
+
+        observer = start.recon_from_camera[predictions.edges[:, 0]]
+        self.camera_quat_xyzw = _parameter(_quat_xyzw(start.recon_from_camera))
+        self.camera_center = _parameter(start.recon_from_camera[:, :3, 3])
+        self.log_depth = _parameter(np.log(depth))
+        self.slow_focal = _parameter(
+            FOCAL_SLOWNESS * (start.log_focal[:1] if pinhole.shared else start.log_focal)
+        )
+        self.slow_focal.requires_grad_(pinhole.focal_px is None)
+        self.pair_quat_xyzw = _parameter(_quat_xyzw(observer))
+        self.log_scale = _parameter(start.log_pair_scale)
+        # The scale multiplies the whole of P_e in eq. 1, its translation too.
+        self.pair_center = _parameter(observer[:, :3, 3] / np.exp(start.log_pair_scale)[:, None])
+
+    def focal(self) -> Tensor:
+        """fx (n,)."""
+        return torch.exp(self.slow_focal / FOCAL_SLOWNESS).expand(len(self.camera_center))
+
+    def scale(self) -> Tensor:
+        """σ_e (e,), their product 1."""
+        return torch.exp(self.log_scale - self.log_scale.mean())
+
+    def points(self) -> Tensor:
+        """X̂ (n, pixels, 3) in the recon frame."""
+        ray = self.offset / self.focal()[:, None, None]
+        ray = torch.cat([ray, torch.ones_like(ray[..., :1])], dim=2)
+        in_camera = torch.exp(self.log_depth)[..., None] * ray
+        return in_camera @ self.rotation(self.camera_quat_xyzw).mT + self.camera_center[:, None]
+
+    def distance(self, points: Tensor, pairs: slice, view: int) -> Tensor:
+        """‖X̂_i − σ_e P_e X_e,i‖ (pairs, pixels) for the first (0) or second (1) view of some pairs."""
+        shown = torch.from_numpy(self.shown[view][pairs]).flatten(1, 2)
+        aligned = shown @ self.rotation(self.pair_quat_xyzw[pairs]).mT + self.pair_center[pairs, None]
+        aligned = self.scale()[pairs, None, None] * aligned
+        return torch.linalg.vector_norm(points[self.images[pairs, view]] - aligned, dim=2)
+
+    def range(self, pairs: slice, view: int) -> Tensor:
+        """Median distance (pairs,) of a view's points from the first camera, recon units."""
+        shown = torch.from_numpy(self.shown[view][pairs]).flatten(1, 2)
+        return self.scale()[pairs] * torch.linalg.vector_norm(shown, dim=2).median(dim=1).values
+
+    @staticmethod
+    def rotation(quat_xyzw: Tensor) -> Tensor:
+        """Rotation matrices (k,3,3) of quaternions (k,4) of any length."""
+        x, y, z, w = torch.nn.functional.normalize(quat_xyzw, dim=1).unbind(dim=1)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def _parameter(values: ndarray) -> torch.nn.Parameter:
+    return torch.nn.Parameter(torch.tensor(values, dtype=torch.float32))
+
+
+def _quat_xyzw(recon_from_camera: Float[ndarray, "k 4 4"]) -> Float[ndarray, "k 4"]:
+    return Rotation.from_matrix(recon_from_camera[:, :3, :3]).as_quat()
+
+
+def _mean_confidence(predictions: PairPredictions, log_weight: bool) -> Float[ndarray, "n h w"]:
+    """The network's confidence averaged over the pairs that show an image, logs of it where they are weights."""
+    total = np.zeros((predictions.image_count, *predictions.conf.shape[1:]), np.float32)
+    for edge, *confs in zip(predictions.edges, predictions.conf, predictions.conf2, strict=True):
+        for image, conf in zip(edge, confs, strict=True):
+            total[image] += weigh(conf, log_weight)
+    shown = np.bincount(predictions.edges.ravel(), minlength=len(total))
+    mean = total / shown[:, None, None].astype(np.float32)
+    return np.exp(mean) if log_weight else mean

@@ -1,0 +1,350 @@
+"""Global alignment by Gauss-Newton on a few thousand pixels per image, the depths eliminated.
+
+It minimises what eq. 1 of the paper does, with three changes. Residuals are weighted by what they prove to
+be worth (`align_residuals`). The first view of a pair stands in its camera's own frame, as it was predicted,
+so that its rays give the focal length. And a pair's pose P_e, free in eq. 1, is its first camera's but for an
+error whose spread is measured over all pairs: where the network places second views well, pairs tie cameras
+firmly.
+"""
+
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.sparse import csr_array
+from threadpoolctl import threadpool_limits
+
+from jcr.errors import NotTrustedError
+from jcr.geometry import adjoint, inverse, rotation_exp, transform
+from jcr.progress import Progress
+from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
+from jcr.reconstruct.global_alignment.depths import fused_depth
+from jcr.reconstruct.global_alignment.initial_estimate import initial_state
+from jcr.reconstruct.global_alignment.normal_equations import Layout, PairTies, image_equations
+from jcr.reconstruct.global_alignment.observations import (
+    ImageObservations,
+    choose_pixels,
+    observe,
+    weight_is_log,
+)
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.reconstruct.global_alignment.pointmap_residuals import Noise, State, measure_noise, residuals
+
+COARSE_PIXELS = 300
+"""Per image: enough to come within the noise, and seven times cheaper than the default."""
+COARSE_TOLERANCE = 1e-3
+FINE_TOLERANCE = 1e-4
+"""Of the last step (rad, or relative): a tenth of what the noise of predictions leaves."""
+ITERATIONS = 30
+START_SPREAD = 0.01
+"""Of the pairs' errors, relative to the depth and in radians, until it is measured."""
+LEAST_SPREAD = 1e-5
+GAUGE_WEIGHT = 1e3
+"""Of the held sum of the log pair scales, in units of what the pointmaps say of one: stiff beside it."""
+NORMAL_SQUARE_MEDIAN = 0.455
+"""Median of the square of a unit normal."""
+DEPTH_CHUNK = 4096
+"""Pixels at a time, so that the arrays of a chunk stay in the cache."""
+CONTRADICTION = 4.0
+"""A pair whose residual is this many times the median one is named to the user."""
+USELESS = 0.2
+"""Residual of the middle pair, relative to the distance, that no network worth its weights comes near."""
+
+NOTHING = "the alignment of the pairs came to nothing; their pointmaps have too little in common"
+
+
+@runtime_checkable
+class Cameras(Protocol):
+    """What is free about the cameras: each way of tying them takes its own step."""
+
+    @property
+    def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
+        """Where they stand now."""
+        ...
+
+    def step(
+        self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
+    ) -> Float[ndarray, " p"]:
+        """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
+        ...
+
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        ...
+
+
+class FreeCameras:
+    """Cameras that may stand anywhere; the first one and the product of the pair scales are held (gauge)."""
+
+    def __init__(self, recon_from_camera: Float[ndarray, "n 4 4"]) -> None:
+        self.recon_from_camera = recon_from_camera
+        self.normal = np.zeros((0, 0))
+
+    def step(
+        self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
+    ) -> Float[ndarray, " p"]:
+        """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
+        scales = layout.scales
+        held = hessian.copy()
+        held[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+        self.normal = held[6:, 6:]
+        step = np.zeros(layout.size)
+        step[6:] = -np.linalg.solve(self.normal, gradient[6:])
+        self.recon_from_camera = moved(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
+        return step
+
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step; the first camera's is 0."""
+        size = 6 * len(self.recon_from_camera)
+        out = np.zeros((size, size))
+        out[6:, 6:] = np.linalg.inv(self.normal)[: size - 6, : size - 6]
+        return out
+
+
+def moved(
+    recon_from_camera: Float[ndarray, "n 4 4"], twist: Float[ndarray, "n 6"]
+) -> Float[ndarray, "n 4 4"]:
+    """Transforms after the twists (v, ω) that `Layout` defines."""
+    turn = rotation_exp(twist[:, 3:])
+    center = (turn @ recon_from_camera[:, :3, 3:])[..., 0] + twist[:, :3]
+    return transform(turn @ recon_from_camera[:, :3, :3], center)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Predictions with all that is settled about them before anything is estimated."""
+
+    predictions: PairPredictions
+    pinhole: Pinhole
+    log_weight: bool
+
+    @property
+    def layout(self) -> Layout:
+        """The unknowns."""
+        count = self.predictions.image_count
+        focals = 0 if self.pinhole.focal_px else 1 if self.pinhole.shared else count
+        return Layout(count, len(self.predictions.edges), focals)
+
+    def observe(self, image: int, pixels: Int[ndarray, " m"] | slice) -> ImageObservations:
+        """All pointmaps at some pixels of one image."""
+        return observe(self.predictions, self.pinhole, image, pixels, self.log_weight)
+
+    def observe_all(self, count: int) -> list[ImageObservations]:
+        """About `count` pixels of every image."""
+        return [self.observe(k, pixels) for k, pixels in enumerate(choose_pixels(self.predictions, count))]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What Gauss-Newton came to."""
+
+    state: State
+    cameras: Cameras
+    images: list[ImageObservations]
+    noise: list[Noise]
+    """Per image, of its pointmaps."""
+    pair_spread: Float[ndarray, "6"]
+    """One sigma per axis of the pairs' errors: translation, rotation."""
+    settled: bool
+    """Whether the last step was small enough."""
+
+
+def align_fast(
+    predictions: PairPredictions, options: AlignOptions, progress: Progress | None = None
+) -> Alignment:
+    """Align from a start in closed form, on few pixels, then on many, and settle the depth of every pixel."""
+    begin = time.perf_counter()
+    problem = Problem(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
+    solution = solve_free(problem, options)
+    return dense_alignment(problem, solution, begin, progress)
+
+
+def solve_free(problem: Problem, options: AlignOptions) -> Solution:
+    """Cameras, focal lengths, pair scales and the depths of `options.pixels` pixels per image."""
+    images = problem.observe_all(min(COARSE_PIXELS, options.pixels))
+    state = initial_state(images, problem.predictions.edges, problem.pinhole)
+    cameras = FreeCameras(state.recon_from_camera)
+    pair_spread = START_SPREAD * np.repeat([np.exp(np.median(np.concatenate(state.log_depth))), 1.0], 3)
+    coarse = gauss_newton(images, state, problem.layout, cameras, pair_spread, COARSE_TOLERANCE)
+    images = problem.observe_all(options.pixels)
+    depth = [fused_depth(o, coarse.state, noise)[0] for o, noise in zip(images, coarse.noise, strict=True)]
+    state = replace(coarse.state, log_depth=[np.log(z) for z in depth])
+    return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
+
+
+# The matrices are small. BLAS threads gain nothing on them, and on a busy machine wait for each other: with the
+# other core taken, 15 images took 3 to 6 times as long.
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def gauss_newton(
+    images: list[ImageObservations],
+    state: State,
+    layout: Layout,
+    cameras: Cameras,
+    pair_spread: Float[ndarray, "6"],
+    tolerance: float,
+) -> Solution:
+    """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
+
+    The weights, and the spread of the pairs' errors, are measured anew in each iteration. Raises
+    NotTrustedError where the pointmaps do not determine the unknowns.
+    """
+    selections = [_selection(o, layout) for o in images]
+    focals = [layout.focal(k) for k in range(layout.images)]
+    iteration = 0
+    while True:
+        misfit = [
+            residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
+        ]
+        noise = measure_noise(images, misfit)
+        # The residuals of an image, which are most of the memory, go as its equations come.
+        equations = [image_equations(o, misfit.pop(0), own) for o, own in zip(images, noise, strict=True)]
+        observer_axes = adjoint(inverse(state.recon_from_camera))
+        ties = [
+            PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
+            for o in images
+        ]
+        try:
+            reduced = [own.reduced(tie) for own, tie in zip(equations, ties, strict=True)]
+        except np.linalg.LinAlgError:
+            raise NotTrustedError(NOTHING) from None
+
+        hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+        for selection, own in zip(selections, reduced, strict=True):
+            hessian += selection.T @ (selection.T @ own.hessian).T
+            gradient += selection.T @ own.gradient
+        # A pair nobody believes keeps its scale.
+        scales = layout.scales
+        hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
+        try:
+            step = cameras.step(layout, hessian, gradient)
+        except np.linalg.LinAlgError:
+            step = np.full(layout.size, np.nan)
+        if not np.isfinite(step).all():
+            raise NotTrustedError(NOTHING)
+
+        log_depth, pair_error = [], np.zeros_like(state.pair_error)
+        variance = np.zeros_like(state.pair_error)
+        for k, o in enumerate(images):
+            local_step = selections[k] @ step
+            pair_step = reduced[k].pair_step(local_step)
+            # An error of a pair moves its view as a step of its observer does.
+            local_step[: pair_step.size] -= pair_step.ravel()
+            # A far step of a pixel without parallax must not take it behind or beyond the scene.
+            depth_step = np.clip(equations[k].depth_step(local_step), -0.5, 0.5)
+            log_depth.append(state.log_depth[k] + depth_step)
+            pair_error[o.second_pairs] = ties[k].error + np.einsum("kij,kj->ki", ties[k].axes, pair_step)
+            variance[o.second_pairs] = reduced[k].error_variance
+        pair_spread = _spread(pair_error, variance, pair_spread)
+        state = State(
+            recon_from_camera=cameras.recon_from_camera,
+            log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
+            log_pair_scale=state.log_pair_scale + step[layout.scales],
+            pair_error=pair_error,
+            log_depth=log_depth,
+        )
+        iteration += 1
+        settled = bool(np.abs(step).max() < tolerance)
+        if settled or iteration == ITERATIONS:
+            return Solution(state, cameras, images, noise, pair_spread, settled)
+        del equations, reduced  # or they would stay until the next ones are complete
+
+
+def _spread(
+    error: Float[ndarray, "e 6"], variance: Float[ndarray, "e 6"], before: Float[ndarray, "6"]
+) -> Float[ndarray, "6"]:
+    """Spread of the pairs' translations and rotations, from the errors found under the spread `before`.
+
+    The evidence fixed point σ² = Σ x² / Σ (1 − var(x)/σ²) (MacKay, "Bayesian interpolation", 1992, eq. 30),
+    with medians in place of the sums: pairs that are altogether wrong do not count.
+    """
+    determined = 1.0 - np.median((variance / before**2).reshape(-1, 2, 3), axis=(0, 2))
+    squared = np.median((error**2).reshape(-1, 2, 3), axis=(0, 2)) / NORMAL_SQUARE_MEDIAN
+    return np.repeat(np.maximum(np.sqrt(squared / np.maximum(determined, 0.01)), LEAST_SPREAD), 3)
+
+
+def dense_alignment(
+    problem: Problem, solution: Solution, begin: float, progress: Progress | None = None
+) -> Alignment:
+    """The record of a solution, in its own recon frame, with the depth of every pixel."""
+    predictions, state = problem.predictions, solution.state
+    count, (height, width) = predictions.image_count, predictions.conf.shape[1:]
+    depth = np.empty((count, height * width), np.float32)
+    confidence = np.empty_like(depth)
+
+    def settle(k: int) -> None:
+        for start in range(0, height * width, DEPTH_CHUNK):
+            chunk = slice(start, start + DEPTH_CHUNK)
+            depth[k, chunk], confidence[k, chunk] = fused_depth(
+                problem.observe(k, chunk), state, solution.noise[k]
+            )
+
+    # numpy lets go of the interpreter during its loops, so threads share the cores.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done, _ in enumerate(pool.map(settle, range(count)), start=1):
+            if progress is not None:
+                progress("align pairs", done / count)
+    focal = np.exp(state.log_focal)
+    residual = _pair_residuals(predictions, solution)
+    return Alignment(
+        recon_from_camera=state.recon_from_camera,
+        focal_px=np.stack([focal, focal * problem.pinhole.aspect], axis=1),
+        principal_point_px=problem.pinhole.principal_point_px,
+        depth=depth.reshape(count, height, width),
+        confidence=(np.exp(confidence) if problem.log_weight else confidence).reshape(count, height, width),
+        pair_scale=np.exp(state.log_pair_scale),
+        pair_residual=residual,
+        seconds=time.perf_counter() - begin,
+        method="fast",
+        notes=_notes(predictions, residual, solution.settled),
+    )
+
+
+def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[ndarray, " e"]:
+    """Residual of each pair, the larger of its two views'."""
+    residual = np.zeros(len(predictions.edges))
+    for o, noise in zip(solution.images, solution.noise, strict=True):
+        np.maximum.at(residual, o.pair, np.sqrt(2 * noise.across**2 + noise.along**2))
+    return residual
+
+
+def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
+    """What the user should know of an alignment."""
+    notes = []
+    middle = float(np.median(residual))
+    if not settled:
+        notes.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
+    if middle > USELESS:
+        notes.append(
+            f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"
+        )
+    bad = np.flatnonzero(residual > CONTRADICTION * middle)
+    if len(bad):
+        names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
+        pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        notes.append(
+            f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}"
+        )
+    return tuple(notes)
+
+
+def _selection(o: ImageObservations, layout: Layout) -> csr_array:
+    """Matrix that takes a step of all unknowns to the local ones of an image's equations."""
+    n, maps = o.second_count, len(o.pair)
+    twists, scales = np.arange(6 * n).reshape(n, 6), 6 * n + np.arange(maps)
+    own = np.broadcast_to(6 * o.image + np.arange(6), (n, 6))
+    observers = 6 * o.observer[:n, None] + np.arange(6)
+    rows = [twists.ravel(), twists.ravel(), scales]
+    columns = [own.ravel(), observers.ravel(), layout.scales[o.pair]]
+    signs = [np.ones(6 * n), -np.ones(6 * n), np.ones(maps)]
+    if (focal := layout.focal(o.image)) is not None:
+        rows.append(np.array([6 * n + maps]))
+        columns.append(np.array([focal]))
+        signs.append(np.ones(1))
+    entries = np.concatenate(signs), (np.concatenate(rows), np.concatenate(columns))
+    return csr_array(entries, shape=(6 * n + maps + 1, layout.size))

@@ -1,0 +1,263 @@
+"""Kinematic alignment: the cameras are not free, they are base_from_gripper[i] · gripper_from_camera.
+
+The unknowns of global alignment's cameras, 6 per image and only up to a similarity, become one
+`gripper_from_camera` and small corrections of the gripper poses under the robot's own noise. The robot's
+motion then sets the metric scale inside the alignment, pair scales included, instead of after it.
+"""
+
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.geometry import adjoint, inverse, nearest_rotation, rotation_log, scale_translation, skew, transform
+from jcr.progress import Progress
+from jcr.reconstruct.global_alignment.alignment import (
+    Alignment,
+    AlignOptions,
+    check_connected,
+    check_options,
+    pinhole_of,
+)
+from jcr.reconstruct.global_alignment.gauss_newton import (
+    FINE_TOLERANCE,
+    NORMAL_SQUARE_MEDIAN,
+    Problem,
+    Solution,
+    dense_alignment,
+    gauss_newton,
+    moved,
+    solve_free,
+)
+from jcr.reconstruct.global_alignment.normal_equations import Layout
+from jcr.reconstruct.global_alignment.observations import weight_is_log
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.reconstruct.global_alignment.pointmap_residuals import State
+from jcr.records import REACH
+
+VAGUE = 10.0
+"""One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
+
+STRAIN = 5.0
+"""Standard deviations by which a gripper pose may move before the user is told."""
+START_NOISE = 0.001
+"""Of the robot (rad) until it is measured."""
+LEAST_NOISE = 1e-5
+"""rad: a tenth of what the best arm repeats."""
+
+
+@dataclass(frozen=True)
+class KinematicOptions:
+    """How camera poses are tied to the gripper poses."""
+
+    robot_noise: tuple[float, float] | None = None
+    """One-sigma noise of the gripper poses per axis, metres and radians; 0 holds them, None estimates it."""
+    align: AlignOptions = field(default_factory=AlignOptions)
+
+
+@dataclass(frozen=True)
+class KinematicAlignment:
+    """A reconstruction in the robot's base frame, in metres, with the hand-eye transform that made it."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    scale: float
+    """Metres per unit of the free alignment, which is the geometric mean of the pairs' units."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    """Corrected within the robot's noise."""
+    covariance: Float[ndarray, "7 7"]
+    """Of gripper_from_camera and log scale, in the order of `records.COVARIANCE_ORDER`."""
+    alignment: Alignment
+    """Here the recon frame is the base frame, in metres."""
+
+
+class HandEyeCameras:
+    """Cameras on a gripper: base_from_camera[i] = base_from_gripper[i] · gripper_from_camera."""
+
+    def __init__(
+        self,
+        base_from_gripper: Float[ndarray, "n 4 4"],
+        gripper_from_camera: Float[ndarray, "4 4"],
+        options: KinematicOptions,
+    ) -> None:
+        self.measured = base_from_gripper
+        self.base_from_gripper = base_from_gripper
+        self.gripper_from_camera = gripper_from_camera
+        self.estimated = options.robot_noise is None
+        self.spread = np.repeat(options.robot_noise or (REACH * START_NOISE, START_NOISE), 3)
+        """One sigma of the gripper poses' errors: translation, rotation."""
+        self.normal = self.jacobian = np.zeros((0, 0))
+
+    @property
+    def recon_from_camera(self) -> Float[ndarray, "n 4 4"]:
+        """In the base frame."""
+        return self.base_from_gripper @ self.gripper_from_camera
+
+    @property
+    def information(self) -> Float[ndarray, "6"]:
+        """Inverse variance of the gripper poses' errors; 0 where they are held."""
+        return np.where(self.spread == 0, 0.0, 1.0 / np.where(self.spread == 0, 1.0, self.spread) ** 2)
+
+    def step(
+        self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
+    ) -> Float[ndarray, " p"]:
+        """Solve the reduced normal equations, move the cameras, and return the step of all unknowns.
+
+        Unknowns in turn: a twist of gripper_from_camera and one of each gripper pose, both in gripper axes,
+        then what `layout` has beside cameras. Either twist moves camera i by Ad(base_from_gripper[i]) of it.
+        """
+        images = layout.images
+        rest = layout.size - 6 * images
+        to_base = adjoint(self.base_from_gripper)
+        jacobian = np.zeros((layout.size, 6 + layout.size))
+        for k in range(images):
+            rows = slice(6 * k, 6 * k + 6)
+            jacobian[rows, :6] = to_base[k]
+            jacobian[rows, 6 + 6 * k : 12 + 6 * k] = to_base[k]
+        jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
+        prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
+        pull = np.concatenate([np.zeros(6), (self.information * self.deviation()).ravel(), np.zeros(rest)])
+        free = np.concatenate([np.ones(6, bool), np.tile(self.spread > 0, images), np.ones(rest, bool)])
+
+        self.normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
+        self.jacobian = jacobian[: 6 * images, free]
+        full = np.zeros(6 + layout.size)
+        full[free] = -np.linalg.solve(self.normal, (jacobian.T @ gradient + pull)[free])
+        self.gripper_from_camera = moved(self.gripper_from_camera[None], full[None, :6])[0]
+        correction = moved(np.tile(np.eye(4), (images, 1, 1)), full[6 : 6 + 6 * images].reshape(-1, 6))
+        self.base_from_gripper = self.base_from_gripper @ correction
+        if self.estimated:
+            variance = np.linalg.inv(self.normal).diagonal()[6 : 6 + 6 * images].reshape(-1, 6)
+            self.spread = self._estimated_spread(variance)
+        return jacobian @ full
+
+    def _estimated_spread(self, variance: Float[ndarray, "n 6"]) -> Float[ndarray, "6"]:
+        """The evidence fixed point, as for the pairs' errors: wrong gripper poses do not count."""
+        arm = np.repeat([REACH, 1.0], 3)
+        determined = 1.0 - np.median(variance / self.spread**2)
+        squared = np.median((self.deviation() / arm) ** 2) / NORMAL_SQUARE_MEDIAN
+        return arm * max(np.sqrt(squared / max(determined, 0.05)), LEAST_NOISE)
+
+    def covariance(self) -> Float[ndarray, "r r"]:
+        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        return self.jacobian @ np.linalg.solve(self.normal, self.jacobian.T)
+
+    def hand_eye_covariance(self, pairs: int) -> Float[ndarray, "7 7"]:
+        """Of gripper_from_camera and the mean log pair scale, in the order of COVARIANCE_ORDER."""
+        functional = np.zeros((7, len(self.normal)))
+        functional[:6, :6] = np.eye(6)
+        functional[:3, 3:6] = -skew(self.gripper_from_camera[:3, 3])
+        functional[6, -pairs:] = 1.0 / pairs
+        return functional @ np.linalg.solve(self.normal, functional.T)
+
+    def strain(self) -> Float[ndarray, " n"]:
+        """By how many standard deviations of the robot's noise each gripper pose had to move, at most."""
+        return np.abs(self.deviation() * np.sqrt(self.information)).max(axis=1)
+
+    def deviation(self) -> Float[ndarray, "n 6"]:
+        """How far the gripper poses have moved from the measured ones, in gripper axes."""
+        gap = inverse(self.measured) @ self.base_from_gripper
+        return np.concatenate([gap[:, :3, 3], rotation_log(gap[:, :3, :3])], axis=1)
+
+
+def align_kinematic(
+    predictions: PairPredictions,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    options: KinematicOptions | None = None,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    progress: Progress | None = None,
+) -> KinematicAlignment:
+    """Solve for gripper_from_camera and the reconstruction together, gripper poses under the robot's noise.
+
+    The start is a free alignment and a hand-eye transform in closed form, or the one given. Motions that
+    leave a direction unobservable show in the covariance. Raises InputError as `align` does, and where there
+    are fewer than 3 images, or gripper poses of another number.
+    """
+    options = options or KinematicOptions()
+    begin = time.perf_counter()
+    check_options(options.align)
+    check_connected(predictions)
+    count = predictions.image_count
+    if len(base_from_gripper) != count:
+        raise InputError(f"{len(base_from_gripper)} gripper poses for {count} images; give one for each")
+    if count < 3:
+        raise InputError(f"kinematic alignment needs 3 images or more, there are {count}; take more")
+    problem = Problem(predictions, pinhole_of(predictions, options.align), weight_is_log(predictions))
+    free = solve_free(problem, options.align)
+    solution, cameras = solve_kinematic(problem, free, base_from_gripper, options, gripper_from_camera)
+    alignment = dense_alignment(problem, solution, begin, progress)
+    notes = (*alignment.notes, *contradictions(cameras, predictions))
+    return KinematicAlignment(
+        gripper_from_camera=cameras.gripper_from_camera,
+        scale=float(np.exp(solution.state.log_pair_scale.mean())),
+        base_from_gripper=cameras.base_from_gripper,
+        covariance=cameras.hand_eye_covariance(len(predictions.edges)),
+        alignment=replace(alignment, method="kinematic", notes=notes),
+    )
+
+
+def solve_kinematic(
+    problem: Problem,
+    free: Solution,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    options: KinematicOptions,
+    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+) -> tuple[Solution, HandEyeCameras]:
+    """Kinematic alignment, base frame and metres, from a free one; raises as `gauss_newton` does."""
+    start, scale = hand_eye_from_motions(base_from_gripper, free.state.recon_from_camera)
+    cameras = HandEyeCameras(
+        base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
+    )
+    state = replace(rescaled(free.state, scale), recon_from_camera=cameras.recon_from_camera)
+    spread = free.pair_spread * np.repeat([scale, 1.0], 3)
+    solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
+    return solution, cameras
+
+
+def rescaled(state: State, factor: float) -> State:
+    """The same state with all lengths multiplied."""
+    return replace(
+        state,
+        recon_from_camera=scale_translation(state.recon_from_camera, factor),
+        log_depth=[log_depth + np.log(factor) for log_depth in state.log_depth],
+        log_pair_scale=state.log_pair_scale + np.log(factor),
+        pair_error=state.pair_error * np.repeat([factor, 1.0], 3),
+    )
+
+
+def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
+    """A note that names the images whose gripper pose had to move further than the robot's noise explains.
+
+    Where that noise is estimated, four images or fewer cannot tell a wrong pose from a bad robot.
+    """
+    strain = cameras.strain()
+    if strain.max() <= STRAIN or (cameras.estimated and len(strain) < 5):
+        return ()
+    names = [
+        predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(strain > STRAIN)
+    ]
+    return (
+        f"the pictures contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
+        "robot's noise; these poses are wrong, or --robot-noise is too small",
+    )
+
+
+def hand_eye_from_motions(
+    base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
+) -> tuple[Float[ndarray, "4 4"], float]:
+    """gripper_from_camera and scale from all motions: rotation after Park and Martin (1994), then one least
+    squares for translation and scale (the paper's scale recovery problem, without its grid)."""
+    i, j = np.triu_indices(len(base_from_gripper), 1)
+    a = inverse(base_from_gripper[i]) @ base_from_gripper[j]
+    b = inverse(recon_from_camera[i]) @ recon_from_camera[j]
+    rotation = nearest_rotation(rotation_log(a[:, :3, :3]).T @ rotation_log(b[:, :3, :3]))
+    moved_by = b[:, :3, 3] @ rotation.T
+    left = np.concatenate([a[:, :3, :3] - np.eye(3), -moved_by[:, :, None]], axis=2)
+    solution = np.linalg.lstsq(left.reshape(-1, 4), -a[:, :3, 3].ravel(), rcond=1e-10)[0]
+    scale = float(solution[3])
+    if scale <= 0:
+        # Motions that do not show the scale: their lengths at least bound it.
+        scale = float(np.linalg.norm(a[:, :3, 3]) / max(np.linalg.norm(moved_by), 1e-12))
+    return transform(rotation, solution[:3]), scale

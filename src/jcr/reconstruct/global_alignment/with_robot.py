@@ -1,0 +1,121 @@
+"""Free and kinematic alignment of the same pairs, and the better of the two."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import NotTrustedError
+from jcr.geometry import inverse, skew
+from jcr.progress import Progress
+from jcr.reconstruct.global_alignment.align import align
+from jcr.reconstruct.global_alignment.alignment import (
+    Alignment,
+    AlignOptions,
+    check_connected,
+    check_options,
+    pinhole_of,
+)
+from jcr.reconstruct.global_alignment.gauss_newton import Problem, Solution, dense_alignment, solve_free
+from jcr.reconstruct.global_alignment.kinematic import (
+    KinematicOptions,
+    contradictions,
+    rescaled,
+    solve_kinematic,
+)
+from jcr.reconstruct.global_alignment.observations import weight_is_log
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.records import CameraEvidence
+
+
+@dataclass(frozen=True)
+class RobotAlignment:
+    """The better alignment in the first camera's frame, and what the pictures alone say, for the calibration."""
+
+    alignment: Alignment
+    evidence: CameraEvidence | None
+    """None where the aligner does not know how sure it is (adam)."""
+
+
+def align_with_robot(
+    predictions: PairPredictions,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    options: AlignOptions | None = None,
+    progress: Progress | None = None,
+) -> RobotAlignment:
+    """Align freely and kinematically, and keep what promises the smaller error of the cameras.
+
+    Neither knows the truth. Each predicts, from its own normal equations with weights measured on its own
+    residuals, how far its cameras are off after the best similarity. Kinematic alignment is kept where it
+    promises less, did settle, and no gripper pose had to move beyond the robot's noise, which it estimates: a
+    wrong gripper pose would bend the scene. (The cost at the minimum does not decide: free cameras have 6n - 13
+    parameters more and always fit better.) What the calibration is given as `evidence` is the free cameras in
+    either case, as the robot's poses must not count twice. Raises InputError as `align` does.
+    """
+    options = options or AlignOptions()
+    if options.method != "fast":
+        return RobotAlignment(align(predictions, options, progress), None)
+    begin = time.perf_counter()
+    check_options(options)
+    check_connected(predictions)
+    problem = Problem(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
+    free = solve_free(problem, options)
+    evidence = CameraEvidence(free.state.recon_from_camera, free.cameras.covariance())
+    kinematic, note = _kinematic_if_better(problem, free, base_from_gripper, options)
+    alignment = dense_alignment(problem, kinematic or free, begin, progress)
+    method = "fast" if kinematic is None else "kinematic"
+    return RobotAlignment(replace(alignment, method=method, notes=(*alignment.notes, note)), evidence)
+
+
+def _kinematic_if_better(
+    problem: Problem, free: Solution, base_from_gripper: Float[ndarray, "n 4 4"], options: AlignOptions
+) -> tuple[Solution | None, str]:
+    """Kinematic alignment in the frame and unit of the free one, or None, and what speaks for the choice."""
+    count = problem.predictions.image_count
+    if count < 3:
+        return None, f"cameras aligned freely: {count} images are too few to tie them to the robot"
+    try:
+        kinematic, cameras = solve_kinematic(
+            problem, free, base_from_gripper, KinematicOptions(align=options)
+        )
+    except (NotTrustedError, np.linalg.LinAlgError):
+        return None, "cameras aligned freely: tied to the robot's poses they came to nothing"
+    contradicted = contradictions(cameras, problem.predictions)
+    if contradicted:
+        return None, f"cameras aligned freely: {contradicted[0]}"
+    if not kinematic.settled:
+        return None, "cameras aligned freely: tied to the robot's poses they did not settle"
+    metres = float(np.exp(kinematic.state.log_pair_scale.mean()))
+    errors_mm = [
+        1e3 * predicted_error(solution.state.recon_from_camera, solution.cameras.covariance()) * unit
+        for solution, unit in ((free, metres), (kinematic, 1.0))
+    ]
+    promise = "expected error {:.2g} mm freely, {:.2g} mm tied to the robot's poses".format(*errors_mm)
+    if errors_mm[0] <= errors_mm[1]:
+        return None, f"cameras aligned freely: {promise}"
+    return _in_first_camera(kinematic, metres), f"cameras aligned kinematically: {promise}"
+
+
+def predicted_error(recon_from_camera: Float[ndarray, "n 4 4"], covariance: Float[ndarray, "r r"]) -> float:
+    """Root mean square error of the camera centres after the best similarity, from the twists' covariance."""
+    center = recon_from_camera[:, :3, 3]
+    count = len(center)
+    by_turn = -skew(center)
+    unit = np.tile(np.eye(3), (count, 1, 1))
+    moves = np.zeros((3 * count, 6 * count))
+    for k in range(count):
+        moves[3 * k : 3 * k + 3, 6 * k : 6 * k + 6] = np.concatenate([unit[k], by_turn[k]], axis=1)
+    of_centers = moves @ covariance @ moves.T
+    gauge = np.concatenate([unit, by_turn, center[:, :, None]], axis=2).reshape(3 * count, 7)
+    basis = np.linalg.qr(gauge)[0]
+    left = np.trace(of_centers) - np.trace(basis.T @ of_centers @ basis)
+    return float(np.sqrt(max(left, 0.0) / count))
+
+
+def _in_first_camera(solution: Solution, metres: float) -> Solution:
+    """A solution in the base frame and metres as a free one would have it: first camera, pairs' mean unit."""
+    base_from_camera = solution.state.recon_from_camera
+    relative = replace(solution.state, recon_from_camera=inverse(base_from_camera[0]) @ base_from_camera)
+    return replace(solution, state=rescaled(relative, 1.0 / metres))

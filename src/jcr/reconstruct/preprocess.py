@@ -1,0 +1,159 @@
+"""Images as the network was trained on them, and the intrinsics that go with the pixels it sees.
+
+Pixel (0, 0) is the centre of the top-left pixel. A resize by s maps x' = (x + 0.5)·s − 0.5 (the image's outer
+edges stay its outer edges, which is what Pillow's resize does); a crop subtracts its corner. Forgetting the
+half pixel shifts the principal point by (1 − s)/2 pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from jcr.camera import NO_DISTORTION, distort, pinhole_inside, undistort_image, usable_lens
+from jcr.capture.images import read_image
+from jcr.records import Capture, Intrinsics
+
+PATCH = 16
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Where the network's pixels lie in an undistorted image: resized to `resized_size`, then cropped."""
+
+    original_size: tuple[int, int]
+    """Width, height in pixels, upright and undistorted."""
+    resized_size: tuple[int, int]
+    crop_corner: tuple[int, int]
+    """Left, top of the crop in the resized image."""
+    size: tuple[int, int]
+    """Width, height of what the network sees."""
+
+    @property
+    def scale(self) -> Float[ndarray, "2"]:
+        """Resized over original, for x and y (they differ by the rounding of the sizes)."""
+        return np.array(self.resized_size) / np.array(self.original_size)
+
+    def grid_from_original(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the original image in the network's grid."""
+        return (x_px + 0.5) * self.scale - 0.5 - np.array(self.crop_corner)
+
+    def original_from_grid(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the network's grid in the original image."""
+        return (x_px + np.array(self.crop_corner) + 0.5) / self.scale - 0.5
+
+    def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
+        """The pinhole of the grid, given the pinhole of the original image (its distortion is dropped)."""
+        cx, cy = self.grid_from_original(np.array([original.cx, original.cy]))
+        sx, sy = self.scale
+        width, height = self.size
+        return Intrinsics(original.fx * sx, original.fy * sy, float(cx), float(cy), width, height)
+
+    def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
+        """The pinhole of the original image, given that of the grid."""
+        cx, cy = self.original_from_grid(np.array([grid.cx, grid.cy]))
+        sx, sy = self.scale
+        width, height = self.original_size
+        return Intrinsics(grid.fx / sx, grid.fy / sy, float(cx), float(cy), width, height)
+
+
+def image_grid(
+    original_size: tuple[int, int], long_edge: int = 512, patch: int = PATCH, keep_square: bool = False
+) -> ImageGrid:
+    """The published resize and crop for an image of `original_size` (width, height).
+
+    512: the long edge becomes 512 and both edges are cropped around the centre to multiples of the patch; a
+    square image is cropped to 4:3, DUSt3R having seen none. 224: the short edge becomes 224, then a square is
+    cropped.
+    """
+    width, height = original_size
+    longest = max(width, height)
+    target = round(long_edge * longest / min(width, height)) if long_edge == 224 else long_edge
+    resized = (round(width * target / longest), round(height * target / longest))
+    center = (resized[0] // 2, resized[1] // 2)
+    if long_edge == 224:
+        half = (min(center),) * 2
+    else:
+        half = tuple(2 * c // patch * (patch // 2) for c in center)
+        if resized[0] == resized[1] and not keep_square:
+            half = (half[0], 3 * half[0] // 4)
+    corner = (center[0] - half[0], center[1] - half[1])
+    return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
+
+
+def cover_grid(original_size: tuple[int, int], size: tuple[int, int]) -> ImageGrid:
+    """The middle of an image of `original_size`, as large as it can be, at `size` (both width, height)."""
+    scale = max(size[0] / original_size[0], size[1] / original_size[1])
+    resized = (round(scale * original_size[0]), round(scale * original_size[1]))
+    corner = ((resized[0] - size[0]) // 2, (resized[1] - size[1]) // 2)
+    return ImageGrid(original_size, resized, corner, size)
+
+
+@dataclass(frozen=True)
+class PreparedImages:
+    """A capture's images as the network reads them."""
+
+    colors: UInt8[ndarray, "n h w 3"]
+    grid: ImageGrid
+    lens: Intrinsics | None
+    """Of the capture's images; None: unknown."""
+    pinhole: Intrinsics | None
+    """Of the undistorted images that `grid` resizes; None: unknown."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Pinhole of the network's grid; None: unknown."""
+        return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
+
+    def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
+        """Pixels (...,2) of the network's grid in the capture's images, distorted as the lens made them."""
+        undistorted_px = self.grid.original_from_grid(x_px)
+        if self.pinhole is None or self.lens is None or self.lens.distortion == NO_DISTORTION:
+            return undistorted_px
+        k = self.pinhole
+        return distort(self.lens, (undistorted_px - [k.cx, k.cy]) / [k.fx, k.fy])
+
+
+def prepare_images(
+    capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
+) -> PreparedImages:
+    """Read, undistort where the lens is known, resize and crop the images of a capture.
+
+    `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
+    """
+    lens, notes = usable_lens(capture.intrinsics)
+    pinhole = lens
+    if lens is not None and lens.distortion != NO_DISTORTION:
+        pinhole = pinhole_inside(lens, max(lens.width, lens.height))
+    grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
+    return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, notes)
+
+
+def read_colors(
+    capture: Capture, grid: ImageGrid, lens: Intrinsics | None, pinhole: Intrinsics | None
+) -> UInt8[ndarray, "n h w 3"]:
+    """The images of a capture on a grid, made images of `pinhole` first where the lens is distorted.
+
+    Raises InputError for an image that cannot be read.
+    """
+    width, height = grid.size
+    colors = np.empty((len(capture), height, width, 3), np.uint8)
+    for row, name in enumerate(capture.images):
+        image = read_image(capture.folder / name)
+        if lens is not None and pinhole is not None and lens.distortion != NO_DISTORTION:
+            image = undistort_image(image, lens, pinhole)
+        colors[row] = resize_and_crop(image, grid)
+    return colors
+
+
+def resize_and_crop(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
+    """An image on the network's grid, by the published filters: Lanczos to shrink, bicubic to enlarge."""
+    shrinks = max(grid.original_size) > max(grid.resized_size)
+    filter_ = Image.Resampling.LANCZOS if shrinks else Image.Resampling.BICUBIC
+    resized = Image.fromarray(image).resize(grid.resized_size, filter_)
+    left, top = grid.crop_corner
+    return np.asarray(resized)[top : top + grid.size[1], left : left + grid.size[0]]

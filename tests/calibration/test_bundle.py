@@ -1,0 +1,105 @@
+"""Hand-eye bundle adjustment on simulated observations with a known answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import jcr
+from jcr.calibration.bundle import adjust, median_reprojection
+from jcr.calibration.projection import parameters, project, project_derivatives
+from jcr.records import Intrinsics, Tracks
+from jcr.simulate.observations import LENS, observed
+from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
+
+
+def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options):
+    start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    return adjust(
+        problem.base_from_gripper,
+        (start.gripper_from_camera, start.scale, start.base_from_recon),
+        problem.recon_from_camera,
+        lens,
+        tracks,
+        **options,
+    )
+
+
+def test_projection_derivatives_match_finite_differences():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(30, 3)) * [0.2, 0.2, 0.1] + [0, 0, 0.6]
+    camera = parameters(LENS)
+    by_point, by_camera = project_derivatives(x, camera)
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        numeric = (project(x + step, camera) - project(x - step, camera)) / 2e-6
+        assert np.allclose(by_point[:, :, k], numeric, rtol=1e-6, atol=1e-4)
+    for k in range(9):
+        step = 1e-6 * np.eye(9)[k]
+        numeric = (project(x, camera + step) - project(x, camera - step)) / 2e-6
+        assert np.allclose(by_camera[:, :, k], numeric, rtol=1e-6, atol=1e-4)
+
+
+def test_camera_noise_is_beaten_by_the_images():
+    rng = np.random.default_rng(1)
+    problem = hand_eye_problem(rng, 10, camera_noise=(2e-3, np.radians(0.3)))
+    tracks = observed(problem, rng, 400, 0.3)
+    start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    adjusted = solved(problem, tracks)
+    before = error(problem, start.gripper_from_camera, start.scale)
+    after = error(problem, adjusted.bundle.gripper_from_camera, problem.scale)
+    assert np.linalg.norm(after[:3]) < 0.3e-3
+    assert np.degrees(np.linalg.norm(after[3:6])) < 0.03
+    assert np.linalg.norm(after[:3]) < 0.3 * np.linalg.norm(before[:3])
+    assert np.nanmax(median_reprojection(adjusted)) < 0.6
+
+
+def test_a_focal_length_off_by_five_percent_is_found():
+    rng = np.random.default_rng(2)
+    problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)), camera_noise=(5e-3, 0.01))
+    tracks = observed(problem, rng, 600, 0.3)
+    guess = Intrinsics(LENS.fx * 1.05, LENS.fy * 1.05, 319.5, 239.5, 640, 480)
+    adjusted = solved(problem, tracks, guess, refine_lens=True)
+    assert adjusted.bundle.camera[0] == pytest.approx(LENS.fx, rel=2e-3)
+    assert np.linalg.norm(error(problem, adjusted.bundle.gripper_from_camera, problem.scale)[:3]) < 1e-3
+
+
+def test_wrong_matches_do_not_pull():
+    rng = np.random.default_rng(3)
+    problem = hand_eye_problem(rng, 8, robot_noise=(1e-4, np.radians(0.01)))
+    tracks = observed(problem, rng, 300, 0.3)
+    wrong = rng.random(len(tracks.image)) < 0.1
+    tracks.x_px[wrong] += rng.normal(size=(wrong.sum(), 2)) * 40
+    adjusted = solved(problem, tracks)
+    assert np.linalg.norm(error(problem, adjusted.bundle.gripper_from_camera, problem.scale)[:3]) < 1e-3
+
+
+@pytest.mark.parametrize("views", [2, 3, 8])
+def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
+    # A point seen twice takes up three of its four errors.
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 8, robot_noise=(1e-4, np.radians(0.01)))
+    tracks = observed(problem, rng, 400, 0.3)
+    order = rng.permutation(len(tracks.image))
+    rank = np.zeros(len(order), dtype=int)
+    for point in np.unique(tracks.point):
+        own = order[tracks.point[order] == point]
+        rank[own] = np.arange(len(own))
+    few = rank < views
+    tracks = replace(tracks, image=tracks.image[few], x_px=tracks.x_px[few], point=tracks.point[few])
+    assert solved(problem, tracks).sigma_px == pytest.approx(0.3, rel=0.1)
+
+
+def test_robot_noise_is_found_and_the_ellipsoid_covers():
+    noise = (5e-4, np.radians(0.1))
+    runs, inside, estimates = 60, 0, []
+    for seed in range(runs):
+        rng = np.random.default_rng([4, seed])
+        problem = hand_eye_problem(rng, 10, robot_noise=noise)
+        adjusted = solved(problem, observed(problem, rng, 80, 0.3))
+        missed = error(problem, adjusted.bundle.gripper_from_camera, adjusted.scale)
+        inside += missed @ np.linalg.solve(adjusted.covariance, missed) < chi2.ppf(0.95, 7)
+        estimates.append(adjusted.noise)
+    assert inside / runs >= 0.88
+    assert np.mean(estimates, axis=0) == pytest.approx(noise, rel=0.2)

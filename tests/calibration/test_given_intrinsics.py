@@ -1,0 +1,116 @@
+"""Given intrinsics that the pictures contradict are named, and those that are right never."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
+from jcr.simulate.observations import LENS, observed
+from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
+
+
+def pictured(
+    seed: int, images: int, lens: Intrinsics | None, **motion
+) -> tuple[HandEyeProblem, Capture, Reconstruction]:
+    """Pictures that LENS made, of which it is told that `lens` did; None: told nothing."""
+    rng = np.random.default_rng([seed, images])
+    problem = hand_eye_problem(
+        rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
+    )
+    tracks = observed(problem, rng, 250, 0.5)
+    capture = Capture(
+        Path("."), tuple(f"{k}.png" for k in range(images)), problem.base_from_gripper, (640, 480), lens
+    )
+    reconstruction = Reconstruction(
+        np.arange(images),
+        problem.recon_from_camera,
+        lens or LENS,
+        lens or LENS,
+        np.zeros((images, 1, 1, 3), np.float32),
+        np.zeros((images, 1, 1), np.float32),
+        np.zeros((images, 1, 1, 3), np.uint8),
+        tracks,
+        "test",
+    )
+    return problem, capture, reconstruction
+
+
+def calibrated(
+    seed: int, images: int, lens: Intrinsics | None, options: CalibrateOptions | None = None, **motion
+) -> tuple[HandEyeProblem, HandEye]:
+    problem, capture, reconstruction = pictured(seed, images, lens, **motion)
+    return problem, calibrate(capture, reconstruction, options)
+
+
+def scaled(factor: float) -> Intrinsics:
+    return replace(LENS, fx=LENS.fx * factor, fy=LENS.fy * factor)
+
+
+def said(hand_eye: HandEye) -> str:
+    """What is said of the lens."""
+    return next((text for text in hand_eye.warnings if text.startswith("the pictures show ")), "")
+
+
+@pytest.mark.parametrize("images", [3, 5, 10])
+@pytest.mark.parametrize("motion", [{}, {"pattern": "translation", "deviation": np.radians(6.0)}])
+def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
+    for seed in range(6):
+        assert said(calibrated(seed, images, LENS, **motion)[1]) == ""
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.95, 1.05, 1.2])
+@pytest.mark.parametrize("images", [5, 10])
+def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
+    _, hand_eye = calibrated(0, images, scaled(factor))
+    found = re.match(
+        r"the pictures show a focal length of (\d+) ± \S+ px where (\d+) is given;", said(hand_eye)
+    )
+    assert found is not None
+    assert float(found[1]) == pytest.approx(LENS.fx, rel=0.01)
+    assert float(found[2]) == pytest.approx(LENS.fx * factor, abs=0.5)
+    if abs(factor - 1) > 0.1:
+        # What it does to the calibration is more than can be trusted, and it is the first reason that users read.
+        assert not hand_eye.converged and hand_eye.warnings[0] == said(hand_eye)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
+    # Told that the robot is good, the fit alone would be sure of a wrong answer.
+    problem, hand_eye = calibrated(seed, 10, scaled(1.03), CalibrateOptions(robot_noise=(0.5, 0.1)))
+    off = error(problem, hand_eye.gripper_from_camera, hand_eye.scale)
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    assert "focal length" in said(hand_eye)
+    assert np.abs(off / std)[:6].max() < 3
+
+
+@pytest.mark.parametrize("factor", [1.03, 0.95, 1.2])
+def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) -> None:
+    offset, promised, reported = [], [], []
+    for lens in (LENS, scaled(factor)):
+        _, capture, reconstruction = pictured(0, 5, lens)
+        hand_eye = calibrate(capture, reconstruction)
+        content = calibration_file(capture, reconstruction, hand_eye, {}, "")
+        offset.append(hand_eye.gripper_from_camera[:3, 3])
+        promised.append(np.linalg.norm(content.next_poses[-1].expected_std[:3]))
+        reported.append(np.sqrt(np.trace(hand_eye.covariance[:3, :3])))
+    assert promised[0] < 0.7 * reported[0]
+    assert np.linalg.norm(offset[1] - offset[0]) < promised[1] < reported[1]
+
+
+def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:
+    k1, *others = LENS.distortion
+    turned = said(calibrated(0, 10, replace(LENS, distortion=(-k1, *others)))[1])
+    assert "distortion" in turned and "focal" not in turned and "principal" not in turned
+    shifted = said(calibrated(0, 10, replace(LENS, cx=LENS.cx + 30))[1])
+    found = re.match(r"the pictures show a principal point of \((\d+), (\d+)\) ± ", shifted)
+    assert found is not None and "focal" not in shifted and "distortion" not in shifted
+    assert [float(found[1]), float(found[2])] == pytest.approx([LENS.cx, LENS.cy], abs=4)
+
+
+def test_an_estimated_lens_is_not_doubted() -> None:
+    assert said(calibrated(0, 10, None)[1]) == ""

@@ -1,0 +1,281 @@
+"""Recordings of robots: ROS 1, sqlite3 and MCAP bags give the frames at which the arm stood still."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import capture_writers as writers
+import jcr
+from benchmarks.bag import nearest_view, write_bag
+from jcr.capture.best_frames import best_frames
+from jcr.capture.options import ReadOptions
+from jcr.capture.pose_track import NEVER, pose_track
+from jcr.capture.ros_image import picture_of
+from jcr.geometry import rotation_exp, transform
+from jcr.records import Capture
+from jcr.simulate.problem import hand_eye_problem
+
+pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
+FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path) -> Capture:
+    return jcr.read_capture(tabletop)
+
+
+@pytest.fixture(scope="module")
+def mcap(tmp_path_factory: pytest.TempPathFactory, capture: Capture) -> Path:
+    return write_bag(tmp_path_factory.mktemp("mcap") / "scan", capture, "mcap", 12.0, fps=10.0, tf_hz=50.0)
+
+
+def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture: Capture, mcap: Path):
+    """And the same poses, hence the same calibration, come from all three."""
+    bags = {
+        "mcap": mcap,
+        "sqlite3": write_bag(
+            tmp_path / "sqlite3", capture, "sqlite3", 12.0, fps=10.0, tf_hz=50.0, compressed=False
+        ),
+        "ros1": write_bag(tmp_path / "scan.bag", capture, "ros1", 12.0, fps=10.0, tf_hz=50.0),
+    }
+    for kind, bag in bags.items():
+        got = jcr.read_capture(bag, FRAMES, into=tmp_path / f"{kind}-frames")
+        off_mm, off_deg, view = nearest_view(got.base_from_gripper, capture.base_from_gripper)
+        assert sorted(view) == list(range(12)), kind
+        assert off_mm.max() < 1e-6 and off_deg.max() < 1e-6
+        assert got.intrinsics == capture.intrinsics
+        # What was read is a capture folder itself.
+        again = jcr.read_capture(tmp_path / f"{kind}-frames")
+        assert (again.base_from_gripper == got.base_from_gripper).all() and again.images == got.images
+
+
+def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Capture):
+    """Two publishers on one topic, as with an arm and its gripper; the arm halts at eight places."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    angles = np.random.default_rng(4).uniform(-1, 1, (8, 3))
+    (tmp_path / "arm.urdf").write_text(writers.URDF)
+
+    def header(at: int):
+        return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](at // 10**9, at % 10**9), "")
+
+    def state(at: int, names: list[str], positions: np.ndarray):
+        return types["sensor_msgs/msg/JointState"](header(at), names, positions, np.zeros(0), np.zeros(0))
+
+    with Writer(tmp_path / "joints", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {
+            name: writer.add_connection(name, kind, typestore=store)
+            for name, kind in (
+                ("/joint_states", "sensor_msgs/msg/JointState"),
+                ("/image/compressed", "sensor_msgs/msg/CompressedImage"),
+            )
+        }
+
+        def write(topic: str, at: int, message) -> None:
+            writer.write(topics[topic], at, store.serialize_cdr(message, message.__msgtype__))
+
+        for tick in range(8 * 50):  # 50 Hz, a second a place, the last half of it on the way
+            at = 10**18 + tick * 20_000_000
+            share = max(tick % 50 - 25, 0) / 25
+            here = angles[tick // 50] + share * (angles[(tick // 50 + 1) % 8] - angles[tick // 50])
+            write("/joint_states", at, state(at, ["roll", "pan"], here[[2, 0]]))
+            write(
+                "/joint_states",
+                at + 7_000_000,
+                state(at + 7_000_000, ["grip", "lift"], np.array([0.01, here[1]])),
+            )
+            if tick % 5 == 3:
+                data = np.frombuffer((capture.folder / capture.images[tick // 50]).read_bytes(), np.uint8)
+                message = types["sensor_msgs/msg/CompressedImage"](header(at + 3_000_000), "jpeg", data)
+                write("/image/compressed", at + 9_000_000, message)
+    options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0", frames=8)
+    got = jcr.read_capture(tmp_path / "joints", options, into=tmp_path / "frames")
+    expected = {
+        (capture.folder / capture.images[k]).read_bytes(): pose
+        for k, pose in enumerate(writers.arm_poses(angles))
+    }
+    assert len(got) == 8 and got.intrinsics is None
+    for name, pose in zip(got.images, got.base_from_gripper, strict=True):
+        assert np.allclose(pose, expected[(got.folder / name).read_bytes()], atol=1e-6)
+
+
+def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):
+    bag = write_bag(tmp_path / "raw", capture, "mcap", 6.0, fps=4.0, tf_hz=50.0, compressed=False)
+    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
+    *_, view = nearest_view(got.base_from_gripper, capture.base_from_gripper)
+    for name, k in zip(got.images, view, strict=True):
+        picture = cv2.imread(str(got.folder / name)).astype(int)
+        original = cv2.imread(str(capture.folder / capture.images[k])).astype(int)
+        assert np.abs(picture - original).max() <= 1  # the noise that the bag adds
+
+
+def test_a_bag_is_read_once(tmp_path: Path, mcap: Path):
+    into = tmp_path / "frames"
+    first = jcr.read_capture(mcap, FRAMES, into=into)
+    stamps = {name: (into / name).stat().st_mtime_ns for name in first.images}
+    again = jcr.read_capture(mcap, FRAMES, into=into)
+    assert {name: (into / name).stat().st_mtime_ns for name in again.images} == stamps
+    assert (again.base_from_gripper == first.base_from_gripper).all()
+    fewer = jcr.read_capture(
+        mcap, ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=5), into=into
+    )
+    assert len(fewer) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "--base-frame is not given; the frames of its tf are base_link, tool0, world"),
+        (
+            {"base_frame": "base_link", "gripper_frame": "hand"},
+            "--gripper-frame hand is not in the bag; .* tool0",
+        ),
+        (
+            {"camera_topic": "/nowhere"},
+            "no images on /nowhere; topics with images: /camera/image_raw/compressed",
+        ),
+        ({"urdf": Path("arm.urdf")}, "choose the joint states with --joint-topic: there are none"),
+        ({"frames": 2}, "--frames 2: at least 3"),
+    ],
+)
+def test_what_is_not_in_the_bag_is_listed(tmp_path: Path, mcap: Path, options: dict, words: str):
+    with pytest.raises(jcr.InputError, match=words) as caught:
+        jcr.read_capture(mcap, ReadOptions(**options), into=tmp_path / "frames")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "frames").exists()
+
+
+def test_stale_poses_are_refused_with_their_gap(tmp_path: Path, capture: Capture):
+    """At 5 Hz the poses around an image are 200 ms apart."""
+    bag = write_bag(tmp_path / "slow", capture, "mcap", 12.0, fps=10.0, tf_hz=5.0)
+    with pytest.raises(jcr.InputError, match=r"stale .* 200 ms apart"):
+        jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
+    patient = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12, max_gap_ms=250.0)
+    assert len(jcr.read_capture(bag, patient, into=tmp_path / "frames")) == 12
+
+
+@pytest.mark.parametrize("fault", ["gzip", "cut", "text"])
+def test_files_that_are_no_bags_are_one_line(fault: str, tmp_path: Path, mcap: Path):
+    file = tmp_path / "scan.mcap"
+    data = next(mcap.glob("*.mcap")).read_bytes()
+    file.write_bytes({"gzip": b"\x1f\x8b\x08\x00", "cut": data[: len(data) // 2], "text": b"hello"}[fault])
+    with pytest.raises(jcr.InputError, match=r"scan\.mcap: not a readable bag") as caught:
+        jcr.read_capture(file, FRAMES, into=tmp_path / "frames")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "was, now",
+    [(b"child_frame_id", b"chilb_frame_id"), (b"MSG: geometry_msgs/Vector3", b"MSG: geometry_msgs/Vector4")],
+)
+def test_messages_that_are_not_the_standard_ones_are_refused(
+    was: bytes, now: bytes, tmp_path: Path, mcap: Path
+):
+    """Found by fuzzing: a definition without `child_frame_id`, and one that is not whole, were taken for ROS's."""
+    file = tmp_path / "scan.mcap"
+    data = next(mcap.glob("*.mcap")).read_bytes()
+    assert was in data
+    file.write_bytes(data.replace(was, now))
+    with pytest.raises(
+        jcr.InputError, match=r"its definition of tf2_msgs/msg/TFMessage is not the one of ROS"
+    ):
+        jcr.read_capture(file, FRAMES, into=tmp_path / "frames")
+
+
+def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
+    """A steady turn with a steady advance along x is its own interpolation."""
+    start = 1_700_000_000_000_000_001
+    time_s = np.arange(5.0)
+    turn = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
+    track = pose_track(
+        start + (1e9 * time_s).astype(np.int64), transform(turn, np.outer(time_s, [1.0, 0, 0]))
+    )
+    at, gap = track.at(start + np.array([1_500_000_000, 3_000_000_000, -1, 4_000_000_001]))
+    assert np.allclose(at[0, :3, 3], [1.5, 0, 0]) and np.allclose(
+        at[0, :3, :3], rotation_exp(np.array([0.15, 0.45, -0.3]))
+    )
+    assert gap.tolist() == [10**9, 0, NEVER, NEVER]
+
+
+def test_the_best_frames_are_still_sharp_and_spread():
+    """Of 40 stops, 20 of them one view again and again and 5 blurred, twelve are as good as any twelve."""
+    rng = np.random.default_rng(0)
+    views = hand_eye_problem(rng, 20).base_from_gripper
+    stops = np.concatenate([views, np.repeat(views[:1], 20, axis=0)])
+    poses = np.repeat(stops, 10, axis=0)
+    speed = np.tile([0.2, 0.1, *[0.001] * 6, 0.1, 0.2], 40)
+    sharp = np.ones(400)
+    sharp[10:60] = 0.2  # five of the views
+    asked = []
+
+    def sharpness_of(rows):
+        asked.append(rows)
+        return sharp[rows]
+
+    rows, notes = best_frames(poses, speed, np.ones(400, bool), sharpness_of, 12)
+    assert len(rows) == 12 and (np.diff(rows) > 0).all()
+    assert (speed[rows] < 0.005).all() and (sharp[rows] == 1).all()
+    assert len({tuple(pose.ravel()) for pose in poses[rows]}) == 12
+    assert "5 moments of the recording are blurred" in notes[0]
+    assert len(asked) == 1 and (speed[asked[0]] < 0.005).all()
+    # Only where the arm never stops are moving frames taken, and said to be.
+    rows, notes = best_frames(poses, speed + 0.05, np.ones(400, bool), lambda rows: sharp[rows], 8)
+    assert len(rows) == 8 and "stands still at 0 different views where 8" in notes[-1]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "bayer_gbrg8", "yuv422_yuy2"])
+def test_colours_of_raw_images(encoding: str):
+    """A picture that is red above and blue below stays so, with rows padded to a multiple of 64 bytes."""
+    height, width = 8, 16
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[:4, :, 0] = picture[4:, :, 2] = 200
+    if encoding == "mono8":
+        raw = picture.max(2)
+    elif encoding.startswith("bayer"):
+        pattern = encoding.split("_")[1][:4]
+        raw = np.zeros((height, width), np.uint8)
+        for k, letter in enumerate(pattern):
+            raw[k // 2 :: 2, k % 2 :: 2] = picture[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)]
+    elif encoding == "yuv422_yuy2":
+        # ITU-R BT.601, studio range.
+        weights = np.array([[0.257, 0.504, 0.098], [-0.148, -0.291, 0.439], [0.439, -0.368, -0.071]])
+        y, u, v = np.moveaxis(picture @ weights.T + [16, 128, 128], -1, 0)
+        raw = np.stack([y, np.where(np.arange(width) % 2, v, u)], -1).astype(np.uint8)
+    else:
+        raw = picture if encoding == "rgb8" else picture[..., ::-1]
+    rows = raw.reshape(height, -1)
+    padded = np.zeros((height, 64), np.uint8)
+    padded[:, : rows.shape[1]] = rows
+
+    class Message:
+        pass
+
+    message = Message()
+    fields = {"encoding": encoding, "height": height, "width": width, "step": 64, "data": padded.ravel()}
+    vars(message).update(fields)
+    pixels, ending = picture_of(message, "bag")
+    assert ending == ".png" and isinstance(pixels, np.ndarray)
+    if encoding == "mono8":
+        assert (pixels == 200).all()
+        return
+    assert np.abs(pixels[1, 2:-2].mean(0) - [200, 0, 0]).max() < 20
+    assert np.abs(pixels[6, 2:-2].mean(0) - [0, 0, 200]).max() < 20
+    vars(message).update(encoding="16UC1")
+    with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour picture"):
+        picture_of(message, "bag")
+
+
+def test_the_command_line_judges_a_bag(mcap: Path):
+    command = [sys.executable, "-m", "jcr", "check", str(mcap), "--poses-only", "--json"]
+    command += ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", "8"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["images"]) == 8

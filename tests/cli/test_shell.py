@@ -1,0 +1,168 @@
+"""What every command says and where, and what the shell completes."""
+
+import json
+import os
+import pty
+import re
+import select
+import shutil
+import subprocess
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from jcr.cli import COMMANDS, dispatch
+from jcr.cli.completion import SHELLS, arguments_of, script
+from jcr.cli.export import FORMATS, FormatName
+from jcr.cli.output import Output
+
+
+@pytest.fixture(scope="module")
+def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """The commands that are quick here; those that are not have the same in their own tests."""
+    scratch = tmp_path_factory.mktemp("commands")
+    run = scratch / "run"
+    shutil.copytree(done, run)
+    np.save(scratch / "points.npy", np.zeros((2, 3)))
+    edges = np.array([[0, 1], [1, 0]], np.int32)
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 8), np.linspace(-0.3, 0.3, 6))
+    points = np.stack([x, y, np.ones_like(x)], -1)[None].repeat(2, 0).astype(np.float32)
+    ones = np.full((2, 6, 8), 2, np.float32)
+    np.savez(
+        scratch / "pairs.npz", edges=edges, pts3d=points, pts3d_in_other_view=points, conf=ones, conf2=ones
+    )
+    lines = {
+        "calibrate": ["calibrate", tabletop, run],
+        "check": ["check", tabletop, "--poses-only"],
+        "align": ["align", scratch / "pairs.npz", scratch / "aligned.npz"],
+        "query": ["query", run, scratch / "points.npy"],
+        "export": ["export", run, "ros2"],
+        "measure": ["measure", run],
+        "compare": ["compare", run, tabletop],
+        "bench": ["bench", "run"],
+        "models": ["models"],
+    }
+    return {name: list(map(str, line)) for name, line in lines.items()}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_takes_json_and_quiet(name: str):
+    assert isinstance(
+        import_module(f"jcr.cli.{name}").Arguments.__dataclass_fields__["output"].default_factory(), Output
+    )
+
+
+def test_json_is_one_object_and_quiet_is_silence(
+    commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("benchmarks.run.run", lambda: "| a |\n")
+    for name, line in commands.items():
+        assert dispatch([*line, "--quiet", "--json"]) == 0, name
+        told = capsys.readouterr()
+        assert isinstance(json.loads(told.out), dict), name
+        assert told.err == "", name
+    for name in ("check", "query", "export", "measure", "compare", "bench", "models"):
+        assert dispatch([*commands[name], "--quiet"]) == 0, name
+        told = capsys.readouterr()
+        assert told.out and told.err == "", name
+
+
+def test_errors_are_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["measure", str(tmp_path), "--quiet", "--json"]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.startswith("error: ") and told.err.count("\n") == 1
+
+
+def test_every_export_format_is_in_the_table():
+    assert tuple(row.name for row in FORMATS) == get_args(FormatName)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.CaptureFixture[str]):
+    assert dispatch([name, "--help"]) == 0
+    told = capsys.readouterr().out
+    listed = set(re.findall(r"^. (?:-h, )?(--[a-z][a-z0-9-]*)", told, re.MULTILINE))
+    offered = {argument.flag for argument in arguments_of(import_module(f"jcr.cli.{name}").Arguments)}
+    assert listed == (offered | {"--help"}) - {None}
+    # Arguments are told by their own names, and None is no word of a command line.
+    assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]
+
+
+TYPED = {
+    "jcr ru": {"run"},
+    "jcr run --backe": {"--backend"},
+    "jcr calibrate a b --device ": {"auto", "cpu", "cuda"},
+    "jcr run --backend col": {"colmap"},
+    "jcr map out --segments ta": {"tabletop"},
+    "jcr export out octo": {"octomap"},
+    "jcr run --pos": {"--poses", "--pose-convention", "--pose-units"},
+    "jcr run --no-b": {"--no-bundle-adjustment"},
+    "jcr check ima": {"images/"},
+    "jcr check --poses ima": {"images/"},
+}
+"""What is typed, and what Tab offers, in a folder that holds a folder `images`."""
+
+
+def test_bash_completes(tmp_path: Path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "jcr.bash").write_text(script("bash"))
+    for line, offered in TYPED.items():
+        words = " ".join(f"'{word}'" for word in line.split(" "))
+        asked = (
+            f"source jcr.bash; COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); "
+            '_jcr jcr "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"; '
+            # What -o default does where the function has nothing to offer.
+            '((${#COMPREPLY[@]})) || COMPREPLY=($(compgen -f -S / -- "${COMP_WORDS[COMP_CWORD]}")); '
+            'printf "%s\\n" "${COMPREPLY[@]}"'
+        )
+        told = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, timeout=10)
+        assert set(told.stdout.split()) == offered, (line, told.stderr)
+
+
+def test_fish_completes(tmp_path: Path):
+    if shutil.which("fish") is None:
+        pytest.skip("fish is not installed")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "jcr.fish").write_text(script("fish"))
+    for line, offered in TYPED.items():
+        told = subprocess.run(
+            ["fish", "-c", f"source jcr.fish; complete -C '{line}'"],
+            cwd=tmp_path, capture_output=True, text=True, timeout=30, check=True,
+        )  # fmt: skip
+        found = {row.split("\t")[0] for row in told.stdout.splitlines()}
+        assert found == offered, (line, told.stderr)
+
+
+def test_zsh_completes(tmp_path: Path):
+    if shutil.which("zsh") is None:
+        pytest.skip("zsh is not installed")
+    (tmp_path / "jcr.zsh").write_text(script("zsh"))
+    # Tab works in a terminal alone.
+    asking, terminal = pty.openpty()
+    zsh = subprocess.Popen(
+        ["zsh", "-fi"], cwd=tmp_path, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True
+    )
+    try:
+        os.write(asking, b"unsetopt beep; autoload -U compinit; compinit -u -D; source ./jcr.zsh\n")
+        # Tab completes, then the line's start (Ctrl-A) becomes an echo of what stands there.
+        told, deadline = "", time.monotonic() + 30
+        os.write(asking, b"jcr run --backe\t\x01echo told: \n")
+        while not re.search(r"^told: jcr run --backend", told, re.MULTILINE):
+            assert time.monotonic() < deadline, told
+            if select.select([asking], [], [], 1)[0]:
+                told += os.read(asking, 4096).decode(errors="replace")
+    finally:
+        zsh.kill()
+        zsh.wait()
+        os.close(asking)
+        os.close(terminal)
+
+
+def test_there_is_no_script_for_other_shells(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["--completion", "tcsh"]) == 2
+    told = capsys.readouterr().err
+    assert all(shell in told for shell in SHELLS)

@@ -1,0 +1,558 @@
+"""Exports read back by the tools that own the formats, against known transforms and the true scene."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pycolmap
+import pyoctomap
+import pytest
+import trimesh
+import yaml
+import yourdfpy
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import jcr
+from jcr.camera import distort, undistort
+from jcr.capture.images import read_image
+from jcr.cli import dispatch
+from jcr.cli.export import FORMATS
+from jcr.errors import InputError
+from jcr.export import ros
+from jcr.export.points import read_cloud
+from jcr.export.provenance import Provenance
+from jcr.export.views import PosedImages, write_colmap, write_nerfstudio
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.records import Intrinsics, PointCloud, Tracks
+from jcr.represent.scene import FREE, OCCUPIED, SceneMap
+from jcr.simulate.scenes import make_scene, solid_labels
+from jcr.simulate.truth import read_truth
+
+DOUBT = "scale: every view turns about <one> point -- vary the distance"
+"""With what ends an XML comment in it."""
+PARENT_FROM_CHILD = transform(rotation_exp(np.array([0.4, -2.1, 1.3])), np.array([-0.0524, 0.0407, 1 / 3]))
+
+
+@pytest.fixture(scope="module")
+def scene(done: Path) -> SceneMap:
+    return jcr.load_map(done)
+
+
+def mount(doubt: str | None = None) -> ros.CameraMount:
+    root = np.random.default_rng(0).normal(size=(7, 7))
+    return ros.camera_mount(PARENT_FROM_CHILD, root @ root.T, "tool0", "optical", doubt=doubt)
+
+
+def of_quat(x, y, z, qx, qy, qz, qw) -> np.ndarray:
+    return transform(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), np.array([x, y, z]))
+
+
+def of_publisher(words: list[str]) -> np.ndarray:
+    options = dict(zip(words[::2], words[1::2], strict=True))
+    assert (options["--frame-id"], options["--child-frame-id"]) == ("tool0", "optical")
+    return of_quat(*(float(options[f"--{name}"]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")))
+
+
+def of_launch_xml(path: Path) -> np.ndarray:
+    node = ElementTree.parse(path).getroot().find("node")
+    assert node is not None and node.get("pkg") == "tf2_ros"
+    assert node.get("exec") == "static_transform_publisher"
+    return of_publisher(node.get("args", "").split())
+
+
+def of_launch_py(path: Path) -> np.ndarray:
+    """The file run as ROS runs it, with stand-ins that keep what they are given."""
+    stand_ins = {name: types.ModuleType(name) for name in ("launch", "launch_ros", "launch_ros.actions")}
+    stand_ins["launch"].LaunchDescription = list  # pyright: ignore[reportAttributeAccessIssue]
+    stand_ins["launch_ros.actions"].Node = dict  # pyright: ignore[reportAttributeAccessIssue]
+    content: dict = {}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, module in stand_ins.items():
+            patch.setitem(sys.modules, name, module)
+        exec(path.read_text(), content)
+        (node,) = content["generate_launch_description"]()
+    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
+    return of_publisher(node["arguments"])
+
+
+def of_urdf(path: Path) -> np.ndarray:
+    return yourdfpy.URDF.load(path).get_transform("optical", "tool0")
+
+
+def of_xacro(path: Path) -> np.ndarray:
+    """As xacro expands it: the macro's own defaults put in, then read as URDF."""
+    text = path.read_text()
+    for name, value in re.findall(r"(\w+):=(\S+?)[ \"]", text):
+        text = text.replace(f"${{{name}}}", value)
+    root = ElementTree.fromstring(text)
+    (macro,) = root.findall("{http://www.ros.org/wiki/xacro}macro")
+    robot = ElementTree.Element("robot", name="arm")
+    ElementTree.SubElement(robot, "link", name="tool0")
+    robot.extend(list(macro))
+    expanded = path.with_name("expanded.urdf")
+    ElementTree.ElementTree(robot).write(expanded)
+    return of_urdf(expanded)
+
+
+def of_calib(path: Path) -> np.ndarray:
+    content = yaml.safe_load(path.read_text())
+    named = content["parameters"]
+    assert named["calibration_type"] == "eye_in_hand" and named["name"] == path.stem
+    assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("base_link", "tool0")
+    assert named["tracking_base_frame"] == "optical"
+    at, turn = content["transform"]["translation"], content["transform"]["rotation"]
+    return of_quat(*(at[axis] for axis in "xyz"), *(turn[axis] for axis in "xyzw"))
+
+
+def of_pose(path: Path) -> np.ndarray:
+    content = yaml.safe_load(path.read_text())
+    assert content["header"]["frame_id"] == "tool0"
+    at, turn = content["pose"]["pose"]["position"], content["pose"]["pose"]["orientation"]
+    return of_quat(*(at[axis] for axis in "xyz"), *(turn[axis] for axis in "xyzw"))
+
+
+READERS = {
+    "hand_eye.launch.xml": (ros.ros2_launch, of_launch_xml),
+    "hand_eye.launch.py": (ros.moveit_launch, of_launch_py),
+    "hand_eye.urdf": (ros.urdf, of_urdf),
+    "hand_eye.xacro": (ros.xacro, of_xacro),
+    "hand_eye.calib": (lambda mount: ros.easy_handeye2(mount, "hand_eye"), of_calib),
+    "hand_eye.yaml": (ros.pose_with_covariance, of_pose),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("doubt", [None, DOUBT])
+def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt: str | None, tmp_path: Path):
+    write, read = READERS[name]
+    path = tmp_path / name
+    path.write_text(write(mount(doubt)))
+    np.testing.assert_allclose(read(path), PARENT_FROM_CHILD, atol=1e-9)
+    first = path.read_text()[:300]
+    assert "optical in tool0" in first and "metres, radians" in first
+    assert ("NOT TO BE TRUSTED: scale: every view" in first) == (doubt is not None)
+
+
+def test_static_transform_publisher_line_holds_the_transform():
+    line = ros.static_transform_publisher("tool0", "optical", PARENT_FROM_CHILD)
+    assert line.startswith("ros2 run tf2_ros static_transform_publisher ")
+    np.testing.assert_allclose(of_publisher(line.split()[4:]), PARENT_FROM_CHILD, atol=1e-9)
+
+
+def test_root_link_has_the_axes_of_rep_103():
+    # Looking forward (x of the root), the optical frame has z there, x to the right (-y) and y down (-z).
+    np.testing.assert_array_equal(ros.ROOT_FROM_OPTICAL[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    root = ros.on_root(mount(), "camera_link")
+    assert (root.parent, root.child) == ("tool0", "camera_link")
+    np.testing.assert_allclose(root.parent_from_child @ ros.ROOT_FROM_OPTICAL, PARENT_FROM_CHILD, atol=1e-12)
+
+
+def test_root_link_of_a_camera_with_an_offset_and_its_covariance():
+    root_from_optical = transform(rotation_exp(np.array([0.1, 0.2, -1.4])), np.array([0.01, -0.06, 0.02]))
+    errors = 1e-6 * np.random.default_rng(1).normal(size=(6, 6))
+    exact = ros.camera_mount(PARENT_FROM_CHILD, np.zeros((7, 7)), "tool0", "optical")
+    moved = np.zeros((6, 6))
+    for k, error in enumerate(errors):
+        true = transform(
+            rotation_exp(error[3:]) @ PARENT_FROM_CHILD[:3, :3], PARENT_FROM_CHILD[:3, 3] + error[:3]
+        )
+        here = ros.on_root(exact, "link", root_from_optical).parent_from_child
+        there = true @ inverse(root_from_optical)
+        np.testing.assert_allclose(here @ root_from_optical, PARENT_FROM_CHILD, atol=1e-12)
+        moved[k, :3] = there[:3, 3] - here[:3, 3]
+        moved[k, 3:] = Rotation.from_matrix(there[:3, :3] @ here[:3, :3].T).as_rotvec()
+    covariance = np.zeros((7, 7))
+    covariance[:6, :6] = errors.T @ errors
+    found = ros.on_root(
+        ros.camera_mount(PARENT_FROM_CHILD, covariance, "tool0", "optical"), "link", root_from_optical
+    )
+    np.testing.assert_allclose(found.covariance, moved.T @ moved, rtol=1e-4, atol=1e-17)
+
+
+def test_covariance_is_six_by_six_in_the_order_of_ros():
+    written = yaml.safe_load(ros.pose_with_covariance(mount()))["pose"]["covariance"]
+    root = np.random.default_rng(0).normal(size=(7, 7))
+    np.testing.assert_allclose(np.reshape(written, (6, 6)), (root @ root.T)[:6, :6], atol=1e-12)
+
+
+def test_camera_info_is_what_image_proc_reads():
+    lens = Intrinsics(601.5, 602.5, 318.0, 244.0, 640, 480, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
+    content = yaml.safe_load(ros.camera_info(mount(), lens))
+    assert (content["image_width"], content["image_height"]) == (640, 480)
+    assert content["distortion_model"] == "plumb_bob"
+
+    def matrix(name: str) -> np.ndarray:
+        part = content[name]
+        return np.reshape(part["data"], (part["rows"], part["cols"]))
+
+    np.testing.assert_array_equal(matrix("camera_matrix"), lens.matrix)
+    np.testing.assert_array_equal(matrix("projection_matrix"), np.column_stack([lens.matrix, np.zeros(3)]))
+    np.testing.assert_array_equal(matrix("rectification_matrix"), np.eye(3))
+    # OpenCV, whose order of coefficients plumb_bob takes, projects where our lens does.
+    x = np.array([[0.2, -0.15, 1.0]])
+    seen, _ = cv2.projectPoints(
+        x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")
+    )
+    np.testing.assert_allclose(seen[0, 0], distort(lens, x[0, :2]), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü"])
+def test_names_that_are_no_frames_are_refused(name: str):
+    with pytest.raises(InputError, match="frame"):
+        ros.camera_mount(PARENT_FROM_CHILD, np.eye(7), "tool0", name)
+
+
+def test_a_frame_cannot_be_its_own_parent():
+    with pytest.raises(InputError, match="different"):
+        ros.camera_mount(PARENT_FROM_CHILD, np.eye(7), "tool0", "tool0")
+    with pytest.raises(InputError, match="root"):
+        ros.on_root(mount(), "optical")
+
+
+LENS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3, -2e-3, 0.02))
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> PosedImages:
+    """Three noisy pictures through a lens with all five coefficients, and the exact pixels of 60 points."""
+    rng = np.random.default_rng(5)
+    folder = tmp_path / "capture"
+    images = ("left/0.png", "left/1.png", "right/0.png")
+    for image in images:
+        (folder / image).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 255, (240, 320, 3), np.uint8)).save(folder / image)
+    points = rng.uniform([0.4, -0.2, 0.0], [0.7, 0.2, 0.1], (60, 3))
+    down = rotation_exp(np.array([np.pi, 0.0, 0.0]))
+    poses = np.stack(
+        [
+            transform(rotation_exp(0.15 * rng.normal(size=3)) @ down, np.array([0.55, y, 0.6 + 0.05 * y]))
+            for y in (-0.1, 0.0, 0.1)
+        ]
+    )
+    x_px = []
+    for base_from_camera in poses:
+        x = apply(inverse(base_from_camera), points)
+        x_px.append(distort(LENS, x[:, :2] / x[:, 2:]))
+    x_px = np.concatenate(x_px)
+    inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
+    assert inside.sum() > 100
+    tracks = Tracks(
+        np.repeat(np.arange(3), 60)[inside], x_px[inside], np.tile(np.arange(60), 3)[inside], points
+    )
+    return PosedImages(folder, images, poses, LENS, tracks, points)
+
+
+@pytest.mark.parametrize("undistorted", [False, True])
+@pytest.mark.parametrize("read", ["read_binary", "read_text"])
+def test_colmap_model_reprojects_its_points_exactly(
+    views: PosedImages, undistorted: bool, read: str, tmp_path: Path
+):
+    out = tmp_path / "model"
+    write_colmap(out, views, Provenance("base_link", DOUBT), undistorted, link=False)
+    model = pycolmap.Reconstruction()
+    getattr(model, read)(str(out / "sparse" / "0"))
+    assert model.num_images() == 3
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 1e-6
+    found = np.array([point.xyz for point in model.points3D.values()])
+    nearest, _ = cKDTree(views.points_in_base).query(found)
+    assert len(found) > 30 and nearest.max() < 1e-9
+    for image in model.images.values():
+        assert (out / "images" / image.name).is_file()
+        camera_from_base = image.cam_from_world().matrix()
+        expected = inverse(views.base_from_camera[image.image_id - 1])[:3]
+        np.testing.assert_allclose(camera_from_base, expected, atol=1e-9)
+    camera = next(iter(model.cameras.values()))
+    assert camera.model_name == ("PINHOLE" if undistorted else "FULL_OPENCV")
+    about = (out / "README.txt").read_text()
+    assert "frame: base_link\nunit: m\n" in about and "NOT TO BE TRUSTED" in about
+
+
+@pytest.mark.parametrize("undistorted", [False, True])
+def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
+    views: PosedImages, undistorted: bool, tmp_path: Path
+):
+    out = tmp_path / "splat"
+    n = len(views.points_in_base)
+    gray = np.full((n, 3), 90, np.uint8)
+    zeros = np.zeros(n, int)
+    ones = np.ones(n)
+    cloud = PointCloud(views.points_in_base, gray, ones, 0 * ones, zeros, zeros, np.zeros((1, 3)))
+    write_nerfstudio(out, views, cloud, Provenance("base_link"), undistorted, link=not undistorted)
+    content = json.loads((out / "transforms.json").read_text())
+    assert content["about"]["frame"] == "base_link" and content["about"]["unit"] == "m"
+    assert len(content["frames"]) == 3
+    matrix = np.array([[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]])
+    coefficients = np.array([content.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    for k, frame in enumerate(content["frames"]):
+        path = out / frame["file_path"]
+        assert path.is_symlink() == (not undistorted)
+        assert read_image(path).shape == (content["h"], content["w"], 3)
+        base_from_opengl = np.array(frame["transform_matrix"])
+        # x right, y up, z backward: the camera looks along -z.
+        base_from_camera = base_from_opengl @ np.diag([1.0, -1.0, -1.0, 1.0])
+        np.testing.assert_allclose(base_from_camera, views.base_from_camera[k], atol=1e-9)
+        mine = views.tracks.image == k
+        x = apply(inverse(base_from_camera), views.points_in_base[views.tracks.point[mine]])
+        seen = cv2.projectPoints(x, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+        x_px = views.tracks.x_px[mine]
+        if undistorted:
+            rays = undistort(LENS, x_px)
+            x_px = rays @ np.diag([content["fl_x"], content["fl_y"]]) + [content["cx"], content["cy"]] - 0.5
+        # There the first pixel's centre is at (0.5, 0.5).
+        np.testing.assert_allclose(seen, x_px + 0.5, atol=1e-6)
+    first = trimesh.load(out / content["ply_file_path"])
+    np.testing.assert_allclose(np.asarray(first.vertices), views.points_in_base, atol=1e-6)  # pyright: ignore
+
+
+def test_pictures_turned_by_a_tag_are_copied_upright(views: PosedImages, tmp_path: Path):
+    tag = Image.Exif()
+    tag[0x0112] = 3
+    source = views.folder / views.images[0]
+    pixels = read_image(source)
+    Image.fromarray(pixels).save(source, exif=tag)
+    write_colmap(tmp_path / "model", views, Provenance("base_link"), undistorted=False, link=True)
+    copied = tmp_path / "model" / "images" / "left_0.png"
+    assert not copied.is_symlink() and (copied.parent / "left_1.png").is_symlink()
+    np.testing.assert_array_equal(read_image(copied), pixels[::-1, ::-1])
+
+
+def export(done: Path, name: str, path: Path, *options: object) -> Path:
+    assert dispatch(["export", str(done), name, str(path), *map(str, options)]) == 0
+    return path
+
+
+def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
+    path = export(done, "ply", tmp_path / "out.ply", "--base-frame", "arm_base")
+    cloud, written = read_cloud(done / "cloud.ply"), read_cloud(path)
+    np.testing.assert_array_equal(written.label, cloud.label)
+    loaded = trimesh.load(path)
+    np.testing.assert_allclose(np.asarray(loaded.vertices), cloud.points_in_base, atol=1e-6)  # pyright: ignore
+    np.testing.assert_array_equal(np.asarray(loaded.colors)[:, :3], cloud.color)  # pyright: ignore
+    header = path.read_bytes()[:600].decode("latin-1")
+    assert "comment frame arm_base" in header and "comment unit m" in header
+
+
+def test_mesh_lies_on_the_true_surface_and_faces_free_space(
+    done: Path, true_mesh: trimesh.Trimesh, tmp_path: Path
+):
+    loaded = trimesh.load_scene(export(done, "glb", tmp_path / "map.glb"))
+    assert loaded.metadata["frame"] == "base_link" and loaded.metadata["unit"] == "m"
+    mesh = loaded.to_geometry()
+    assert isinstance(mesh, trimesh.Trimesh)
+    assert mesh.area > 0.3  # a table of 0.7 m by 0.8 m was in view
+    rows = np.random.default_rng(0).choice(
+        len(mesh.faces), 3000, p=mesh.area_faces / mesh.area, replace=False
+    )
+    _, distance, at = trimesh.proximity.closest_point(true_mesh, mesh.triangles_center[rows])
+    assert np.median(distance) < 0.003 and np.percentile(distance, 95) < 0.01
+    assert ((mesh.face_normals[rows] * true_mesh.face_normals[at]).sum(1) > 0).mean() > 0.9
+    # The colours are those of the nearest points of the cloud.
+    cloud = read_cloud(done / "cloud.ply")
+    near, at = cKDTree(cloud.points_in_base).query(mesh.vertices)
+    colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)  # pyright: ignore
+    off = np.abs(colors - cloud.color[at]).mean(1)
+    assert np.median(off[near < 0.003]) < 12
+
+
+def test_octomap_tells_free_from_occupied_from_unknown(
+    done: Path, scene: SceneMap, tabletop: Path, tmp_path: Path
+):
+    path = export(done, "octomap", tmp_path / "map.bt", "--voxel-size", 0.02)
+    assert b"# frame: base_link\n# unit: m\n" in path.read_bytes()[:200]
+    tree = pyoctomap.OcTree(1.0)  # pyright: ignore[reportAttributeAccessIssue]
+    assert tree.readBinary(str(path)) and tree.getResolution() == pytest.approx(0.02)
+    rng = np.random.default_rng(2)
+    x = rng.uniform(scene.box[0] + 0.02, scene.box[1] - 0.02, (100_000, 3))
+    said = tree.getLabels(x)  # 1 occupied, 0 free, -1 unknown
+    center = 0.02 * (np.floor(x / 0.02) + 0.5)
+    state = scene.check_spheres(center, 0.01, unknown="report")
+    np.testing.assert_array_equal(said, np.where(state == OCCUPIED, 1, np.where(state == FREE, 0, -1)))
+    # Against the truth: what is solid is never free, what is free is hardly ever occupied.
+    truth = read_truth(tabletop)
+    solid = solid_labels(make_scene("tabletop", truth.seed), x) > 0
+    assert (said[solid] == 0).mean() < 0.01
+    above = x[:, 2] > truth.table_height + max(thing.height for thing in truth.objects) + 0.03
+    seen = ~scene.query(x).unknown
+    assert (said[above] == 1).mean() < 0.005
+    assert (said[above & seen] == 0).mean() > 0.5 and (said[above & ~seen] == -1).mean() > 0.9
+
+
+@pytest.mark.parametrize("unknown", ["occupied", "free"])
+def test_esdf_voxels_hold_the_distance_at_their_centres(
+    done: Path, scene: SceneMap, unknown: str, tmp_path: Path
+):
+    path = export(done, "esdf", tmp_path / "esdf.npz", "--unknown", unknown, "--voxel-size", 0.015)
+    with np.load(path) as file:
+        grid = {name: file[name] for name in file.files}
+    assert (str(grid["frame"]), str(grid["unit"]), str(grid["unknown"])) == ("base_link", "m", unknown)
+    assert "positive outside" in str(grid["sign"]) and grid["voxel_size"] == 0.015
+    shape = np.array(grid["values"].shape)
+    np.testing.assert_allclose(grid["dims"], 0.015 * shape)
+    np.testing.assert_allclose(grid["pose"][:3] - grid["dims"] / 2 + 0.0075, grid["origin"], atol=1e-12)
+    np.testing.assert_array_equal(grid["pose"][3:], [1, 0, 0, 0])
+    at = np.random.default_rng(0).integers(0, shape, (5000, 3))
+    x = grid["origin"] + 0.015 * at
+    expected = scene.query(x, unknown).distance  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(grid["values"][tuple(at.T)], expected, atol=1e-6)
+    assert np.isfinite(grid["values"]).all() and grid["values"].min() < 0 < grid["values"].max()
+
+
+def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: SceneMap, tmp_path: Path):
+    with np.load(export(done, "spheres", tmp_path / "spheres.npz")) as file:
+        centers, radii, frame = file["centers"], file["radii"], str(file["frame"])
+    assert frame == "base_link" and radii.min() > 0 and len(radii) < 3000
+    x = np.random.default_rng(3).uniform(*scene.box, (100_000, 3))
+    distance = scene.query(x, "free").distance
+    covered = np.zeros(len(x), bool)
+    places = cKDTree(x)
+    for center, radius in zip(centers, radii, strict=True):
+        covered[places.query_ball_point(center, radius)] = True
+    assert covered[distance <= 0].all() and (distance <= 0).sum() > 1000
+    # The default excess is 2 cm; the interpolated distance changes a little faster than one goes.
+    assert distance[covered].max() < 0.025
+
+
+def test_run_exports_its_cameras_where_they_truly_were(done: Path, tabletop: Path, tmp_path: Path):
+    truth = read_truth(tabletop)
+    out = export(done, "colmap", tmp_path / "colmap")
+    model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+    assert model.compute_mean_reprojection_error() < 1.0
+    names = [Path(image).name for image in truth.images]
+    for image in model.images.values():
+        base_from_camera = truth.base_from_camera[names.index(image.name)]
+        assert np.linalg.norm(image.projection_center() - base_from_camera[:3, 3]) < 1e-3
+    heights = np.array([point.xyz[2] for point in model.points3D.values()])
+    assert abs(np.median(heights) - truth.table_height) < 0.02
+    out = export(done, "nerfstudio", tmp_path / "splat")
+    content = json.loads((out / "transforms.json").read_text())
+    for frame in content["frames"]:
+        base_from_camera = truth.base_from_camera[names.index(Path(frame["file_path"]).name)]
+        found = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(found[:3, 3], base_from_camera[:3, 3], atol=1e-3)
+        np.testing.assert_allclose(found[:3, 2], -base_from_camera[:3, 2], atol=2e-3)
+
+
+def test_command_gives_the_root_link_asked_for(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    gripper_from_camera = np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"])
+    options = ["--to-root", "camera_link", "--parent-frame", "flange"]
+    path = export(done, "urdf", tmp_path / "a.urdf", *options)
+    found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")
+    np.testing.assert_allclose(found @ ros.ROOT_FROM_OPTICAL, gripper_from_camera, atol=1e-9)
+    told = [0.0, 0.015, -0.002, -0.4977, 0.5023, -0.4977, 0.5023]
+    path = export(done, "urdf", tmp_path / "b.urdf", *options, "--root-from-optical", *told)
+    found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")
+    np.testing.assert_allclose(found @ of_quat(*told), gripper_from_camera, atol=1e-9)
+    export(done, "ros2", tmp_path / "c.launch.xml", *options)
+    assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
+
+
+def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json"):
+        (run / name).symlink_to(done / name)
+    content = json.loads((done / "calibration.json").read_text())
+    content |= {"converged": False, "warnings": [DOUBT, "and another"]}
+    (run / "calibration.json").write_text(json.dumps(content))
+    for row in FORMATS:
+        if row.name == "rerun":
+            continue  # needs an extra; tested where it is
+        assert dispatch(["export", str(run), row.name]) == 3
+        complaint = capsys.readouterr().err
+        assert DOUBT in complaint and "not to be trusted" in complaint
+        path = run / "export" / row.file
+        files = (
+            [path] if path.is_file() else [path / "README.txt", path / "transforms.json", path / "points.ply"]
+        )
+        files = [file for file in files if file.exists()]
+        assert files
+        for file in files:
+            if file.suffix == ".npz":
+                with np.load(file) as arrays:
+                    text = str(arrays["warning"]).encode()
+            else:
+                text = file.read_bytes()
+            assert b"NOT TO BE TRUSTED: scale: every view turns" in text, row.name
+    assert not [path for path in run.rglob("*") if ".part" in path.name]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "ros2"),
+        (["fbx"], "'fbx'"),
+        (["glb"], "jcr map"),
+        (["ply"], "jcr map"),
+        (["nerfstudio"], "no run"),
+        (["colmap"], "no run"),
+        (["urdf", "--child-frame", "tool0"], "different"),
+        (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
+        (["urdf", "--to-root", "a", "--root-from-optical", *"0000000"], "quaternion"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+):
+    """In a run folder that holds its calibration and nothing else."""
+    shutil.copy(done / "calibration.json", tmp_path)
+    assert dispatch(["export", str(tmp_path), *arguments]) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("error: ") and complaint.count("\n") == 1 and words in complaint
+    assert not (tmp_path / "export").exists()
+    if arguments in ([], ["fbx"]):
+        assert all(row.name in complaint for row in FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["octomap", "x.bt", "--voxel-size", "0.0005"], "million"),
+        (["octomap", "x.bt", "--voxel-size", "-1"], "voxels of"),
+        (["esdf", "x.npz", "--voxel-size", "5"], "voxels of"),
+        (["spheres", "x.npz", "--excess", "0"], "voxels of"),
+        (["esdf", ".", "--voxel-size", "0.05"], "folder"),
+        (["colmap", "."], "is there already"),
+    ],
+)
+def test_wrong_sizes_and_places_are_refused(
+    done: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    words: str,
+):
+    (tmp_path / "mine.txt").write_text("kept")
+    monkeypatch.chdir(tmp_path)
+    assert dispatch(["export", str(done), *options]) == 2
+    assert words in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_rerun_recording_is_read_by_rerun(done: Path, tmp_path: Path):
+    pytest.importorskip("rerun", reason="rerun-sdk is an extra of its own: pip install 'jcr[rerun]'")
+    path = export(done, "rerun", tmp_path / "run.rrd")
+    verified = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True, check=False
+    )
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_rerun_that_is_not_installed_is_named(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert dispatch(["export", str(done), "rerun", str(tmp_path / "run.rrd")]) == 2
+    assert "jcr[rerun]" in capsys.readouterr().err and not (tmp_path / "run.rrd").exists()

@@ -1,0 +1,219 @@
+"""What hostile bytes are fed to: every reader, with a valid file of its format to start from."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import capture_writers as writers
+from benchmarks.bag import write_bag
+from jcr.calibration.calibration_json import (
+    calibration_file,
+    read_calibration,
+    read_hand_eye,
+    write_calibration,
+)
+from jcr.calibration.stage import calibrate_poses
+from jcr.capture import capture_json
+from jcr.capture.camera_info import read_camera_info
+from jcr.capture.images import read_image
+from jcr.capture.lerobot_files import read_episode
+from jcr.capture.options import ReadOptions
+from jcr.capture.read import read_source
+from jcr.cli.query import read_points
+from jcr.export.points import read_cloud, write_cloud
+from jcr.geometry import inverse
+from jcr.reconstruct.dust3r.weights import load_weights
+from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
+from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
+from jcr.records import Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
+from jcr.represent.build import build_scene
+from jcr.represent.options import MapOptions
+from jcr.represent.scene import load_map
+from jcr.simulate.problem import hand_eye_problem
+
+SIZE = (16, 12)
+COUNT = 4
+NAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=3)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file that is changed, and who reads it."""
+
+    file: Path
+    """Valid as it is."""
+    read: Callable[[Path], object]
+    """Of that file."""
+
+    def feed(self, data: bytes) -> object:
+        """What the reader makes of these bytes."""
+        self.file.write_bytes(data)
+        return self.read(self.file)
+
+
+def small_capture(folder: Path) -> Capture:
+    """Four tiny pictures, and poses of a hand-eye problem."""
+    (folder / "images").mkdir(parents=True)
+    draw = np.random.default_rng(0)
+    images = tuple(f"images/{k}.png" for k in range(COUNT))
+    for name in images:
+        Image.fromarray(draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)).save(folder / name)
+    poses = hand_eye_problem(draw, COUNT).base_from_gripper
+    lens = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
+    capture = Capture(folder, images, poses, SIZE, lens)
+    capture_json.write(folder, capture)
+    return capture
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """Every reader's target, its valid file in a folder of its own below `folder`."""
+    found: dict[str, Target] = {}
+    capture = small_capture(folder / "capture")
+    cameras = capture.base_from_gripper @ hand_eye_problem(np.random.default_rng(1), 3).gripper_from_camera
+
+    def whole(path: Path) -> Callable[[Path], object]:
+        return lambda file: read_source(path, NAMES, into=path.parent / "frames")
+
+    found["capture.json"] = Target(folder / "capture" / "capture.json", capture_json.read)
+    for name, write in (
+        ("poses.csv", lambda place: writers.write_table(place, capture)),
+        (
+            "poses.tsv",
+            lambda place: writers.write_table(place, capture, "rpy", "image,x,y,z,roll,pitch,yaw", "\t"),
+        ),
+        ("poses.npy", lambda place: writers.write_npy(place, capture)),
+        ("poses.txt", lambda place: writers.write_tum(place, capture)),
+        ("cal_data.yaml", lambda place: writers.write_industrial(place, capture)),
+        ("transforms.json", lambda place: writers.write_transforms(place, capture, cameras)),
+    ):
+        write(folder / name.replace(".", "-"))
+        place = folder / name.replace(".", "-")
+        found[name] = Target(place / name, whole(place))
+    place = folder / "cal_data-yaml"
+    found["pose.yaml"] = Target(place / "pose_0.yaml", whole(place))
+    for name, write in (
+        ("samples.yaml", writers.write_moveit),
+        ("wrist.samples", writers.write_easy_handeye2),
+    ):
+        place = folder / name.replace(".", "-")
+        write(place, capture.base_from_gripper, cameras)
+        found[name] = Target(place / name, whole(place / name))
+    place = folder / "camera_info"
+    place.mkdir()
+    writers.write_camera_info(capture, place)
+    found["camera_info.yaml"] = Target(place / "camera_info.yaml", lambda file: read_camera_info(file, SIZE))
+    found |= pictures(folder / "pictures") | results(folder / "results", capture, cameras)
+    found |= networks(folder / "networks") | recordings(folder / "recordings", capture)
+    place = folder / "colmap"
+    writers.write_colmap(place, capture, cameras)
+    for name in ("cameras.bin", "images.bin"):
+        found[name] = Target(place / "sparse" / "0" / name, whole(place))
+    return found
+
+
+def pictures(folder: Path) -> dict[str, Target]:
+    """A picture in each format that cameras write."""
+    folder.mkdir()
+    pixels = np.random.default_rng(2).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    names = [f"picture.{ending}" for ending in ("png", "jpg", "tif", "bmp", "webp", "gif")]
+    for name in names:
+        Image.fromarray(pixels).save(folder / name)
+    return {name: Target(folder / name, read_image) for name in names}
+
+
+def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Target]:
+    """The files of a run folder that are read again."""
+    folder.mkdir()
+    draw = np.random.default_rng(3)
+    pairs = PosePairs(capture.folder, capture.images, capture.base_from_gripper, cameras, True)
+    found = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
+    write_calibration(folder / "calibration.json", found)
+    height, width = SIZE[1], SIZE[0]
+    tracks = Tracks(np.zeros(2, int), draw.random((2, 2)), np.arange(2), draw.random((2, 3)))
+    assert capture.intrinsics is not None
+    reconstruction = Reconstruction(
+        image_index=np.arange(COUNT),
+        recon_from_camera=cameras,
+        intrinsics=capture.intrinsics,
+        pointmap_intrinsics=capture.intrinsics,
+        points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
+        confidence=np.ones((COUNT, height, width), np.float32),
+        colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        tracks=tracks,
+        backend="colmap",
+    )
+    write_reconstruction(folder / "reconstruction.npz", reconstruction)
+    ones = np.ones(200)
+    cloud = PointCloud(
+        points_in_base=draw.random((200, 3)),
+        color=np.zeros((200, 3), np.uint8),
+        confidence=ones,
+        margin=ones,
+        label=ones.astype(int),
+        image=np.zeros(200, int),
+        camera_centers_in_base=inverse(cameras)[:, :3, 3],
+        label_names=("none", "cup"),
+    )
+    write_cloud(folder / "cloud.ply", cloud)
+    (folder / "run.json").write_text(json.dumps({"capture": "x", "reconstruct": "y", "options": {}}))
+    (folder / "reference.json").write_text(
+        json.dumps({"gripper_from_camera": capture.base_from_gripper[0].tolist()})
+    )
+    (folder / "points.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
+    np.save(folder / "points.npy", draw.random((4, 3)))
+    write_cloud(folder / "points.ply", cloud)
+    build_scene(cloud, MapOptions(cell=0.2, max_seconds=0.1)).save(folder / "map.safetensors")
+    readers: dict[str, Callable[[Path], object]] = {
+        "calibration.json": read_calibration,
+        "reconstruction.npz": read_reconstruction,
+        "cloud.ply": read_cloud,
+        "map.safetensors": load_map,
+        "reference.json": read_hand_eye,
+        "points.csv": read_points,
+        "points.npy": read_points,
+        "points.ply": read_points,
+    }
+    return {name: Target(folder / name, read) for name, read in readers.items()}
+
+
+def networks(folder: Path) -> dict[str, Target]:
+    """What networks leave, or are."""
+    folder.mkdir()
+    shape = (2, 4, 4)
+    arrays = {name: np.zeros((*shape, 3), np.float32) for name in ("pts3d", "pts3d_in_other_view")}
+    arrays |= {name: np.ones(shape, np.float32) for name in ("conf", "conf2")}
+    np.savez(folder / "pairs.npz", edges=np.array([[0, 1], [1, 0]]), allow_pickle=False, **arrays)
+    torch.save({"model": {"weight": torch.zeros(4)}}, folder / "weights.pth")
+    return {
+        "pairs.npz": Target(
+            folder / "pairs.npz", lambda file: pairs_from_arrays(read_arrays(file), file.name)
+        ),
+        "weights.pth": Target(folder / "weights.pth", lambda file: load_weights(str(file), "cpu")),
+    }
+
+
+def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
+    """Data that robots record."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    (folder / "set" / "data").mkdir(parents=True)
+    table = folder / "set" / "data" / "0.parquet"
+    columns = {"timestamp": [0.0, 0.1], "episode_index": [0, 0], "state": [[0.0, 1.0], [2.0, 3.0]]}
+    pq.write_table(pa.table(columns), table)
+    info = {"codebase_version": "v2.1", "total_episodes": 1, "data_path": "data/0.parquet"}
+    info |= {"video_path": "videos/0.mp4", "fps": 10, "features": {"state": {"shape": [2]}}}
+    info["features"]["wrist"] = {"dtype": "video"}
+    found = {
+        "episode.parquet": Target(table, lambda file: read_episode(folder / "set", info, "wrist", "state", 0))
+    }
+    for kind, name, bag in (("mcap", "scan.mcap", "scan"), ("ros1", "scan.bag", "scan.bag")):
+        file = write_bag(folder / bag, capture, kind, 2.0, fps=4.0, tf_hz=10.0)
+        file = next(file.glob("*.mcap")) if file.is_dir() else file
+        found[name] = Target(file, lambda file: read_source(file, NAMES, into=file.parent / "frames"))
+    return found

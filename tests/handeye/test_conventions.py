@@ -1,0 +1,116 @@
+"""Each way of writing poses wrongly is named, and sound poses never are."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jcr.calibration.calibration_json import calibration_file
+from jcr.geometry import inverse, transform
+from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.next_poses import next_poses
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import PosePairs
+from jcr.simulate.problem import hand_eye_problem
+
+
+def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:
+    return transform(rotation.as_matrix(), poses[:, :3, 3])
+
+
+def rotations(poses: np.ndarray) -> Rotation:
+    return Rotation.from_matrix(poses[:, :3, :3])
+
+
+def reordered_quaternion(poses: np.ndarray, order: list[int]) -> np.ndarray:
+    return with_rotation(poses, Rotation.from_quat(rotations(poses).as_quat()[:, order]))
+
+
+MISTAKES = {
+    "inverses": (inverse, "inverse"),
+    "reversed": (lambda g: g[::-1].copy(), "reverse order"),
+    "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
+    "early by one": (lambda g: np.roll(g, -1, 0), "1 behind the images"),
+    "w first": (lambda g: reordered_quaternion(g, [3, 0, 1, 2]), "quaternions w, x, y, z"),
+    "w last": (lambda g: reordered_quaternion(g, [1, 2, 3, 0]), "quaternions x, y, z, w"),
+    "Euler order": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", rotations(g).as_euler("ZYX"))),
+        "Euler angles ZYX that were taken as xyz",
+    ),
+    "vectors, degrees for radians": (
+        lambda g: with_rotation(g, Rotation.from_rotvec(np.degrees(rotations(g).as_rotvec()))),
+        "rotation vectors in degrees that were taken as radians",
+    ),
+    "vectors, radians for degrees": (
+        lambda g: with_rotation(g, Rotation.from_rotvec(np.radians(rotations(g).as_rotvec()))),
+        "rotation vectors in radians that were taken as degrees",
+    ),
+    "angles, degrees for radians": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.degrees(rotations(g).as_euler("xyz")))),
+        r"Euler angles \(xyz\) in degrees that were taken as radians",
+    ),
+    "angles, radians for degrees": (
+        lambda g: with_rotation(g, Rotation.from_euler("xyz", np.radians(rotations(g).as_euler("xyz")))),
+        r"Euler angles \(xyz\) in radians that were taken as degrees",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_each_mistake_is_named(mistake: str):
+    write, words = MISTAKES[mistake]
+    problem = hand_eye_problem(
+        np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4), camera_noise=(1e-4, 1e-4)
+    )
+    found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
+    assert found is not None
+    assert re.search(words, explained(found))
+    assert found[0].translation_mm < 1.0 < found[1].translation_mm
+
+
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
+def test_sound_poses_are_left_alone(noise):
+    for seed in range(2):
+        problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=noise)
+        assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None
+
+
+def test_proposed_poses_keep_their_promise_and_stay_in_reach():
+    rng = np.random.default_rng(2)
+    problem = hand_eye_problem(rng, 5)
+    reach = np.array([[0.2, -0.4, 0.2], [0.8, 0.4, 0.8]])
+    now, proposed = next_poses(
+        problem.base_from_gripper, 3, problem.gripper_from_camera, (5e-4, np.radians(0.1)), reach
+    )
+    assert len(proposed) == 3
+    last = now
+    for pose in proposed:
+        assert (pose.expected_std < last + 1e-12).all()
+        last = pose.expected_std
+        position = pose.base_from_gripper[:3, 3]
+        assert (position >= reach[0] - 0.01).all() and (position <= reach[1] + 0.01).all()
+    assert last[:3].max() < 0.75 * now[:3].max()
+
+
+def test_a_planar_capture_is_told_to_tilt():
+    problem = hand_eye_problem(np.random.default_rng(3), 8, "planar")
+    now, proposed = next_poses(problem.base_from_gripper, 2, problem.gripper_from_camera)
+    down = problem.base_from_gripper[0, 2, :3]
+    tilt = [np.degrees(np.arccos(pose.base_from_gripper[2, :3] @ down)) for pose in proposed]
+    assert max(tilt) > 10.0
+    assert proposed[-1].expected_std[:3].max() < 0.02 * now[:3].max()
+
+
+def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
+    noise = (0.03, np.radians(4.0))
+    problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
+    names = tuple(f"{k}.png" for k in range(12))
+    pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    assert not found.converged
+    promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
+    used = problem.base_from_gripper[found.inliers]
+    _, proposed = next_poses(used, 2, problem.gripper_from_camera, noise)
+    assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)

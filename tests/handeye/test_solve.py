@@ -1,0 +1,321 @@
+"""The calibration from poses: known answers, invariances, outliers, coverage, degenerate motions."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2, f
+
+import jcr
+from jcr.geometry import adjoint, inverse, rotation_between_deg, rotation_exp, scale_translation, transform
+from jcr.handeye.closed_form import closed_form
+from jcr.handeye.equation import residuals, residuals_by_camera
+from jcr.handeye.fit import Cues, fit_poses
+from jcr.handeye.noise import NoiseShare, widened
+from jcr.simulate.problem import error, hand_eye_problem, unit_similarity
+
+NOISE = (5e-4, np.radians(0.1))
+
+
+@pytest.mark.parametrize("count", [3, 5, 10])
+@pytest.mark.parametrize("pattern", ["varied"])
+def test_exact_poses_give_the_exact_answer(count, pattern):
+    for seed in range(10):
+        problem = hand_eye_problem(np.random.default_rng(seed), count, pattern)
+        weights = np.ones(count)
+        x, scale, _ = closed_form(problem.base_from_gripper, problem.recon_from_camera, weights)
+        assert np.abs(error(problem, x, scale)).max() < 1e-7
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert np.abs(error(problem, solved.gripper_from_camera, solved.scale)).max() < 1e-8
+
+
+def test_half_turns_do_not_flip_the_answer():
+    rng = np.random.default_rng(3)
+    problem = hand_eye_problem(rng, 8)
+    # Every second view is half a turn (to 1e-9) about a skew axis from its neighbour.
+    turns = np.pi * rng.normal(size=(8, 3))
+    turns *= (np.pi - 1e-9) / np.linalg.norm(turns, axis=1, keepdims=True)
+    gripper = problem.base_from_gripper.copy()
+    gripper[1::2] = gripper[0::2] @ transform(rotation_exp(turns[1::2]), rng.normal(size=(4, 3)))
+    x = problem.gripper_from_camera
+    camera = scale_translation(gripper @ x, 1 / problem.scale)
+    found, scale, _ = closed_form(gripper, camera, np.ones(8))
+    assert np.abs(error(problem, found, scale)).max() < 1e-8
+
+
+def test_a_similarity_of_the_reconstruction_changes_nothing_but_scale():
+    rng = np.random.default_rng(4)
+    problem = hand_eye_problem(rng, 9, robot_noise=NOISE)
+    before = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    moved, factor = unit_similarity(problem.recon_from_camera, rng)
+    after = jcr.solve_hand_eye(problem.base_from_gripper, moved)
+    assert np.allclose(before.gripper_from_camera, after.gripper_from_camera, atol=1e-8)
+    assert after.scale * factor == pytest.approx(before.scale, rel=1e-8)
+    assert np.allclose(before.covariance, after.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_the_order_of_images_does_not_matter_to_the_last_bit():
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 12, robot_noise=NOISE)
+    problem.base_from_gripper[4, :3, 3] += 0.05
+    before = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    order = rng.permutation(12)
+    after = jcr.solve_hand_eye(problem.base_from_gripper[order], problem.recon_from_camera[order])
+    assert (before.gripper_from_camera == after.gripper_from_camera).all()
+    assert before.scale == after.scale
+    assert (before.inliers[order] == after.inliers).all()
+
+
+def test_agrees_with_opencv_where_scale_is_known():
+    problem = hand_eye_problem(np.random.default_rng(6), 12, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale)
+    camera_from_recon = np.linalg.inv(camera)
+    rotation, translation = cv2.calibrateHandEye(
+        list(gripper[:, :3, :3]),
+        list(gripper[:, :3, 3]),
+        list(camera_from_recon[:, :3, :3]),
+        list(camera_from_recon[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    solved = jcr.solve_hand_eye(gripper, camera)
+    assert rotation_between_deg(rotation, solved.gripper_from_camera[:3, :3]) < 0.2
+    assert np.linalg.norm(translation[:, 0] - solved.gripper_from_camera[:3, 3]) < 2e-3
+    assert solved.scale == pytest.approx(1.0, abs=5e-3)
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(10, 3), (15, 4), (20, 6)])
+@pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
+def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
+    for seed in range(4):
+        rng = np.random.default_rng([seed, count])
+        problem = hand_eye_problem(rng, count, robot_noise=NOISE)
+        clean = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        bad = rng.choice(count, wrong, replace=False)
+        gripper = problem.base_from_gripper.copy()
+        if kind == "shuffled":
+            gripper[bad] = problem.base_from_gripper[np.roll(bad, 1)]
+        elif kind == "stale":
+            gripper[bad] = problem.base_from_gripper[(bad - 1) % count]
+        else:
+            mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+            gripper[bad] = mirror @ gripper[bad] @ mirror
+        solved = jcr.solve_hand_eye(gripper, problem.recon_from_camera)
+        assert sorted(np.flatnonzero(~solved.inliers)) == sorted(bad)
+        assert [reason is not None for reason in solved.reasons] == list(~solved.inliers)
+        assert solved.converged
+        # Fewer images know less, but the wrong ones must not pull.
+        both = solved.covariance + clean.covariance
+        gap = error(problem, solved.gripper_from_camera, solved.scale) - error(
+            problem, clean.gripper_from_camera, clean.scale
+        )
+        assert gap @ np.linalg.solve(both, gap) < chi2.ppf(0.999, 7)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_the_95_percent_ellipsoid_covers_95_percent(given):
+    inside = np.zeros(2)
+    runs = 250
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
+        solved = jcr.solve_hand_eye(
+            problem.base_from_gripper, problem.recon_from_camera, robot_noise=NOISE if given else None
+        )
+        missed = error(problem, solved.gripper_from_camera, solved.scale)
+        for k, part in enumerate((slice(0, 7), slice(0, 6))):
+            squared = missed[part] @ np.linalg.solve(solved.covariance[part, part], missed[part])
+            inside[k] += squared < chi2.ppf(0.95, part.stop)
+    assert (inside / runs >= 0.90).all() and (inside / runs <= 0.98).all()
+
+
+def test_three_images_do_not_promise_too_much():
+    """Few degrees of freedom tell how noisy the robot is, and this one's noises are in no usual relation."""
+    inside, runs = 0, 100
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([7, seed]), 3, robot_noise=(5e-4, np.radians(0.01)))
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        missed = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
+    # One count of degrees of freedom for both noises gives 70.
+    assert inside >= 93
+
+
+def test_an_image_that_is_given_twice_is_one():
+    problem = hand_eye_problem(np.random.default_rng(13), 5, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    twice = [0, 1, 2, 3, 4, 2]
+    once, doubled = jcr.solve_hand_eye(gripper, camera), jcr.solve_hand_eye(gripper[twice], camera[twice])
+    assert (doubled.covariance == once.covariance).all()
+    assert (doubled.gripper_from_camera == once.gripper_from_camera).all()
+    assert (doubled.translation_residual_m == once.translation_residual_m[twice]).all()
+
+
+def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
+    given, inside, runs = (1e-4, np.radians(0.02)), 0, 50
+    for seed in range(runs):
+        problem = hand_eye_problem(np.random.default_rng([8, seed]), 6, "varied", given, NOISE)
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
+        missed = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
+        assert solved.robot_noise.estimated
+        assert any("more than the robot noise that was given" in warning for warning in solved.warnings)
+    # Binomial: 47.5 ± 1.5; none where the given noise is believed.
+    assert inside >= 42
+
+
+def test_a_covariance_is_widened_by_what_hangs_on_the_noise_and_how_little_is_known_of_it():
+    root = np.random.default_rng(9).normal(size=(7, 7)) * np.logspace(-4, 0, 7)[:, None]
+    covariance, none, nu = root @ root.T, np.zeros((7, 7)), 5.0
+    of_log = np.diag([2 / nu, 1e6])
+    alone = widened(covariance, NoiseShare(np.stack([covariance, none]), of_log))
+    assert np.allclose(alone, covariance * 7 * f.ppf(0.99, 7, nu) / chi2.ppf(0.99, 7), rtol=1e-6)
+    # A noise of which nothing is known widens nothing where nothing hangs on it.
+    assert np.allclose(widened(covariance, NoiseShare(np.stack([none, none]), of_log)), covariance, rtol=1e-6)
+    both = widened(covariance, NoiseShare(np.stack([covariance / 2, covariance / 2]), np.eye(2) * 2 / nu))
+    assert np.allclose(both, covariance * 7 * f.ppf(0.99, 7, 2 * nu) / chi2.ppf(0.99, 7), rtol=1e-6)
+
+
+def test_residuals_by_camera_match_finite_differences():
+    problem = hand_eye_problem(np.random.default_rng(10), 4, robot_noise=NOISE)
+    camera = problem.recon_from_camera
+    x = problem.gripper_from_camera
+    base_from_recon = (
+        problem.true_base_from_gripper[0] @ x @ inverse(scale_translation(camera[0], problem.scale))
+    )
+    of_all = (x, problem.scale, base_from_recon)
+    by_camera = residuals_by_camera(*of_all, camera) @ adjoint(camera)
+    for k, motion in enumerate(1e-6 * np.eye(6)):
+        ahead, behind = (
+            residuals(*of_all, problem.base_from_gripper, camera @ transform(rotation_exp(m[3:]), m[:3]))[0]
+            for m in (motion, -motion)
+        )
+        # The logarithm's derivative is one but for the size of the residuals.
+        assert np.allclose(by_camera[:, :, k], (ahead - behind) / 2e-6, atol=5e-3)
+
+
+def test_covariance_matches_a_jackknife_over_images():
+    problem = hand_eye_problem(np.random.default_rng(8), 30, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    full = jcr.solve_hand_eye(gripper, camera)
+    start = (full.gripper_from_camera, full.scale, full.base_from_recon)
+    noise = (full.robot_noise.translation, full.robot_noise.rotation)
+    left_out = []
+    for k in range(30):
+        fit = fit_poses(gripper, camera, start, ~np.eye(30, dtype=bool)[k], noise)
+        left_out.append(error(problem, fit.gripper_from_camera, fit.scale))
+    jackknife = 29 / 30 * ((np.array(left_out) - np.mean(left_out, 0)) ** 2).sum(0)
+    ratio = np.sqrt(jackknife / np.diag(full.covariance))
+    assert (ratio > 0.6).all() and (ratio < 1.6).all()
+
+
+def test_held_out_error_is_that_of_a_fit_without_the_image():
+    problem = hand_eye_problem(np.random.default_rng(9), 8, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    full = jcr.solve_hand_eye(gripper, camera)
+    start = (full.gripper_from_camera, full.scale, full.base_from_recon)
+    noise = (full.robot_noise.translation, full.robot_noise.rotation)
+    missed = [
+        np.linalg.norm(
+            fit_poses(gripper, camera, start, ~np.eye(8, dtype=bool)[k], noise).translation_residual[k]
+        )
+        for k in range(8)
+    ]
+    assert full.held_out is not None
+    assert full.held_out.translation_mm == pytest.approx(1e3 * np.mean(missed), rel=0.03)
+
+
+UNSEEN = {
+    "two": "two images share",
+    "translation": "pure translation",
+    "one-axis": "one fixed axis",
+    "planar": "planar or SCARA",
+    "orbit": "look-at orbit",
+    # A tool point that happens to lie on the optical axis makes an orbit of the pivot.
+    "pivot": "all views turn about one",
+    "camera-centre": "its own centre",
+}
+
+
+@pytest.mark.parametrize("pattern", UNSEEN)
+@pytest.mark.parametrize("deviation_deg", [0.0, 3.0])
+@pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
+def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
+    for seed in range(5):
+        problem = hand_eye_problem(
+            np.random.default_rng(seed), 10, pattern, noise, deviation=np.radians(deviation_deg)
+        )
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert not solved.converged
+        assert not solved.observability.observable
+        assert UNSEEN[pattern] in " ".join(solved.observability.unobservable)
+        assert solved.observability.advice
+        nearly = any("nearly" in name for name in solved.observability.unobservable)
+        assert nearly or deviation_deg == 0.0 or pattern == "two"
+
+
+def test_general_motion_is_never_called_degenerate():
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+        assert solved.observability.observable, (seed, solved.observability)
+        assert solved.converged
+
+
+def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
+    planar = hand_eye_problem(np.random.default_rng(10), 10, "planar", NOISE)
+    down = planar.true_base_from_gripper[0, 2, :3]  # the base's z axis in the gripper frame
+    height = float(down @ planar.gripper_from_camera[:3, 3])
+    solved = jcr.solve_hand_eye(
+        planar.base_from_gripper, planar.recon_from_camera, cues=Cues(offset=(down, height, 1e-3))
+    )
+    assert solved.converged
+    assert np.linalg.norm(error(planar, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
+
+    orbit = hand_eye_problem(np.random.default_rng(11), 10, "orbit", NOISE)
+    solved = jcr.solve_hand_eye(
+        orbit.base_from_gripper, orbit.recon_from_camera, cues=Cues(scale=(orbit.scale, 1e-3))
+    )
+    assert solved.converged
+    assert np.linalg.norm(error(orbit, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
+
+
+def test_poses_that_belong_to_other_pictures_are_not_trusted():
+    rng = np.random.default_rng(12)
+    problem = hand_eye_problem(rng, 10)
+    solved = jcr.solve_hand_eye(problem.base_from_gripper[rng.permutation(10)], problem.recon_from_camera)
+    assert not solved.converged
+    assert "jcr check" in " ".join(solved.warnings)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "camera", "words"),
+    [
+        (np.eye(4), np.eye(4), "shape"),
+        (np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), "4 camera poses for 3"),
+        (np.tile(np.eye(4), (1, 1, 1)), np.tile(np.eye(4), (1, 1, 1)), "1 pose"),
+        (np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), "0 pose"),
+        (np.full((3, 4, 4), np.nan), np.tile(np.eye(4), (3, 1, 1)), "NaN"),
+        ("poses", "poses", "not numbers"),
+    ],
+)
+def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
+    with pytest.raises(jcr.InputError, match=words):
+        jcr.solve_hand_eye(gripper, camera)
+
+
+def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
+    """The larger half of what three images leave open is how far the robot's poses scatter."""
+    noise = (5e-4, np.radians(0.1))
+    trusted = {"estimated": 0, "given": 0}
+    for seed in range(12):
+        problem = hand_eye_problem(np.random.default_rng(seed), 3, robot_noise=noise)
+        poses = problem.base_from_gripper, problem.recon_from_camera
+        estimated, given = jcr.solve_hand_eye(*poses), jcr.solve_hand_eye(*poses, robot_noise=noise)
+        trusted["estimated"] += estimated.converged
+        trusted["given"] += given.converged
+        for answer in (estimated, given):
+            uncertain = [warning for warning in answer.warnings if "is known to ±" in warning]
+            assert all(("--robot-noise" in warning) == (answer is estimated) for warning in uncertain)
+            if answer.converged:
+                off = error(problem, answer.gripper_from_camera, answer.scale)
+                assert (np.abs(off) < 5 * np.sqrt(np.diag(answer.covariance))).all()
+    assert trusted["given"] > 2 * trusted["estimated"]

@@ -1,0 +1,7 @@
+"""Where the project lies, and what may lie beside it."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+SHARED = ROOT.parent / "shared"
+"""Fixtures and real captures of others, which the project does not hold; tests say where it is absent."""

@@ -1,0 +1,200 @@
+"""Plane sweep on a scene whose depth is known: a box on a table, drawn by casting rays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from jcr.camera import rays
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.reconstruct.depth import plane_sweep as plane_sweep_module
+from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions, plane_sweep
+from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
+from jcr.records import Intrinsics, Tracks
+
+PINHOLE = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
+BOX_HEIGHT, BOX_HALF_WIDTH = 0.06, 0.05
+BLANK_X = 0.11
+"""The table has one colour beyond this x."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Seven views of the table z = 0, from above, 0.4 to 0.5 m away."""
+
+    images: UInt8[ndarray, "m h w 3"]
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    depth: Float[ndarray, "m h w"]
+    blank: Bool[ndarray, "m h w"]
+    tracks: Tracks
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    rng = np.random.default_rng(3)
+    texture = np.stack([gaussian_filter(rng.normal(size=(600, 600)), 2.0) for _ in range(3)], axis=-1)
+    texture = np.clip(128 + 60 * texture / texture.std(), 0, 255)
+    cameras, images, depths, blanks = [], [], [], []
+    for k in range(7):
+        azimuth, tilt = 2 * np.pi * k / 7, 0.25 + 0.1 * (k % 3)
+        centre = (0.42 + 0.03 * (k % 2)) * np.array(
+            [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
+        )
+        z = -centre / np.linalg.norm(centre)
+        x = np.cross([np.sin(0.4 * k), np.cos(0.4 * k), 0.0], z)
+        x /= np.linalg.norm(x)
+        recon_from_camera = transform(np.stack([x, np.cross(z, x), z], axis=-1), centre)
+        direction = rays(PINHOLE) @ recon_from_camera[:3, :3].T
+        on_table = -centre[2] / direction[..., 2]
+        on_box = (BOX_HEIGHT - centre[2]) / direction[..., 2]
+        hits_box = (np.abs(centre + on_box[..., None] * direction)[..., :2] < BOX_HALF_WIDTH).all(-1)
+        # Sides of the box: the first of the four upright planes that is hit below the top.
+        side = np.full_like(on_table, np.inf)
+        for axis in (0, 1):
+            for sign in (-1, 1):
+                t = (sign * BOX_HALF_WIDTH - centre[axis]) / direction[..., axis]
+                hit = centre + t[..., None] * direction
+                here = (np.abs(hit[..., 1 - axis]) <= BOX_HALF_WIDTH) & (hit[..., 2] <= BOX_HEIGHT)
+                side = np.where((t > 0) & here & (hit[..., 2] >= 0), np.minimum(side, t), side)
+        depth = np.minimum(np.where(hits_box, on_box, on_table), side)
+        point = centre + depth[..., None] * direction
+        place = 300 + 1000 * (point[..., :2] + [[0.4, 0.1]] * point[..., 2:])
+        color = np.stack(
+            [map_coordinates(texture[..., c], place.reshape(-1, 2).T, mode="reflect") for c in range(3)]
+        )
+        color = color.T.reshape(*depth.shape, 3)
+        blank = point[..., 0] > BLANK_X
+        cameras.append(recon_from_camera)
+        images.append(np.where(blank[..., None], 140, np.clip(color, 0, 255)).astype(np.uint8))
+        depths.append(depth)
+        blanks.append(blank)
+    recon_from_camera = np.stack(cameras)
+    points = np.concatenate(
+        [
+            np.column_stack([rng.uniform(-0.12, 0.1, (300, 2)), np.zeros(300)]),
+            np.column_stack([rng.uniform(-0.05, 0.05, (60, 2)), np.full(60, BOX_HEIGHT)]),
+        ]
+    )
+    image, point, x_px = [], [], []
+    for k, camera_from_recon in enumerate(inverse(recon_from_camera)):
+        x = apply(camera_from_recon, points)
+        u, v = (PINHOLE.matrix @ x.T)[:2] / x[:, 2]
+        (seen,) = np.nonzero((u > 0) & (u < PINHOLE.width - 1) & (v > 0) & (v < PINHOLE.height - 1))
+        image.append(np.full(len(seen), k))
+        point.append(seen)
+        x_px.append(np.stack([u, v], axis=-1)[seen])
+    tracks = Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), points)
+    return Scene(np.stack(images), recon_from_camera, np.stack(depths), np.stack(blanks), tracks)
+
+
+@pytest.fixture(scope="module")
+def swept(scene: Scene) -> tuple[ndarray, ndarray]:
+    return _sweep(scene.images, scene.recon_from_camera, scene.tracks)
+
+
+def _sweep(
+    images: ndarray, recon_from_camera: ndarray, tracks: Tracks, options: PlaneSweepOptions | None = None
+) -> tuple[ndarray, ndarray]:
+    neighbours = choose_neighbours(tracks, recon_from_camera, 4)
+    planes = sweep_planes(tracks, recon_from_camera)
+    return plane_sweep(images, recon_from_camera, PINHOLE, neighbours, planes, options)
+
+
+def test_a_tight_budget_takes_the_images_one_by_one_and_changes_no_bit(
+    scene: Scene, swept: tuple[ndarray, ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = []
+    smooth = plane_sweep_module._add_semi_global_paths
+    monkeypatch.setattr(
+        plane_sweep_module,
+        "_add_semi_global_paths",
+        lambda cost, grey: together.append(len(cost)) or smooth(cost, grey),
+    )
+    tight = _sweep(scene.images, scene.recon_from_camera, scene.tracks, PlaneSweepOptions(memory_gb=0.1))
+    assert together == [1] * len(scene.images)
+    for one, other in zip(tight, swept, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_depth_is_found_and_confidence_knows_where(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
+    depth, confidence = swept
+    assert np.isfinite(depth).all() and (depth > 0).all()
+    assert (confidence >= 0).all()
+    error = np.abs(depth / scene.depth - 1)
+    believed = confidence > 0
+    assert believed[~scene.blank].mean() > 0.75
+    assert np.median(error[believed & ~scene.blank]) < 5e-4
+    assert (error[believed & ~scene.blank] > 0.02).mean() < 0.02
+
+
+def test_one_colour_is_no_evidence(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
+    _, confidence = swept
+    inner = scene.blank & np.roll(scene.blank, 12, 1) & np.roll(scene.blank, -12, 1)
+    inner &= np.roll(scene.blank, 12, 2) & np.roll(scene.blank, -12, 2)
+    assert inner.sum() > 500
+    assert (confidence[inner] == 0).mean() > 0.99
+
+
+def test_a_pixel_that_no_neighbour_sees_has_no_confidence(
+    scene: Scene, swept: tuple[ndarray, ndarray]
+) -> None:
+    _, confidence = swept
+    neighbours = choose_neighbours(scene.tracks, scene.recon_from_camera, 4)
+    hidden_somewhere = 0
+    for i, others in enumerate(neighbours):
+        seen = np.zeros(scene.depth[i].shape, dtype=int)
+        for j in others:
+            neighbour_from_camera = inverse(scene.recon_from_camera[j]) @ scene.recon_from_camera[i]
+            x = apply(neighbour_from_camera, scene.depth[i][..., None] * rays(PINHOLE))
+            u, v, _ = np.moveaxis(x / x[..., 2:] @ PINHOLE.matrix.T, -1, 0)
+            seen += (u > -2) & (u < PINHOLE.width + 1) & (v > -2) & (v < PINHOLE.height + 1)
+        hidden_somewhere += (seen == 0).sum()
+        assert (confidence[i][seen == 0] == 0).mean() > 0.99
+    assert hidden_somewhere > 100
+
+
+def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
+    depth, confidence = swept
+    scale, motion = 7.3, transform(rotation_exp(np.array([0.3, -1.1, 0.7])), np.array([2.0, -3.0, 1.0]))
+    moved = motion @ scene.recon_from_camera
+    moved[:, :3, 3] *= scale
+    tracks = Tracks(
+        scene.tracks.image,
+        scene.tracks.x_px,
+        scene.tracks.point,
+        scale * apply(motion, scene.tracks.points_in_recon),
+    )
+    depth_moved, confidence_moved = _sweep(scene.images, moved, tracks)
+    both = (confidence > 0) & (confidence_moved > 0)
+    assert both.sum() > 0.99 * (confidence > 0).sum()
+    assert np.quantile(np.abs(depth_moved / scale / depth - 1)[both], 0.99) < 1e-3
+
+
+def test_planes_take_the_slope_of_the_table(scene: Scene) -> None:
+    planes = sweep_planes(scene.tracks, scene.recon_from_camera)
+    camera_from_recon = inverse(scene.recon_from_camera)
+    normal = camera_from_recon[:, :3, 2]  # the table's, in the camera
+    table = normal / (normal * camera_from_recon[:, :3, 3]).sum(-1, keepdims=True)
+    # A sixth of the points lie on the box and must not tilt the planes.
+    np.testing.assert_allclose(planes[:, 0, :2], table[:, :2], atol=0.02)
+    assert (planes[:, 0, 2] < table[:, 2]).all() and (table[:, 2] < planes[:, -1, 2]).all()
+    np.testing.assert_allclose(np.diff(planes, 2, axis=1), 0, atol=1e-12)
+
+
+def test_neighbours_share_points_under_a_useful_angle() -> None:
+    """Four cameras in a row look at one patch; a fifth stands at the first's place and sees other points."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3)) + [0, 0, 1.0]
+    angles_deg = np.array([0.0, 1.0, 15.0, 60.0, 0.0])
+    centres = np.stack(
+        [np.sin(np.radians(angles_deg)), 0 * angles_deg, 1 - np.cos(np.radians(angles_deg))], axis=-1
+    )
+    recon_from_camera = transform(np.eye(3), centres)
+    image = np.concatenate([np.repeat(np.arange(4), 30), np.full(10, 4)])
+    point = np.concatenate([np.tile(np.arange(30), 4), np.arange(30, 40)])
+    tracks = Tracks(image, np.zeros((len(image), 2)), point, points)
+    neighbours = choose_neighbours(tracks, recon_from_camera, 3)
+    assert neighbours[0].tolist() == [2, 1, 3]
+    assert all(i not in others and len(others) == 3 for i, others in enumerate(neighbours))

@@ -1,0 +1,304 @@
+"""Both checkpoint layouts, their faults, and pickles that must not run."""
+
+import argparse
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jcr.train.options import TrainOptions
+from jcr.train.train import new_network, write_weights
+from PIL import Image
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+
+from jcr.cli import dispatch
+from jcr.errors import InputError
+from jcr.reconstruct.checkpoints import CHECKPOINTS
+from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
+from jcr.reconstruct.global_alignment.pairs import read_pairs
+from jcr.reconstruct.preprocess import cover_grid
+
+CONFIG = {
+    "head_type": "dpt",
+    "enc_embed_dim": 32,
+    "enc_depth": 1,
+    "enc_num_heads": 2,
+    "dec_embed_dim": 32,
+    "dec_depth": 10,
+    "dec_num_heads": 2,
+}
+MODEL = (
+    "AsymmetricCroCo3DStereo(pos_embed='RoPE100', img_size=(512, 512), head_type='dpt', output_mode='pts3d', "
+    "depth_mode=('exp', -inf, inf), conf_mode=('exp', 1, inf), enc_embed_dim=32, enc_depth=1, "
+    "enc_num_heads=2, dec_embed_dim=32, dec_depth=10, dec_num_heads=2, landscape_only=False)"
+)
+
+
+# Small files, where the head does not matter.
+LINEAR_CONFIG = {**CONFIG, "head_type": "linear", "dec_depth": 2}
+LINEAR_MODEL = MODEL.replace("'dpt'", "'linear'").replace("dec_depth=10", "dec_depth=2")
+
+
+@pytest.fixture(scope="module")
+def network() -> Dust3r:
+    torch.manual_seed(0)
+    return Dust3r(**CONFIG).eval()
+
+
+@pytest.fixture(scope="module")
+def linear() -> Dust3r:
+    torch.manual_seed(0)
+    return Dust3r(**LINEAR_CONFIG).eval()
+
+
+def write_pth(path: Path, network: Dust3r, model: str = MODEL, **tensors: torch.Tensor) -> Path:
+    state = {**network.state_dict(), **tensors}
+    torch.save({"args": argparse.Namespace(model=model, epochs=100), "model": state}, path)
+    return path
+
+
+def write_folder(folder: Path, network: Dust3r, config: dict[str, object] = CONFIG) -> Path:
+    # Published safetensors name a tied tensor once and write Infinity into their JSON.
+    state = {key: tensor for key, tensor in network.state_dict().items() if ".layer_rn." not in key}
+    folder.mkdir(exist_ok=True)
+    save_file(state, folder / "model.safetensors")
+    infinite = {"depth_mode": ["exp", -float("inf"), float("inf")], "conf_mode": ["exp", 1, float("inf")]}
+    (folder / "config.json").write_text(json.dumps({**config, **infinite, "freeze": "none"}))
+    return folder
+
+
+def assert_same_output(network: Dust3r, loaded: Dust3r) -> None:
+    image = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    with torch.inference_mode():
+        for ours, theirs in zip(network(image, image.flip(3)), loaded(image, image.flip(3)), strict=True):
+            torch.testing.assert_close(ours.points, theirs.points, rtol=1e-5, atol=1e-6)
+
+
+def test_every_layout_loads_to_the_same_network(
+    tmp_path: Path, network: Dust3r, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_folder(tmp_path / "folder", network)
+    pth = write_pth(tmp_path / "weights.pth", network)
+    for source in (folder, folder / "model.safetensors", pth):
+        loaded = load_weights(source)
+        assert_same_output(network, loaded.network)
+        assert fingerprint(loaded.network) == fingerprint(network)
+        assert not loaded.is_metric
+    load_weights(pth)
+    said = capsys.readouterr().err
+    assert said.count(str(pth)) == 1 and "licence" in said
+
+
+def test_a_second_decoder_that_is_not_stored_is_a_copy_of_the_first(tmp_path: Path, linear: Dust3r) -> None:
+    state = {key: value for key, value in linear.state_dict().items() if not key.startswith("dec_blocks2.")}
+    torch.save({"args": argparse.Namespace(model=LINEAR_MODEL), "model": state}, tmp_path / "croco.pth")
+    loaded = load_weights(tmp_path / "croco.pth").network
+    assert torch.equal(loaded.dec_blocks2[1].mlp.fc1.weight, linear.dec_blocks[1].mlp.fc1.weight)
+
+
+def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: Dust3r) -> None:
+    model = MODEL.replace("AsymmetricCroCo3DStereo", "AsymmetricMASt3R").replace("'dpt'", "'catmlp+dpt'")
+    model = model.replace("'pts3d'", "'pts3d+desc24'").replace(")\n", "")[:-1] + ", two_confs=True)"
+    matching = {
+        f"downstream_head{head}.head_local_features.fc{layer}.{leaf}": torch.zeros(4)
+        for head in (1, 2)
+        for layer in (1, 2)
+        for leaf in ("weight", "bias")
+    }
+    loaded = load_weights(write_pth(tmp_path / "mast3r.pth", network, model, **matching))
+    assert loaded.is_metric
+    assert_same_output(network, loaded.network)
+
+
+class Trap:
+    """Unpickled by pickle.load, it creates a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("layout", ["pickle", "torch"])
+def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
+    sprung = tmp_path / "sprung"
+    content = {"args": argparse.Namespace(model=MODEL, trap=Trap(sprung)), "model": {}}
+    bad = tmp_path / "bad.pth"
+    if layout == "pickle":
+        bad.write_bytes(pickle.dumps(content))
+    else:
+        torch.save(content, bad)
+    with pytest.raises(InputError, match=r"bad\.pth: damaged, or holds code"):
+        load_weights(bad)
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "__import__('os').abort()",
+        "AsymmetricMASt3R(depth_mode=(lambda: 1)())",
+        "AsymmetricMASt3R(*[1])",
+        "AsymmetricMASt3R(" + "(" * 5000,
+        "os.abort",
+    ],
+)
+def test_the_model_string_is_read_and_never_evaluated(tmp_path: Path, linear: Dust3r, model: str) -> None:
+    with pytest.raises(InputError, match="no checkpoint of DUSt3R"):
+        load_weights(write_pth(tmp_path / "weights.pth", linear, model))
+
+
+def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear: Dust3r) -> None:
+    def complaint(source: Path | str) -> str:
+        with pytest.raises(InputError) as caught:
+            load_weights(source)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert "no such weights" in complaint(tmp_path / "absent.pth")
+    folder = write_folder(tmp_path / "folder", linear, LINEAR_CONFIG)
+    tensors = folder / "model.safetensors"
+    whole = tensors.read_bytes()
+    tensors.write_bytes(whole[: len(whole) // 2])
+    assert "damaged or no safetensors" in complaint(folder)
+    tensors.write_bytes(whole)
+    (folder / "config.json").write_text('{"enc_depth": ')
+    assert "no readable JSON" in complaint(folder)
+    (folder / "config.json").write_text(json.dumps({**LINEAR_CONFIG, "enc_depth": 2}))
+    assert "enc_blocks.1" in complaint(folder)
+    (folder / "config.json").write_text(json.dumps({**LINEAR_CONFIG, "num_classes": 1000}))
+    assert "num_classes" in complaint(folder)
+    (folder / "config.json").unlink()
+    assert "config.json belongs beside them" in complaint(folder)
+
+    pth = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
+    pth.write_bytes(pth.read_bytes()[:-5000])
+    assert "damaged" in complaint(pth)
+    torch.save(linear.state_dict(), pth)
+    assert "no checkpoint of DUSt3R" in complaint(pth)
+    write_pth(pth, linear, LINEAR_MODEL, foreign=torch.zeros(1))
+    assert "not of this network, foreign first" in complaint(pth)
+    write_pth(pth, linear, LINEAR_MODEL, enc_norm_weight=torch.zeros(1))
+    assert "enc_norm_weight" in complaint(pth)
+    write_pth(pth, linear, LINEAR_MODEL, **{"enc_norm.weight": torch.zeros(3)})
+    assert "enc_norm.weight is (3,), the configuration asks for (32,)" in complaint(pth)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "0 weights files" in complaint(empty)
+    (tmp_path / "image.png").touch()
+    assert "not .png" in complaint(tmp_path / "image.png")
+    write_pth(pth, linear, LINEAR_MODEL)
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="use --device cpu"):
+            load_weights(pth, "cuda")
+
+
+def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
+    tmp_path: Path, linear: Dust3r, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import huggingface_hub.constants
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    checkpoint = CHECKPOINTS["dust3r"]
+    hub_id = checkpoint.hub_id
+    assert not checkpoint.is_cached()
+    with pytest.raises(InputError, match="not in the cache and not to be had from the hub"):
+        load_weights(hub_id)
+    repository = tmp_path / f"models--{hub_id.replace('/', '--')}"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text("0" * 40)
+    (repository / "snapshots").mkdir()
+    write_folder(repository / "snapshots" / ("0" * 40), linear, LINEAR_CONFIG)
+    assert checkpoint.is_cached()
+    loaded = load_weights(hub_id)
+    assert "CC BY-NC-SA 4.0" in loaded.licence
+    assert_same_output(linear, loaded.network)
+
+
+def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(
+    tmp_path: Path, linear: Dust3r, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    frames = []
+    for k in range(3):
+        Image.fromarray(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)).save(tmp_path / f"{k}.png")
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec([0.3 * k, 0.2, 0.1 * k * k]).as_matrix()
+        pose[0, 3] = 0.1 * k
+        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
+    lens = {"fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "distortion": [0, 0, 0, 0, 0]}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    weights = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
+    out = tmp_path / "pairs.npz"
+    command = [
+        "predict",
+        str(tmp_path),
+        str(out),
+        "--weights",
+        str(weights),
+        "--cache",
+        str(tmp_path / "cache"),
+    ]
+    command += ["--image-size", "224", "--device", "cpu", "--quiet", "--json"]
+    assert dispatch(command) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["pairs"] == 6 and (said["width"], said["height"]) == (224, 224)
+    pairs = read_pairs(out)
+    assert pairs.images == ("0.png", "1.png", "2.png")
+    assert pairs.intrinsics is not None
+    # 80x60 is enlarged so that 60 becomes 224, then the middle 224 columns are kept.
+    assert pairs.intrinsics.fy == pytest.approx(70 * 224 / 60)
+    assert pairs.intrinsics.cx == pytest.approx(39.5 * 224 / 60 + (224 / 60 - 1) / 2 - 37, abs=0.6)
+    assert len(list((tmp_path / "cache").iterdir())) == 6
+
+    assert dispatch([*command, "--memory-gb", "0"]) == 2
+    assert "must be positive" in capsys.readouterr().err
+    weights.write_bytes(b"no weights")
+    assert dispatch(command) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and str(weights) in error and error.count("\n") == 1
+
+
+def test_jcr_models_lists_licences_scale_and_what_is_present(capsys: pytest.CaptureFixture[str]) -> None:
+    assert dispatch(["models", "--json"]) == 0
+    rows = {(row["backend"], row["weights"]): row for row in json.loads(capsys.readouterr().out)["models"]}
+    assert rows["colmap", ""]["present"] == "yes"
+    mast3r = rows["mast3r", CHECKPOINTS["mast3r"].hub_id]
+    assert mast3r["scale"] == "metres" and "non-commercial" in mast3r["licence"]
+    assert rows["mapanything", CHECKPOINTS["mapanything"].hub_id]["licence"] == "Apache-2.0"
+
+
+def test_the_weights_in_a_folder_say_their_licence_size_and_accuracy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = TrainOptions(tmp_path, embed=48, encoder_depth=1, decoder_depth=2, licence="MIT")
+    write_weights(tmp_path, new_network(options).state_dict(), options)
+    loaded = load_weights(tmp_path)
+    assert loaded.licence == "MIT" and loaded.size == (128, 96) and loaded.network.absolute_position
+    checkpoint = replace(CHECKPOINTS["compact"], hub_id=str(tmp_path))
+    monkeypatch.setitem(CHECKPOINTS, "compact", checkpoint)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"accuracy": "9 mm"}))
+    assert checkpoint.is_cached() and load_weights(tmp_path).matching_block == 1
+    (tmp_path / "config.json").write_text(json.dumps(config | {"matching_block": 2}))
+    with pytest.raises(InputError, match="matching_block"):
+        load_weights(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(config | {"accuracy": "9 mm"}))
+    assert dispatch(["models"]) == 0
+    assert f"compact      {tmp_path}" in (listed := capsys.readouterr().out) and "accuracy: 9 mm" in listed
+    (tmp_path / "model.safetensors").unlink()
+    assert not checkpoint.is_cached()
+
+
+def test_a_wide_image_is_cropped_to_the_one_size_that_weights_know() -> None:
+    grid = cover_grid((1280, 720), (64, 48))
+    assert grid.resized_size == (85, 48) and grid.crop_corner == (10, 0) and grid.size == (64, 48)
+    middle = grid.original_from_grid(np.array([31.5, 23.5]))
+    np.testing.assert_allclose(middle, (639.5, 359.5), atol=8)

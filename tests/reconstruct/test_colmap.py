@@ -1,0 +1,211 @@
+"""The COLMAP back end on the bundled capture, against its truth, and on captures it must refuse or mend."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+
+from jcr.camera import distort
+from jcr.capture.read import read_capture
+from jcr.errors import NotTrustedError
+from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
+from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.records import Capture, Reconstruction
+from jcr.simulate.truth import read_truth
+
+SMALL = ColmapOptions(pointmap_size_px=80)
+"""For tests that ask for poses only."""
+
+
+@pytest.fixture(scope="module")
+def capture(tabletop: Path) -> Capture:
+    return read_capture(tabletop)
+
+
+@pytest.fixture(scope="module")
+def found(capture: Capture) -> Reconstruction:
+    return reconstruct(_first(capture, 7), ColmapOptions(pointmap_size_px=240))
+
+
+@pytest.fixture(scope="module")
+def four(capture: Capture) -> Reconstruction:
+    return reconstruct(_first(capture, 4), SMALL)
+
+
+def _first(capture: Capture, count: int) -> Capture:
+    return replace(
+        capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
+    )
+
+
+def _true_base_from_camera(capture: Capture, result: Reconstruction) -> Float[ndarray, "m 4 4"]:
+    reference = json.loads((capture.folder / "reference.json").read_text())
+    return capture.base_from_gripper[result.image_index] @ np.array(reference["gripper_from_camera"])
+
+
+def _center_errors(capture: Capture, result: Reconstruction) -> Float[ndarray, " m"]:
+    """Distances (m) of the camera centres from where gripper pose and reference put them."""
+    centers = _true_base_from_camera(capture, result)[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, result.recon_from_camera[:, :3, 3])
+    fitted = apply_similarity(base_from_recon, scale, result.recon_from_camera[:, :3, 3])
+    return np.linalg.norm(fitted - centers, axis=1)
+
+
+def _reprojection_errors(result: Reconstruction) -> Float[ndarray, "k 2"]:
+    tracks = result.tracks
+    camera_from_recon = inverse(result.recon_from_camera)[tracks.image]
+    x = np.einsum("kij,kj->ki", camera_from_recon[:, :3, :3], tracks.points_in_recon[tracks.point])
+    x += camera_from_recon[:, :3, 3]
+    return distort(result.intrinsics, x[:, :2] / x[:, 2:]) - tracks.x_px
+
+
+def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) -> None:
+    assert found.image_index.tolist() == list(range(7))
+    assert found.intrinsics == capture.intrinsics
+    assert found.notes == ()
+    assert np.sqrt((_center_errors(capture, found) ** 2).mean()) < 2e-4
+    true = _true_base_from_camera(capture, found)[:, :3, :3]
+    relative = np.swapaxes(true[:1], -1, -2) @ true
+    measured = np.swapaxes(found.recon_from_camera[:1, :3, :3], -1, -2) @ found.recon_from_camera[:, :3, :3]
+    assert rotation_between_deg(relative, measured).max() < 0.1
+
+
+def test_tracks_reproject_without_half_a_pixel(found: Reconstruction) -> None:
+    error = _reprojection_errors(found)
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.4
+    assert np.abs(np.median(error, axis=0)).max() < 0.05
+    assert np.bincount(found.tracks.point).min() >= 2
+    assert len(found.tracks.points_in_recon) > 500
+
+
+def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
+    assert np.isfinite(found.points_in_recon).all()
+    assert (found.confidence > 0).mean() > 0.5
+    centers = _true_base_from_camera(capture, found)[:, :3, 3]
+    base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
+    x_in_base = apply_similarity(base_from_recon, scale, found.points_in_recon[found.confidence > 0])
+    truth = read_truth(capture.folder)
+    low, high = truth.workspace_in_base
+    inside = ((x_in_base > low) & (x_in_base < high))[:, :2].all(-1)
+    height = x_in_base[inside, 2] - truth.table_height
+    assert (np.abs(height) < 1e-3).mean() > 0.4  # most of what the views show is bare table
+    assert (height < -5e-3).mean() < 0.005
+    assert (height > max(thing.height for thing in truth.objects) + 5e-3).mean() < 0.005
+
+
+def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_path: Path) -> None:
+    """Bit for bit, also when the images lie on their side with an EXIF tag that says so."""
+    turned = _first(capture, 4)
+    names = []
+    for name in turned.images:
+        exif = Image.Exif()
+        exif[0x0112] = 6  # to be turned a quarter clockwise for viewing
+        names.append(f"{Path(name).stem}.png")
+        with Image.open(capture.folder / name) as upright:
+            on_its_side = upright.convert("RGB").transpose(Image.Transpose.ROTATE_90)
+            on_its_side.save(tmp_path / names[-1], exif=exif)
+    shares = []
+    again = reconstruct(
+        replace(turned, folder=tmp_path, images=tuple(names)),
+        SMALL,
+        lambda stage, share: shares.append(share) if stage == "mapping" else None,
+    )
+    assert shares == [0.0, 0.5, 0.75, 1.0, 1.0]  # a pair first, then image by image
+    np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
+    np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
+    np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
+    np.testing.assert_array_equal(again.points_in_recon, four.points_in_recon)
+    np.testing.assert_array_equal(again.confidence, four.confidence)
+
+
+def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:
+    assert capture.intrinsics is not None
+    folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
+    result = reconstruct(replace(_first(capture, 4), intrinsics=folding), SMALL)
+    assert len(result.notes) == 1 and "folds over at" in result.notes[0] and "not used" in result.notes[0]
+    assert result.intrinsics == capture.intrinsics
+    np.testing.assert_array_equal(result.recon_from_camera, four.recon_from_camera)
+
+
+def test_unknown_lens_is_found(capture: Capture) -> None:
+    assert capture.intrinsics is not None
+    result = reconstruct(replace(_first(capture, 5), intrinsics=None), SMALL)
+    assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
+    corner = np.array([[0.4, 0.3]])
+    np.testing.assert_allclose(
+        distort(result.intrinsics, corner), distort(capture.intrinsics, corner), atol=3
+    )
+    assert _center_errors(capture, result).max() < 1e-3
+
+
+def test_tracks_are_in_pixels_of_the_original(capture: Capture) -> None:
+    result = reconstruct(_first(capture, 4), replace(SMALL, working_size_px=480))
+    assert result.intrinsics == capture.intrinsics
+    error = _reprojection_errors(result)
+    assert np.abs(np.median(error, axis=0)).max() < 0.1
+    assert _center_errors(capture, result).max() < 1e-3
+
+
+def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Path) -> None:
+    three = _first(capture, 4)
+    for name in three.images[:3]:
+        shutil.copy(capture.folder / name, tmp_path / Path(name).name)
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "elsewhere.png")
+    images = (*(Path(name).name for name in three.images[:2]), "elsewhere.png", Path(three.images[2]).name)
+    result = reconstruct(replace(three, folder=tmp_path, images=images), SMALL)
+    assert result.image_index.tolist() == [0, 1, 3]
+    assert result.notes == ("3 of 4 images registered; not elsewhere.png",)
+    assert result.tracks.image.max() == 2
+
+
+def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_path: Path) -> None:
+    bare = _first(capture, 4)
+    for k, name in enumerate(bare.images):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shade = np.linspace(90, 150 + k, 640)[None, :, None] * np.ones((480, 1, 3))
+        Image.fromarray(shade.astype(np.uint8)).save(tmp_path / name)
+    with pytest.raises(NotTrustedError) as refusal:
+        reconstruct(replace(bare, folder=tmp_path), SMALL)
+    message = str(refusal.value)
+    assert "\n" not in message
+    assert "0 of 4 images" in message and "0 features" in message and "textured objects" in message
+
+
+def test_plain_background_is_refused(real_captures: Path) -> None:
+    with pytest.raises(NotTrustedError, match=r"0 of 8 images \(too little texture"):
+        reconstruct(read_capture(real_captures / "franka_plain_background"), SMALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "count"), [("franka_tabletop", 8), ("doosan_bench", 15)])
+def test_real_cameras_follow_the_gripper(real_captures: Path, name: str, count: int) -> None:
+    """To within the few millimetres to which the references are good, and the poses of both robots."""
+    capture = read_capture(real_captures / name)
+    result = reconstruct(capture, SMALL)
+    assert len(result.image_index) == count
+    assert any("folds over" in note for note in result.notes) == (name == "doosan_bench")
+    error = _center_errors(capture, result)
+    assert np.median(error) < 3e-3
+    assert error.max() < 0.01
+
+
+def _python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+
+
+def test_pillow_and_pycolmap_live_together_in_a_fresh_process():
+    """In the order in which the stage is imported alone, pycolmap's zlib broke Pillow's."""
+    write = "import io; from PIL import Image; Image.effect_noise((640, 480), 50).save(io.BytesIO(), 'PNG')"
+    done = _python(f"import jcr.reconstruct.sfm; {write}")
+    assert done.returncode == 0, done.stderr
+    refused = _python("import pycolmap; import jcr")
+    assert "import jcr (or PIL.Image) before pycolmap" in refused.stderr

@@ -1,0 +1,492 @@
+"""The report: that it says what was found, harms nobody, needs nothing, and works in a browser."""
+
+import base64
+import itertools
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from chromium import Chromium
+from jcr.calibration.calibration_json import calibration_file, failed_file, worst_direction
+from jcr.calibration.stage import calibrate
+from jcr.capture.images import read_image
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.report.figures import ABOVE, camera_figure, rendered_points
+from jcr.report.html import failed_report_html, report_html
+from jcr.report.images import MAGNIFIED
+from jcr.report.motion import _excitation_bars
+from jcr.report.notations import notations
+from jcr.report.samples import CLEARANCE, sample_surface, slices
+from jcr.represent.build import build_scene
+from jcr.represent.cloud import point_cloud
+from jcr.represent.options import MapOptions
+from jcr.results import RunResult
+from jcr.rounding import significant
+from jcr.simulate.truth import Truth, read_truth
+
+EVIL = "<script>alert(1)</script>&\"'.jpg"
+"""The name of the second image; a legal path on every Unix."""
+WRONG, UNREGISTERED = 5, 11
+"""Images whose gripper pose is wrong, and that the back end did not find."""
+CELL = 0.02
+
+
+@pytest.fixture(scope="module")
+def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, RunResult]:
+    """A run on the bundled images whose pointmaps are cast against the true table and boxes."""
+    truth = read_truth(tabletop)
+    folder = tmp_path_factory.mktemp("report") / "a & <b>"
+    names = [EVIL if k == 1 else name for k, name in enumerate(truth.images)]
+    for name, source in zip(names, truth.images, strict=True):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(tabletop / source, folder / name)
+    reported = truth.base_from_gripper.copy()
+    reported[WRONG, :3, 3] += [0.05, 0.0, 0.03]
+    lens = truth.intrinsics
+    capture = Capture(folder, tuple(names), reported, (lens.width, lens.height), lens)
+    reconstruction, label = _cast(truth, tabletop)
+    hand_eye = calibrate(capture, reconstruction)
+    content = calibration_file(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
+    names = ("none", *(f"<i>{thing.name}" for thing in truth.objects))
+    cloud = point_cloud(capture, reconstruction, hand_eye, label, label_names=names)
+    scene = build_scene(cloud, MapOptions(cell=CELL, max_seconds=4.0))
+    return capture, RunResult(folder, content, hand_eye, reconstruction, cloud, scene)
+
+
+@pytest.fixture(scope="module")
+def page(run: tuple[Capture, RunResult]) -> str:
+    return report_html(*run)
+
+
+def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
+    """Pointmaps of table and boxes seen by all cameras but one, in a frame of its own; and their labels."""
+    step, scale = 8, 0.1
+    lens = truth.intrinsics
+    grid = Intrinsics(
+        lens.fx / step,
+        lens.fy / step,
+        (lens.cx + 0.5) / step - 0.5,
+        (lens.cy + 0.5) / step - 0.5,
+        lens.width // step,
+        lens.height // step,
+    )
+    x, y = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
+    rays = np.stack([(x - grid.cx) / grid.fx, (y - grid.cy) / grid.fy, np.ones(x.shape)], axis=-1)
+    rows = np.array([k for k in range(len(truth.images)) if k != UNREGISTERED])
+    base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
+    cameras = inverse(base_from_recon) @ truth.base_from_camera[rows]
+    cameras[:, :3, 3] /= scale
+
+    rng = np.random.default_rng(0)
+    corner, opposite = truth.workspace_in_base
+    spots = rng.uniform(corner, opposite, (300, 3))
+    spots[::2, 2] = truth.table_height
+    depth = np.empty((len(rows), *x.shape))
+    label = np.zeros(depth.shape, int)
+    image, seen, point = [], [], []
+    for k, row in enumerate(rows):
+        base_from_camera = truth.base_from_camera[row]
+        center, direction = base_from_camera[:3, 3], rays @ base_from_camera[:3, :3].T
+        depth[k] = (truth.table_height - center[2]) / direction[..., 2]
+        for number, thing in enumerate(truth.objects, start=1):
+            box_from_base = inverse(thing.base_from_box)
+            start, along = apply(box_from_base, center), direction @ box_from_base[:3, :3].T
+            with np.errstate(divide="ignore"):
+                planes = (np.array([[-0.5], [0.5]]) * thing.box_size - start) / along[..., None, :]
+            enter, leave = planes.min(-2).max(-1), planes.max(-2).min(-1)
+            nearer = (enter < leave) & (enter < depth[k])
+            depth[k][nearer], label[k][nearer] = enter[nearer], number
+        in_camera = apply(inverse(base_from_camera), spots)
+        pixel = in_camera[:, :2] / in_camera[:, 2:] * lens.fx + [lens.cx, lens.cy]
+        pixel += rng.normal(0, 0.3, pixel.shape)
+        inside = np.flatnonzero(((pixel > 0) & (pixel < [lens.width, lens.height])).all(1))
+        image.append(np.full(len(inside), k))
+        seen.append(pixel[inside])
+        point.append(inside)
+    reconstruction = Reconstruction(
+        image_index=rows,
+        recon_from_camera=cameras,
+        intrinsics=lens,
+        pointmap_intrinsics=grid,
+        points_in_recon=np.stack(
+            [apply(cameras[k], depth[k][..., None] * rays / scale) for k in range(len(rows))]
+        ),
+        confidence=(depth > 0).astype(float),
+        colors=np.stack(
+            [read_image(tabletop / truth.images[row])[step // 2 :: step, step // 2 :: step] for row in rows]
+        ),
+        tracks=Tracks(
+            np.concatenate(image),
+            np.concatenate(seen),
+            np.concatenate(point),
+            apply(inverse(base_from_recon), spots) / scale,
+        ),
+        backend="cast",
+        notes=("a <note> & more",),
+    )
+    return reconstruction, label
+
+
+class Elements(HTMLParser):
+    """Every element with its attributes, and the text of the page outside of scripts and styles."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.text, self.scripts = "", list[str]()
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.cdata_elem == "script":
+            self.scripts[-1] += data
+        elif self.cdata_elem is None:
+            self.text += data
+
+    def copied(self, what: str) -> str:
+        label = f"copy {what}"
+        return next(a["data-copy"] or "" for _, a in self.found if a.get("aria-label") == label)
+
+
+def test_numbers_are_those_of_the_calibration_file(run, page: str):
+    _, result = run
+    written = json.loads(json.dumps(result.calibration.model_dump()))
+    elements = Elements(page)
+    assert json.loads(elements.copied("the matrix")) == written["gripper_from_camera"]
+    x = np.array(written["gripper_from_camera"])
+    np.testing.assert_allclose(json.loads(elements.copied("Translation (m)")), x[:3, 3], atol=1e-9)
+
+    def is_rotation(rotation: Rotation) -> None:
+        np.testing.assert_allclose(rotation.as_matrix(), x[:3, :3], atol=1e-8)
+
+    is_rotation(Rotation.from_quat(json.loads(elements.copied("Quaternion"))))
+    is_rotation(Rotation.from_rotvec(json.loads(elements.copied("Rotation vector (rad)"))))
+    for unit, degrees in (("rad", False), ("deg", True)):
+        roll, pitch, yaw = json.loads(elements.copied(f"Roll, pitch, yaw ({unit})"))
+        # R = Rz(yaw) Ry(pitch) Rx(roll), as URDF means it.
+        is_rotation(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=degrees))
+    ros = elements.copied("the ROS 2 command")
+    values = dict(re.findall(r"--([a-z-]+) (\S+)", ros))
+    assert (values["frame-id"], values["child-frame-id"]) == ("tool0", "camera_color_optical_frame")
+    np.testing.assert_allclose([float(values[axis]) for axis in "xyz"], x[:3, 3], atol=1e-9)
+    is_rotation(Rotation.from_quat([float(values[f"q{axis}"]) for axis in "xyzw"]))
+
+    held_out = written["held_out"]
+    said = f"{significant(held_out['translation_mm'])} mm and {significant(held_out['rotation_deg'])}°"
+    assert f"predicted to {said}" in elements.text
+    for std in written["uncertainty"]["translation_std_mm"]:
+        assert f"±{significant(std)} mm" in elements.text
+    for image in written["images"]:
+        if image["used"]:
+            assert f"{significant(image['reprojection_px'])} px" in elements.text
+
+
+def test_rejected_images_say_why(run, page: str):
+    _, result = run
+    images = result.calibration.images
+    assert [k for k, image in enumerate(images) if not image.used] == [WRONG, UNREGISTERED]
+    text = Elements(page).text
+    for k in (WRONG, UNREGISTERED):
+        assert f"Rejected: {images[k].reason}" in text
+
+
+def test_text_from_files_stays_text(page: str):
+    elements = Elements(page)
+    assert "<script>alert" not in page
+    assert len(elements.scripts) == 3  # the scene's data, the 3D view, the copy buttons
+    assert all(f"<i>{name}" in elements.text for name in ("mug", "tape"))
+    scene = json.loads(elements.scripts[0])
+    assert scene["views"][1]["name"] == Path(EVIL).name and Path(EVIL).name in elements.text
+    assert EVIL in [a.get("title") for _, a in elements.found]
+    assert "a & <b>" in elements.text and "a <note> & more" in elements.text
+
+
+def test_page_is_one_small_file(page: str):
+    assert len(page.encode()) < 4e6
+    elements = Elements(page)
+    loads = [a[key] for _, a in elements.found for key in ("src", "href", "srcset", "data") if a.get(key)]
+    assert loads and all(url.startswith("data:image/") for url in loads)
+    assert set(re.findall(r'url\("?(.)', page)) == {"#"}  # to parts of the page itself
+    assert "http:" not in page and "https:" not in page and "@import" not in page
+    policy = next(a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy")
+    assert "default-src 'none'" in policy
+    assert "$" not in elements.text
+
+
+def test_sections_without_a_record_are_left_out(run):
+    capture, result = run
+    bare = report_html(capture, replace(result, cloud=None, scene=None))
+    ids = {a.get("id") for _, a in Elements(bare).found}
+    assert "map" not in ids and {"transform", "scene", "images", "residuals", "uncertainty"} < ids
+    assert "predicted colour" not in bare and "points as measured" not in bare
+
+
+def test_cameras_alone_are_reported_without_tracks_points_or_map(run):
+    capture, result = run
+    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
+    hand_eye = calibrate(capture, reconstruction)
+    content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
+    page = report_html(capture, RunResult(result.out, content, hand_eye, reconstruction))
+    assert "back end marker" in Elements(page).text and 'class="marks"' not in page
+    assert "features refined" not in page
+
+
+def test_untrusted_calibration_is_not_recommended(run):
+    capture, result = run
+    still = capture.base_from_gripper.copy()
+    still[:, :3, :3] = np.eye(3)
+    cameras = still @ result.hand_eye.gripper_from_camera
+    capture = replace(capture, base_from_gripper=still)
+    reconstruction = replace(result.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
+    hand_eye = calibrate(capture, reconstruction)
+    content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
+    page = report_html(capture, RunResult(result.out, content, hand_eye, reconstruction))
+    text = Elements(page).text
+    assert f"Do not trust this calibration: {content.warnings[0]}." in text
+    assert "Trusted:" not in text and "number to believe" not in text
+    assert all(advice in text for advice in content.observability.advice)
+
+
+def test_reprojections_and_poses_to_add_are_those_of_the_run(run, page: str):
+    capture, result = run
+    marks = re.findall(r'<svg class="marks" viewBox="0 0 640 480".*?d="([^"]*)"', page)
+    assert len(marks) == len(result.reconstruction.image_index)
+    ways = np.array([re.findall(r"l(-?\d+) (-?\d+)", path)[:20] for path in marks], float) / MAGNIFIED
+    # The features were moved by 0.3 px along each axis.
+    assert 0.25 < ways.std() < 0.35
+    elements = Elements(page)
+    for k, pose in enumerate(result.calibration.next_poses, start=1):
+        copied = np.array(json.loads(elements.copied(f"pose {k}")))
+        np.testing.assert_allclose(copied, pose.base_from_gripper, atol=1e-6)
+        near = capture.base_from_gripper[capture.images.index(pose.like), :3, 3]
+        assert f"{1e3 * np.linalg.norm(copied[:3, 3] - near):.0f}\u00a0mm" in elements.text
+    assert all(part in elements.text for part in ("left of the tick", "tracked features in red"))
+
+
+def test_unseen_direction_has_a_red_bar(run):
+    capture, result = run
+    turned = capture.base_from_gripper.copy()
+    yaw = np.linspace(0, 2, len(turned))[:, None] * [0.0, 0.0, 1.0]
+    turned[:, :3, :3] = rotation_exp(yaw) @ turned[0, :3, :3]
+    bars = _excitation_bars(turned, result.hand_eye.gripper_from_camera)
+    red = re.findall(r'class="rejected"><th>([^<]*)</th>', bars)
+    assert len(red) == 1 and "offset" in red[0] and bars.index("rejected") < bars.index('"used"')
+
+
+def test_a_run_without_camera_poses_says_why_with_its_images(run, tmp_path: Path):
+    capture, _ = run
+    reason = "only 2 of 12 images share features; lay <textured> things on the table"
+    failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
+    elements = Elements(failed_report_html(capture, failed, tmp_path))
+    assert f"No calibration: {reason}." in elements.text
+    names = [a.get("alt") for tag, a in elements.found if tag == "img"]
+    assert names == list(capture.images)
+    assert "together" in elements.text and "$" not in elements.text
+
+
+def test_uncertainty_of_metres_is_said_in_metres(run):
+    _, result = run
+    covariance = result.hand_eye.covariance.copy()
+    optical = result.hand_eye.gripper_from_camera[:3, 2]
+    for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
+        covariance[:3, :3] = std**2 * np.outer(optical, optical)
+        told = worst_direction(replace(result.hand_eye, covariance=covariance))
+        assert told == f"along the optical axis: {words}"
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.7, 3.0, np.pi - 1e-6])
+def test_uncertainty_of_every_notation_is_what_small_errors_make(angle: float):
+    rng = np.random.default_rng(3)
+    axis = rng.normal(size=3)
+    x = transform(rotation_exp(angle * axis / np.linalg.norm(axis)), rng.normal(size=3))
+    root = 1e-4 * rng.normal(size=(7, 7))
+
+    def values(error: np.ndarray) -> list[np.ndarray]:
+        moved = transform(rotation_exp(error[3:6]) @ x[:3, :3], x[:3, 3] + error[:3])
+        return [part.value for part in notations(moved, np.zeros((7, 7)))]
+
+    for k, part in enumerate(notations(x, root @ root.T)):
+        sides = np.array([[values(sign * column)[k] for sign in (1, -1)] for column in root.T])
+        if part.name == "Quaternion":
+            sides *= np.sign(sides @ part.value)[..., None]
+        if part.name == "Rotation vector" and angle > 3.1:
+            # Beyond a half turn the shorter vector of the same rotation points the other way.
+            length = np.linalg.norm(sides, axis=-1, keepdims=True)
+            sides = np.where(sides @ part.value[:, None] > 0, sides, sides * (1 - 2 * np.pi / length))
+        slopes = (sides[:, 0] - sides[:, 1]) / 2
+        np.testing.assert_allclose(np.linalg.norm(slopes, axis=0), part.std, rtol=1e-5, atol=1e-12)
+
+
+def test_gimbal_lock_is_said():
+    x = transform(Rotation.from_euler("ZYX", [0.4, np.pi / 2, 0.1]).as_matrix(), np.zeros(3))
+    rpy = next(part for part in notations(x, np.eye(7)) if part.unit == "deg")
+    assert "gimbal lock" in rpy.note and not np.isfinite(rpy.std).any()
+    rebuilt = Rotation.from_euler("xyz", rpy.value, degrees=True).as_matrix()
+    np.testing.assert_allclose(rebuilt, x[:3, :3], atol=1e-7)
+
+
+def test_significant_digits():
+    assert [significant(v) for v in (0.0, 1e-9, 0.0123, -0.5, 1.0, 12.34, 1234.5, np.inf)] == [
+        "0", "0", "0.012", "-0.50", "1.0", "12", "1234", "unknown",
+    ]  # fmt: skip
+
+
+def test_figure_places_grippers_where_they_are(run):
+    capture, result = run
+    figure = camera_figure(
+        "t", capture.base_from_gripper, capture.base_from_gripper, None, result.hand_eye.intrinsics, ABOVE
+    )
+    crosses = re.findall(r'class="cross" d="M([\d.-]+) ([\d.-]+)', figure)
+    drawn = np.array(crosses, dtype=float)
+    true = capture.base_from_gripper[:, :2, 3]
+    # From above: x to the right, y up, both at one scale.
+    zoom = np.ptp(drawn[:, 0]) / np.ptp(true[:, 0])
+    np.testing.assert_allclose(drawn - drawn[0], zoom * (true - true[0]) * [1, -1], atol=0.15)
+
+
+def test_rendered_points_are_seen_from_the_front():
+    lens = Intrinsics(100.0, 100.0, 49.5, 29.5, 100, 60)
+    points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 1.0], [0.2, 0.1, 1.0], [0.0, 0.0, -1.0]])
+    color = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]], np.uint8)
+    rgba = rendered_points(points, color, 0.001, lens, 200)
+    assert rgba.shape == (120, 200, 4)
+    assert rgba[60, 100].tolist() == [0, 255, 0, 255]  # the near one hides the far one
+    assert rgba[80, 140].tolist() == [0, 0, 255, 255]
+    assert rgba[5, 5, 3] == 0 and not (rgba[..., :3] == 9).any()
+
+
+def test_surface_is_sampled_on_the_surface(run, tabletop: Path):
+    _, result = run
+    truth = read_truth(tabletop)
+    surface = sample_surface(result.scene, 20_000)
+    x = surface.points_in_base
+    away = np.abs(x[:, 2] - truth.table_height)
+    on_object = np.zeros(len(x), bool)
+    for thing in truth.objects:
+        beyond = np.abs(apply(inverse(thing.base_from_box), x)) - thing.box_size / 2
+        outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+        inside = np.minimum(beyond.max(1), 0)
+        on_object |= np.abs(outside + inside) < away
+        away = np.minimum(away, np.abs(outside + inside))
+    assert 3000 < len(x) <= 20_000
+    assert np.percentile(away, 90) < 2 * CELL
+    # Both the table and what stands on it.
+    assert 0.05 < on_object.mean() < 0.95
+    assert (surface.label[on_object] > 0).mean() > 0.8
+    assert 0.2 < surface.unknown_share < 0.95
+
+    level, upright = slices(result.scene, surface)
+    assert abs(level.at - (truth.table_height + CLEARANCE)) < CELL
+    # In the slice through the objects, the middle of the largest box cannot have been seen.
+    big = max(truth.objects, key=lambda thing: thing.box_size.prod())
+    column, row = ((big.base_from_box[:2, 3] - level.extent[0]) / (level.extent[1] - level.extent[0])).T
+    assert level.unknown[int(row * len(level.unknown)), int(column * level.unknown.shape[1])]
+    assert level.occupancy.shape == level.unknown.shape and upright.axes == (0, 2)
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    browser = Chromium(tmp_path_factory.mktemp("chromium"), "--disable-gpu")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def file(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    path.write_text(page)
+    return path
+
+
+def test_in_a_browser(chromium: Chromium, file: Path):
+    chromium.events.clear()
+    chromium.open(file.as_uri(), 1280)
+    picture = chromium.picture("#scene")
+    drawn = picture[(picture != picture[20, 20]).any(-1)]
+    assert len(drawn) > 0.05 * picture.shape[0] * picture.shape[1]
+    assert len(np.unique(drawn, axis=0)) > 200
+
+    # Turned by the mouse, it shows something else; every layer and switch changes it too.
+    x, y = chromium.center("#scene")
+    before = chromium.picture("#scene")
+    mouse = {"button": "left", "buttons": 1, "clickCount": 1}
+    chromium.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
+    for k in range(1, 5):
+        chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 20 * k, y=y + 5 * k, **mouse)
+    chromium.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 80, y=y + 20, **mouse)
+    pictures = [before, chromium.picture("#scene")]
+    for control in (
+        'input[name="scene-layer"][value="1"]',
+        'input[name="scene-layer"][value="2"]',
+        "#scene-cameras",
+        "#scene-grippers",
+        "#scene-grid",
+        "#scene-tracks",
+        "#scene-next",
+        '[data-look="[-90, 89]"]',
+        '[data-through="1"]',
+    ):
+        chromium.js(f"document.querySelector('{control}').click()")
+        pictures.append(chromium.picture("#scene"))
+    for one, two in itertools.pairwise(pictures):
+        assert (one != two).any()
+    # Out of a camera, the photograph can be laid over the map.
+    assert chromium.js("document.getElementById('scene-photo').naturalWidth") > 100
+
+    chromium.call("Browser.grantPermissions", permissions=["clipboardReadWrite"])
+    copied = chromium.js(
+        "(async () => { const out = []; for (const b of document.querySelectorAll('[data-copy]'))"
+        " { b.click(); await new Promise(done => setTimeout(done, 50)); out.push([b.dataset.copy,"
+        " await navigator.clipboard.readText(), b.textContent]); } return out; })()"
+    )
+    assert len(copied) == 8 + 2  # notations, and poses to add
+    for wanted, found, label in copied:
+        assert wanted == found and label == "copied"
+    _assert_quiet(chromium)
+
+
+def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
+    chromium.events.clear()
+    chromium.open(file.as_uri(), 400, phone=True)
+    assert chromium.js("document.documentElement.scrollWidth") <= 400
+    light = chromium.js("getComputedStyle(document.body).backgroundColor")
+    x, y = chromium.center("#scene")
+    time.sleep(0.1)  # the emulated finger is refused while the page still scrolls
+    before = chromium.picture("#scene")
+    finger = [{"x": x, "y": y, "id": 0}]
+    chromium.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=finger)
+    for k in range(1, 6):
+        moved = [{"x": x + 12 * k, "y": y, "id": 0}]
+        chromium.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=moved)
+    chromium.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    assert (chromium.picture("#scene") != before).any()
+
+    chromium.open(file.as_uri(), 1280, scheme="dark")
+    dark = chromium.js("getComputedStyle(document.body).backgroundColor")
+    assert sum(map(int, re.findall(r"\d+", dark)[:3])) < 200 < sum(map(int, re.findall(r"\d+", light)[:3]))
+    printed = base64.b64decode(chromium.call("Page.printToPDF")["data"])
+    assert printed.startswith(b"%PDF") and len(printed) > 50_000
+    _assert_quiet(chromium)
+
+
+def _assert_quiet(chromium: Chromium) -> None:
+    """No error, no message, no dialogue, and nothing asked of any network."""
+    noise = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded", "Page.javascriptDialog")
+    assert not [event for event in chromium.events if event["method"].startswith(noise)]
+    asked = [e["params"]["request"]["url"] for e in chromium.events if e["method"].endswith("WillBeSent")]
+    assert asked and all(url.startswith(("file:", "data:")) for url in asked)

@@ -1,0 +1,235 @@
+"""Images added to a calibrated run, of scenes in which a thing was taken away or put down."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from jcr.camera import rays, resized, undistort_image
+from jcr.capture.added import read_added, read_pose, with_images, write_added
+from jcr.capture.read import read_capture
+from jcr.errors import InputError
+from jcr.geometry import inverse, scale_translation, transform
+from jcr.reconstruct.added import extend
+from jcr.records import Capture, HandEye, Observability, Reconstruction, RobotNoise, Tracks
+from jcr.represent.build import build_scene
+from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.represent.options import MapOptions
+from jcr.represent.scene import SceneMap
+from jcr.simulate.capture import SimulateOptions, simulate
+from jcr.simulate.render import render
+from jcr.simulate.scenes import Scene, make_scene
+from jcr.simulate.truth import Truth, read_truth, true_depth
+
+pytestmark = pytest.mark.gl
+
+SCALE = 0.37
+"""Metres per unit of the reconstruction."""
+SIZE = 240, 180
+VIEWS = 10
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    folder = tmp_path_factory.mktemp("capture") / "sim"
+    return read_capture(simulate(folder, SimulateOptions(scene="measuring", images=VIEWS, seed=3)))
+
+
+@pytest.fixture(scope="module")
+def truth(capture: Capture) -> Truth:
+    return read_truth(capture.folder)
+
+
+def scene_of(truth: Truth, without: str = "") -> Scene:
+    """The true scene, with one thing taken away."""
+    scene = make_scene("measuring", truth.seed)
+    return replace(scene, objects=tuple(thing for thing in scene.objects if thing.name != without))
+
+
+def known_reconstruction(
+    truth: Truth, capture: Capture, scene: Scene, views: int
+) -> tuple[Reconstruction, HandEye]:
+    """What a back end would find of the first views of a scene, in a frame and unit of its own."""
+    pinhole = resized(truth.intrinsics, *SIZE)
+    base_from_camera = truth.base_from_camera[:views]
+    base_from_recon = transform(
+        cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))[0].astype(float), np.array([0.2, 0.1, 0.3])
+    )
+    recon_from_camera = scale_translation(inverse(base_from_recon) @ base_from_camera, 1 / SCALE)
+    points, confidence, colors = [], [], []
+    for view, recon_from in zip(
+        render(scene, truth.intrinsics, base_from_camera), recon_from_camera, strict=True
+    ):
+        assert view.depth is not None
+        depth = cv2.resize(view.depth, SIZE, interpolation=cv2.INTER_NEAREST) / SCALE
+        x_in_camera = depth[..., None] * rays(pinhole)
+        points.append(x_in_camera @ recon_from[:3, :3].T + recon_from[:3, 3])
+        confidence.append((depth > 0).astype(float))
+        colors.append(undistort_image(view.image, truth.intrinsics, pinhole))
+    points_in_recon = np.stack(points)
+    some = np.random.default_rng(0).choice(np.flatnonzero(np.ravel(confidence)), 2000, replace=False)
+    x = points_in_recon.reshape(-1, 3)[some]
+    image, point, x_px = [], [], []
+    for k, camera_from_recon in enumerate(inverse(recon_from_camera)):
+        seen = x @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3]
+        pixel = seen[:, :2] / seen[:, 2:] * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy]
+        inside = ((pixel > 0) & (pixel < np.array(SIZE) - 1)).all(1) & (seen[:, 2] > 0)
+        image.append(np.full(inside.sum(), k))
+        point.append(np.flatnonzero(inside))
+        x_px.append(pixel[inside])
+    tracks = Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), x)
+    reconstruction = Reconstruction(
+        image_index=np.arange(views),
+        recon_from_camera=recon_from_camera,
+        intrinsics=truth.intrinsics,
+        pointmap_intrinsics=pinhole,
+        points_in_recon=points_in_recon,
+        confidence=np.stack(confidence),
+        colors=np.stack(colors),
+        tracks=tracks,
+        backend="truth",
+    )
+    hand_eye = HandEye(
+        gripper_from_camera=truth.gripper_from_camera,
+        scale=SCALE,
+        base_from_recon=base_from_recon,
+        covariance=1e-10 * np.eye(7),
+        inliers=np.ones(views, bool),
+        translation_residual_m=np.zeros(views),
+        rotation_residual_rad=np.zeros(views),
+        observability=Observability(True, (), ()),
+        robot_noise=RobotNoise(0.0, 0.0, False),
+        residual_translation=0.0,
+        residual_rotation=0.0,
+        converged=True,
+    )
+    return reconstruction, hand_eye
+
+
+def beside(truth: Truth, row: int, count: int) -> np.ndarray:
+    """Camera places 7 cm apart, the first that of an image: near enough for their pictures to be compared."""
+    aside = transform(np.eye(3), np.array([[0.07, 0, 0]]) * np.arange(count)[:, None])
+    return truth.base_from_camera[row] @ aside
+
+
+def added_views(
+    folder: Path, truth: Truth, capture: Capture, scene: Scene, base_from_camera: np.ndarray
+) -> Capture:
+    """Pictures of a scene from new places, added to a run in `folder`."""
+    pairs = []
+    for k, view in enumerate(render(scene, truth.intrinsics, base_from_camera, with_truth=False)):
+        image, pose = folder / f"new{k}.png", folder / f"new{k}.json"
+        cv2.imwrite(str(image), view.image[..., ::-1])
+        base_from_gripper = base_from_camera[k] @ inverse(truth.gripper_from_camera)
+        pose.write_text(json.dumps(base_from_gripper.tolist()))
+        pairs.append((image, pose))
+    return with_images(read_added(folder, capture), pairs)
+
+
+def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> SceneMap:
+    box = tuple(truth.workspace_in_base.ravel().tolist())
+    cloud = point_cloud(capture, reconstruction, hand_eye, options=CloudOptions(confidence_percentile=0.0))
+    return build_scene(cloud, MapOptions(workspace=box))
+
+
+def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
+    """Points in the inner half of a thing's box, well above the table."""
+    thing = next(thing for thing in truth.objects if thing.name == name)
+    low, high = np.array([-0.25, -0.25, -0.1]), np.array([0.25, 0.25, 0.4])
+    x = np.random.default_rng(0).uniform(low, high, (count, 3)) * thing.box_size
+    return x @ thing.base_from_box[:3, :3].T + thing.base_from_box[:3, 3]
+
+
+def test_a_thing_that_was_taken_away_leaves_the_map(truth: Truth, capture: Capture, tmp_path: Path):
+    before, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 6)
+    places = np.concatenate([beside(truth, 0, 2), beside(truth, 4, 2)])
+    new = added_views(tmp_path, truth, capture, scene_of(truth, without="toolbox"), places)
+    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    assert len(after.recon_from_camera) == 10
+    # The last images of the capture found no place; the new ones are no such image.
+    assert after.image_index.tolist() == [0, 1, 2, 3, 4, 5, 10, 11, 12, 13]
+    x = within(truth, "toolbox")
+    old, fresh = mapped(truth, capture, before, hand_eye), mapped(truth, capture, after, hand_eye)
+    assert (old.query(x, unknown="occupied").occupancy > 0.5).mean() > 0.85  # there is air under the handle
+    assert (fresh.query(x, unknown="occupied").occupancy < 0.5).mean() > 0.8
+    stayed = within(truth, "box")
+    assert (fresh.query(stayed, unknown="occupied").occupancy > 0.5).mean() > 0.98
+
+
+def test_a_thing_that_was_put_down_enters_the_map(truth: Truth, capture: Capture, tmp_path: Path):
+    before, hand_eye = known_reconstruction(truth, capture, scene_of(truth, without="box"), 6)
+    places = np.concatenate([beside(truth, 0, 3), beside(truth, 5, 3)])
+    new = added_views(tmp_path, truth, capture, scene_of(truth), places)
+    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    x = within(truth, "box")
+    old, fresh = mapped(truth, capture, before, hand_eye), mapped(truth, capture, after, hand_eye)
+    assert (old.query(x, unknown="occupied").occupancy < 0.5).mean() > 0.9
+    assert (fresh.query(x, unknown="occupied").occupancy > 0.5).mean() > 0.75
+    stayed = within(truth, "toolbox")
+    assert (fresh.query(stayed, unknown="occupied").occupancy > 0.5).mean() > 0.85
+
+
+def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
+    truth: Truth, capture: Capture, tmp_path: Path
+):
+    before, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 8)
+    new = added_views(tmp_path, truth, capture, scene_of(truth), truth.base_from_camera[8:9])
+    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    known = before.confidence > 0
+    assert (after.confidence[:8][known] > 0).mean() > 0.98
+    camera_from_recon = inverse(after.recon_from_camera[8])
+    depth = (
+        SCALE * (after.points_in_recon[8] @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3])[..., 2]
+    )
+    true = cv2.resize(true_depth(truth, 8), SIZE, interpolation=cv2.INTER_NEAREST)
+    found = (after.confidence[8] > 0) & (true > 0)
+    assert found.mean() > 0.3
+    assert np.median(np.abs(depth / true - 1)[found]) < 0.005
+
+
+def test_added_images_are_kept_and_wrong_ones_refused(truth: Truth, capture: Capture, tmp_path: Path):
+    assert len(read_added(tmp_path, capture)) == 0
+    added = added_views(tmp_path, truth, capture, scene_of(truth), truth.base_from_camera[:1])
+    assert len(read_added(tmp_path, capture)) == 0  # not yet part of the run
+    write_added(added, capture)
+    again = read_added(tmp_path, capture)
+    assert again.images == added.images
+    assert np.allclose(again.base_from_gripper, truth.base_from_gripper[:1])
+    image, pose = tmp_path / "new0.png", tmp_path / "new0.json"
+    with pytest.raises(InputError, match="added before"):
+        with_images(again, [(image, pose)])
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), np.zeros((30, 40, 3), np.uint8))
+    with pytest.raises(InputError, match="40x30"):
+        with_images(again, [(small, pose)])
+    with pytest.raises(InputError, match="another folder"):
+        read_added(tmp_path, replace(capture, folder=tmp_path))
+    (tmp_path / "added" / again.images[0]).unlink()
+    with pytest.raises(InputError, match="is gone"):
+        read_added(tmp_path, capture)
+
+
+def test_poses_are_read_from_json_npy_and_text(tmp_path: Path):
+    pose = transform(np.eye(3), np.array([0.4, -0.1, 0.5]))
+    files = {name: tmp_path / name for name in ("a.json", "b.json", "c.npy", "d.txt")}
+    files["a.json"].write_text(json.dumps(pose.tolist()))
+    files["b.json"].write_text(json.dumps({"base_from_gripper": pose.tolist()}))
+    np.save(files["c.npy"], pose)
+    np.savetxt(files["d.txt"], pose, delimiter=", ")
+    for file in files.values():
+        assert np.allclose(read_pose(file), pose), file
+    wrong = tmp_path / "e.json"
+    for value, says in (
+        ((np.diag([1000.0, 1000, 1000, 1]) @ pose).tolist(), "no rotation"),
+        (transform(np.eye(3), np.array([400.0, -100, 500])).tolist(), "millimetres"),
+        ([[1, 2], [3, 4]], "4x4"),
+        ({"pose": 1}, "base_from_gripper"),
+    ):
+        wrong.write_text(json.dumps(value))
+        with pytest.raises(InputError, match=says):
+            read_pose(wrong)
+    with pytest.raises(InputError, match="no such pose file"):
+        read_pose(tmp_path / "none.json")

@@ -1,0 +1,246 @@
+"""`--backend auto`: which one it takes, when it tries a second, which it keeps, and what it says."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from jcr import auto
+from jcr.calibration import stage as calibration_stage
+from jcr.calibration.stage import CalibrateOptions
+from jcr.cli import dispatch
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import rotation_exp, transform
+from jcr.reconstruct.backends import Backend, ReconstructOptions, candidates
+from jcr.reconstruct.checkpoints import CHECKPOINTS, Checkpoint
+from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
+
+GARBAGE = {
+    "enc_embed_dim": 32,
+    "enc_depth": 1,
+    "enc_num_heads": 2,
+    "dec_embed_dim": 32,
+    "dec_depth": 1,
+    "dec_num_heads": 2,
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch):
+    """The search for other readings of the poses takes seconds and is tested elsewhere."""
+    monkeypatch.setattr(calibration_stage, "better_reading", lambda gripper, camera: None)
+
+
+@pytest.fixture
+def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of the back ends whose weights are to count as present; none at first."""
+    names: set[str] = set()
+    hub_ids = {checkpoint.hub_id: name for name, checkpoint in CHECKPOINTS.items()}
+    monkeypatch.setattr(Checkpoint, "is_cached", lambda self: hub_ids[self.hub_id] in names)
+    monkeypatch.setattr(Backend, "is_installed", lambda self: True)
+    return names
+
+
+def test_the_best_whose_weights_are_here_comes_first(present: set[str], monkeypatch: pytest.MonkeyPatch):
+    assert candidates(ReconstructOptions()) == ("colmap", "direct")
+    present |= {"dust3r", "mapanything"}
+    assert candidates(ReconstructOptions()) == ("dust3r", "mapanything", "colmap", "direct")
+    present.add("mast3r")
+    assert candidates(ReconstructOptions())[0] == "mast3r"
+    monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
+    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
+    present.add("compact")
+    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "compact")
+    assert candidates(ReconstructOptions("colmap")) == ("colmap",)
+    assert candidates(ReconstructOptions(weights="pairs.npz")) == ("predictions",)
+    assert candidates(ReconstructOptions(board="chessboard:9x6:0.025")) == ("marker",)
+    assert candidates(ReconstructOptions(weights="folder")) == ("dust3r", "colmap")
+
+
+def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
+    lens = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+    nothing = np.zeros((len(poses), 2, 2))
+    tracks = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    return Reconstruction(
+        image_index=np.arange(len(poses)),
+        recon_from_camera=poses,
+        intrinsics=lens,
+        pointmap_intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
+        points_in_recon=np.zeros((len(poses), 2, 2, 3)),
+        confidence=nothing,
+        colors=nothing[..., None].repeat(3, -1).astype(np.uint8),
+        tracks=tracks,
+        backend=backend,
+    )
+
+
+def auto_result(
+    problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
+) -> tuple[Reconstruction, list[str]]:
+    """What auto keeps where each back end gives these camera poses or this error, and which ones it ran."""
+    tried = []
+
+    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        tried.append(options.backend)
+        answer = answers[options.backend]
+        if isinstance(answer, Exception):
+            raise answer
+        return reconstruction(options.backend, answer)
+
+    monkeypatch.setattr(auto, "reconstruct", door)
+    names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
+    capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    best = auto.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
+    return best.reconstruction, tried
+
+
+def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("mast3r")
+    rng = np.random.default_rng(0)
+    problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, 5e-4))
+    good = problem.recon_from_camera
+    shuffled = good[rng.permutation(8)]
+
+    kept, tried = auto_result(problem, {"mast3r": good}, monkeypatch)
+    assert tried == ["mast3r"] and kept.backend == "mast3r"
+    assert kept.notes[0] == "back end mast3r, the best whose weights are on this machine"
+
+    kept, tried = auto_result(problem, {"mast3r": shuffled, "colmap": good}, monkeypatch)
+    assert tried == ["mast3r", "colmap"] and kept.backend == "colmap"
+    assert "mast3r, the best whose weights are on this machine, is not to be trusted (" in kept.notes[0]
+    assert "colmap (held-out error" in kept.notes[0] and "used instead of mast3r" in kept.notes[0]
+
+    nothing = NotTrustedError("0 of 8 images registered")
+    kept, _ = auto_result(problem, {"mast3r": nothing, "colmap": good}, monkeypatch)
+    assert kept.backend == "colmap" and "gave nothing (0 of 8" in kept.notes[0]
+    kept, _ = auto_result(problem, {"mast3r": shuffled, "colmap": nothing}, monkeypatch)
+    assert kept.backend == "mast3r" and "colmap gave nothing (0 of 8" in kept.notes[0]
+    damaged = InputError("model.safetensors: damaged")
+    kept, _ = auto_result(problem, {"mast3r": damaged, "colmap": good}, monkeypatch)
+    assert kept.backend == "colmap" and "damaged" in kept.notes[0]
+    with pytest.raises(NotTrustedError, match="0 of 8"):
+        auto_result(problem, {"mast3r": damaged, "colmap": nothing}, monkeypatch)
+
+
+def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("dust3r")
+    rng = np.random.default_rng(1)
+    problem = hand_eye_problem(rng, 8)
+    poor, hopeless = (
+        hand_eye_problem(np.random.default_rng(1), 8, camera_noise=(size, 4 * size)).recon_from_camera
+        for size in (0.05, 0.3)
+    )
+    for answers, name in (
+        ({"dust3r": poor, "colmap": hopeless}, "dust3r"),
+        ({"dust3r": hopeless, "colmap": poor}, "colmap"),
+    ):
+        kept, tried = auto_result(problem, answers, monkeypatch)
+        assert tried == ["dust3r", "colmap"] and kept.backend == name
+        assert f"nor is colmap; {name} (held-out error" in kept.notes[0]
+
+
+def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good = problem.recon_from_camera
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    nothing = NotTrustedError("0 of 8 images registered")
+    for second in ("direct", "compact"):
+        kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
+        assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
+        kept, tried = auto_result(problem, {"colmap": shuffled, second: good}, monkeypatch)
+        assert tried == ["colmap", second] and kept.backend == second
+        kept, tried = auto_result(problem, {"colmap": nothing, second: good}, monkeypatch)
+        assert tried == ["colmap", second] and kept.backend == second
+        assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
+        present.add("compact")
+
+
+def test_no_other_back_end_cures_a_motion_that_shows_too_little(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("dust3r")
+    problem = hand_eye_problem(np.random.default_rng(2), 8, pattern="translation")
+    kept, tried = auto_result(problem, {"dust3r": problem.recon_from_camera}, monkeypatch)
+    assert tried == ["dust3r"] and kept.backend == "dust3r"
+
+
+@pytest.fixture
+def garbage_weights(tmp_path: Path) -> Path:
+    """A folder of weights that no training touched."""
+    torch.manual_seed(0)
+    network = Dust3r(**GARBAGE)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    save_file(
+        {k: v.contiguous().clone() for k, v in network.state_dict().items()}, folder / "model.safetensors"
+    )
+    (folder / "config.json").write_text(json.dumps(GARBAGE))
+    return folder
+
+
+def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_weights(
+    tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    weights = load_file(garbage_weights / "model.safetensors")
+    flat = {key: 0 * tensor if "downstream" in key else tensor for key, tensor in weights.items()}
+    save_file(flat, garbage_weights / "model.safetensors")
+    (garbage_weights / "config.json").write_text(json.dumps(GARBAGE | {"licence": "for tests alone"}))
+    frames = []
+    for k in range(3):
+        grey = np.full((48, 64, 3), 90 + 5 * k, np.uint8)
+        grey[20 + k, 30] = 255
+        cv2.imwrite(str(tmp_path / f"{k}.png"), grey)
+        pose = transform(rotation_exp(np.array([0.3 * k, 0.2, 0.1 * k * k])), np.array([0.1 * k, 0.0, 0.3]))
+        frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
+    lens = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0] * 5}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    for backend in ("auto", "dust3r"):
+        out = tmp_path / backend
+        command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
+        assert dispatch(command) == 3
+        licence = f"weights {garbage_weights}: licence for tests alone"
+        assert licence in " ".join(json.loads((out / "calibration.json").read_text())["warnings"])
+        assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
+        assert licence in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says_so(
+    tabletop: Path, tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    capture = tmp_path / "capture"
+    (capture / "images").mkdir(parents=True)
+    content = json.loads((tabletop / "capture.json").read_text())
+    content["frames"] = content["frames"][:5]
+    for frame in content["frames"]:
+        shutil.copy(tabletop / frame["image"], capture / frame["image"])
+    (capture / "capture.json").write_text(json.dumps(content))
+    out = tmp_path / "out"
+    arguments = [str(capture), str(out), "--weights", str(garbage_weights), "--quiet"]
+    assert dispatch(["calibrate", *arguments]) == 0
+    found = json.loads((out / "calibration.json").read_text())
+    assert found["backend"] == "colmap" and found["converged"]
+    why = next(text for text in found["warnings"] if text.startswith("back end dust3r"))
+    assert "colmap" in why and ("not to be trusted" in why or "gave nothing" in why)
+    assert why in (out / "log.txt").read_text()
+    # Its own answer, asked for by name, is not trusted.
+    assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3
+    found = json.loads((out / "calibration.json").read_text())
+    assert found["backend"] == "dust3r" and not found["converged"]
+    licence = next(text for text in found["warnings"] if "licence" in text)
+    assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()
