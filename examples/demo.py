@@ -1,10 +1,6 @@
-"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth.
-
-BACKEND=compact in the environment shows the network that comes with the package instead of COLMAP.
-"""
+"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth."""
 
 import json
-import os
 import time
 from pathlib import Path
 
@@ -18,9 +14,8 @@ from jcr.progress import progress_bars
 root = Path(__file__).parent.parent
 start = time.perf_counter()
 capture = jcr.read_capture(root / "examples/tabletop")
-backend = os.environ.get("BACKEND", "auto")
 with progress_bars() as progress:
-    result = jcr.run(capture, root / "out/demo", backend=backend, progress=progress)
+    result = jcr.run(capture, root / "out/demo", progress=progress)
 seconds = time.perf_counter() - start
 
 hand_eye = result.hand_eye

@@ -84,14 +84,6 @@ def image_grid(
     return ImageGrid(original_size, resized, corner, (2 * half[0], 2 * half[1]))
 
 
-def cover_grid(original_size: tuple[int, int], size: tuple[int, int]) -> ImageGrid:
-    """The middle of an image of `original_size`, as large as it can be, at `size` (both width, height)."""
-    scale = max(size[0] / original_size[0], size[1] / original_size[1])
-    resized = (round(scale * original_size[0]), round(scale * original_size[1]))
-    corner = ((resized[0] - size[0]) // 2, (resized[1] - size[1]) // 2)
-    return ImageGrid(original_size, resized, corner, size)
-
-
 @dataclass(frozen=True)
 class PreparedImages:
     """A capture's images as the network reads them."""

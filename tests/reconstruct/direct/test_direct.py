@@ -1,13 +1,9 @@
 """Direct alignment finds the camera on plain tables, says how surely, and refuses what it cannot tell."""
 
-import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from jcr.reconstruct.compact import CompactOptions, rough_hand_eye
-from jcr.reconstruct.epipolar import EpipolarHandEye
 from PIL import Image
 
 from jcr.calibration.stage import calibrate
@@ -16,8 +12,6 @@ from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
-from jcr.reconstruct import compact
-from jcr.reconstruct.checkpoints import COMPACT
 from jcr.reconstruct.direct.coarse_to_fine import axes_meet, free_directions, moved
 from jcr.reconstruct.direct.direct import DirectOptions, evening, pyramid, reconstruct
 from jcr.reconstruct.direct.photometric import (
@@ -72,29 +66,6 @@ def test_a_picture_of_another_pose_is_left_out_and_named(plain):
     assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
     x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
     assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
-
-
-def test_the_network_of_this_package_gives_a_start_from_which_colours_go_on(plain):
-    capture, truth = plain
-    true = truth.gripper_from_camera
-    rough, _ = rough_hand_eye(capture, CompactOptions())
-    assert isinstance(rough, EpipolarHandEye)
-    assert rotation_between_deg(rough.gripper_from_camera[:3, :3], true[:3, :3]) < 15
-    assert np.linalg.norm(rough.gripper_from_camera[:3, 3] - true[:3, 3]) < 0.15
-    made = compact.reconstruct(capture, CompactOptions(direct=SPARSE))
-    assert made.backend == "compact" and "gave a first start" in made.notes[0] and "licence" in made.notes[1]
-    x = calibrate(capture, made).gripper_from_camera
-    assert np.linalg.norm(x[:3, 3] - true[:3, 3]) < 3e-3
-
-
-def test_weights_that_do_not_match_pictures_are_refused(plain, tmp_path):
-    for name in ("config.json", "model.safetensors"):
-        shutil.copy(COMPACT / name, tmp_path)
-    config = json.loads((tmp_path / "config.json").read_text())
-    del config["matching_block"]
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InputError, match="do not match pictures"):
-        compact.reconstruct(plain[0], CompactOptions(str(tmp_path)))
 
 
 def test_pictures_of_other_poses_are_refused(plain):

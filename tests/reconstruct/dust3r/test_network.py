@@ -10,7 +10,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from jcr.memory import give_back
 from jcr.reconstruct.dust3r.network import (
@@ -172,30 +171,6 @@ def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
 def test_a_configuration_of_another_network_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValueError, match=field):
         Dust3r(**{field: value})
-
-
-@pytest.mark.parametrize(("patch", "stem"), [(4, "PatchEmbedDust3R"), (8, "ConvolutionalStem")])
-def test_small_patches_give_a_point_per_pixel_too(patch: int, stem: str) -> None:
-    torch.manual_seed(0)
-    network = Dust3r(
-        enc_embed_dim=32, enc_depth=1, enc_num_heads=2, dec_embed_dim=32, dec_depth=1, dec_num_heads=2,
-        patch_size=patch, patch_embed_cls=stem,
-    )  # fmt: skip
-    images = torch.randn(2, 3, 24, 32)
-    features = network.encode(images)
-    assert features.tokens.shape == (2, 24 * 32 // patch**2, 32)
-    view, _ = network.decode(features, features)
-    assert view.points.shape == (2, 24, 32, 3)
-    # A token sees its own patch, and what lies far away only where it is told of it later.
-    far, near = images.clone(), images.clone()
-    far[:, :, -2:, -2:] += 1
-    near[:, :, :2, :2] += 1
-    first = [network.patch_embed.proj(getattr(network.patch_embed, "layers", nn.Identity())(x))[..., 0, 0]
-             for x in (images, far, near)]  # fmt: skip
-    change = [(x - first[0]).abs().amax() for x in first[1:]]
-    assert change[0] < 0.2 * change[1]
-    with pytest.raises(ValueError, match="patch_size"):
-        Dust3r(patch_size=patch, head_type="dpt", dec_depth=12)
 
 
 def test_an_image_that_is_no_whole_number_of_patches_is_refused() -> None:

@@ -7,7 +7,7 @@ From there coarse to fine, with a depth for each of a few thousand pixels; in th
 that what disagrees with the robot's motion shows.
 
 Pointmaps come from the plane sweep, which knows depth near edges only: on plain tables a tenth of the pixels.
-docs/results/compact.md says what it gives with and without a start, on simulated and real captures.
+docs/plain-tables.md says when, and what it gives.
 """
 
 from collections.abc import Sequence
@@ -66,17 +66,13 @@ class DirectOptions(DenseOptions):
 
 
 def reconstruct(
-    capture: Capture,
-    options: DirectOptions | None = None,
-    progress: Progress | None = None,
-    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    capture: Capture, options: DirectOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
     """Camera poses by the colours of a capture's images, with the robot's poses to start from.
 
-    A rough `gripper_from_camera` (tens of degrees and centimetres off) is one start among others, none is needed. Known
-    intrinsics are held, else a focal length is estimated. The unit is the robot's metre only roughly, the frame is the
-    first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and NotTrustedError
-    where another place of the camera fits as well, or too few pixels are explained.
+    Known intrinsics are held, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
+    is the first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and
+    NotTrustedError where another place of the camera fits as well, or too few pixels are explained.
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
@@ -87,7 +83,7 @@ def reconstruct(
     lens = given or _guessed_lens(capture.image_size)
     levels = pyramid(images, lens)
     held = given is not None
-    found = search(levels, capture.base_from_gripper, gripper_from_camera, held, report)
+    found = search(levels, capture.base_from_gripper, held, report)
     factor = evening(levels[FREED[0].height], found.cameras)
     levels = {height: level.times(factor) for height, level in levels.items()}
     rows, cameras = fitting_images(levels[FREED[0].height], found.cameras, held)

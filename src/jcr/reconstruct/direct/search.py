@@ -33,7 +33,6 @@ SIZES = (COARSEST.height, COARSE.height, JUDGE.height)
 def search(
     levels: dict[int, Level],
     base_from_gripper: Float[ndarray, "n 4 4"],
-    gripper_from_camera: Float[ndarray, "4 4"] | None,
     lens_held: bool,
     report: Progress,
 ) -> Found:
@@ -49,8 +48,6 @@ def search(
         return judged(levels[screen.height], Cameras(base_from_gripper @ x), screen)
 
     ranked = _best_first([screened(x) for x in starts_from_nothing(base_from_gripper)])[:KEPT]
-    if gripper_from_camera is not None:
-        ranked.insert(0, screened(gripper_from_camera))
     coarse = []
     for k, start in enumerate(ranked):
         report("direct alignment", 0.1 + 0.4 * k / len(ranked))

@@ -5,15 +5,11 @@ Weinzaepfel et al., ICCV 2023); a head per view turns tokens into a 3D point and
 either linear or a dense prediction transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are those of
 the published checkpoints, because they are the keys of the state dict.
 
-Beside the published shapes there are two for small networks: patches of 4 or 8 pixels, and a stem of
-convolutions that makes the tokens (Xiao et al., NeurIPS 2021).
-
-Shapes: b images or pairs, n tokens = h/p · w/p with patches of p pixels (16 where published), c channels.
+Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
 """
 
 import re
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -73,17 +69,13 @@ class Dust3r(nn.Module):
         landscape_only: bool = False,
         freeze: str = "none",
     ) -> None:
-        """The last three say how the published network was trained and change nothing here."""
+        """The last four say how the published network was trained and change nothing here."""
         super().__init__()
-        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)(\+cosine)?", pos_embed)
+        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", pos_embed)
         expected = {
-            "pos_embed": (pos_embed, frequency, "RoPE100 or RoPE100+cosine"),
+            "pos_embed": (pos_embed, frequency, "RoPE100"),
             "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
-            "patch_size": (
-                patch_size,
-                patch_size == PATCH or (patch_size in (4, 8) and head_type == "linear"),
-                f"{PATCH}, or with a linear head 4 or 8",
-            ),
+            "patch_size": (patch_size, patch_size == PATCH, PATCH),
             "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
             "depth_mode": (
                 depth_mode,
@@ -98,15 +90,11 @@ class Dust3r(nn.Module):
                 raise ValueError(f"{name} = {value!r} is not covered; it must be {cure}")
         assert frequency is not None
         self.rope_base = float(frequency[1])
-        self.absolute_position = frequency[2] is not None
-        """Tokens are told where they are, and not only where from each other: learnt sooner, but at one size."""
         self.head_dims = (enc_embed_dim // enc_num_heads, dec_embed_dim // dec_num_heads)
         self.mixed_precision: bool | None = None
         """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
 
-        self.patch = patch_size
-        stem = patch_embed_cls == "ConvolutionalStem"
-        self.patch_embed = (ConvolutionalStem if stem else PatchEmbed)(enc_embed_dim, patch_size)
+        self.patch_embed = PatchEmbed(enc_embed_dim)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_embed_dim))  # only its pre-training used it
         self.enc_blocks = nn.ModuleList(
             EncoderBlock(enc_embed_dim, enc_num_heads, mlp_ratio) for _ in range(enc_depth)
@@ -119,7 +107,7 @@ class Dust3r(nn.Module):
         )
         self.dec_norm = nn.LayerNorm(dec_embed_dim, eps=1e-6)
         self.downstream_head1, self.downstream_head2 = (
-            LinearHead(dec_embed_dim, patch_size)
+            LinearHead(dec_embed_dim)
             if head_type == "linear"
             else DptHead(enc_embed_dim, dec_embed_dim, dec_depth)
             for _ in range(2)
@@ -132,7 +120,7 @@ class Dust3r(nn.Module):
         true_shape1: Int[Tensor, "b 2"] | None = None,
         true_shape2: Int[Tensor, "b 2"] | None = None,
     ) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of images in [-1, 1] whose height and width are multiples of the patch.
+        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16.
 
         A row whose true (height, width) is the transpose of the tensor's is a portrait image that was laid
         down to batch it with landscape ones; it is stood up for the network, its pointmap laid down again.
@@ -159,17 +147,15 @@ class Dust3r(nn.Module):
 
         With `many_pairs` the heads' finest level is made here too, a fifth of a head's work, and kept.
         """
-        if images.shape[-2] % self.patch or images.shape[-1] % self.patch:
+        if images.shape[-2] % PATCH or images.shape[-1] % PATCH:
             raise ValueError(
-                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {self.patch}"
+                f"images are {tuple(images.shape[-2:])}; height and width must be multiples of {PATCH}"
             )
         with self._autocast(images):
-            grid = (images.shape[-2] // self.patch, images.shape[-1] // self.patch)
+            grid = (images.shape[-2] // PATCH, images.shape[-1] // PATCH)
             rotary = rotary_embedding(grid_positions(grid, images.device), self.head_dims[0], self.rope_base)
             # Under autocast the blocks compute in bfloat16 and add to tokens that stay float32.
             x = self.patch_embed(images).float()
-            if self.absolute_position:
-                x = x + position_code(grid, x.shape[-1], images.device)
             for block in self.enc_blocks:
                 x = block(x, rotary)
             tokens = self.enc_norm(x)
@@ -188,16 +174,6 @@ class Dust3r(nn.Module):
                 self.downstream_head2(layers2, features2.grid, features2.finest[1]),
             )
 
-    def decode_both_orders(self, features1: Features, features2: Features) -> tuple[Pointmap, Pointmap]:
-        """What `decode` gives for (1, 2), and below it that for (2, 1), where one decoder serves both views."""
-        with self._autocast(features1.tokens):
-            last = [layers[-1] for layers in self.decoder_layers(features1, features2)]
-            one, other = torch.cat(last), torch.cat(last[::-1])
-            return (
-                self.downstream_head1([one], features1.grid),
-                self.downstream_head2([other], features1.grid),
-            )
-
     def decoder_layers(self, features1: Features, features2: Features) -> tuple[list[Tensor], list[Tensor]]:
         """Per view: the encoder's tokens, then those after each decoder block, the last ones normalised."""
         rotary1, rotary2 = (
@@ -213,28 +189,6 @@ class Dust3r(nn.Module):
         layers1[-1], layers2[-1] = self.dec_norm(x1), self.dec_norm(x2)
         return layers1, layers2
 
-    def matching_attention(
-        self, features1: Features, features2: Features, block: int
-    ) -> tuple[Float[Tensor, "b n m"], Float[Tensor, "b m n"]]:
-        """Where a decoder block's cross-attention looks from each token of one image in the other, both ways round.
-
-        Of the heads that `jcr.train` teaches to look where the same points are; published networks have none.
-        """
-        with self._autocast(features1.tokens):
-            rotary = [
-                rotary_embedding(grid_positions(f.grid, f.tokens.device), self.head_dims[1], self.rope_base)
-                for f in (features1, features2)
-            ]
-            x1, x2 = (self.decoder_embed(f.tokens).float() for f in (features1, features2))
-            for block1, block2 in zip(self.dec_blocks[:block], self.dec_blocks2[:block], strict=True):
-                x1, x2 = block1(x1, x2, *rotary), block2(x2, x1, *rotary[::-1])
-            one, other = (blocks.get_submodule(str(block)) for blocks in (self.dec_blocks, self.dec_blocks2))
-            assert isinstance(one, DecoderBlock) and isinstance(other, DecoderBlock)
-            return (
-                one.matching_scores(x1, x2, *rotary).softmax(-1).mean(1),
-                other.matching_scores(x2, x1, *rotary[::-1]).softmax(-1).mean(1),
-            )
-
     @property
     def device(self) -> torch.device:
         """Where the weights are."""
@@ -249,13 +203,6 @@ def grid_positions(grid: tuple[int, int], device: torch.device) -> Int[Tensor, "
     """Row and column of each token, row by row."""
     rows, columns = (torch.arange(size, device=device) for size in grid)
     return torch.cartesian_prod(rows, columns)
-
-
-def position_code(grid: tuple[int, int], dim: int, device: torch.device) -> Float[Tensor, "n c"]:
-    """Sines and cosines of each token's row and column, a quarter of the channels each (ViT in MAE, He et al. 2022)."""
-    frequency = 10_000.0 ** -(torch.arange(dim // 4, device=device) / (dim // 4))
-    angle = grid_positions(grid, device)[..., None] * frequency
-    return torch.cat([angle.sin(), angle.cos()], -1).flatten(1)
 
 
 def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -> Rotary:
@@ -278,34 +225,14 @@ def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b 
 
 
 class PatchEmbed(nn.Module):
-    """A token per patch, linear in its pixels."""
+    """A token per 16x16 patch."""
 
-    def __init__(self, dim: int, patch: int) -> None:
+    def __init__(self, dim: int) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, dim, patch, patch)
+        self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
         return self.proj(images).flatten(2).mT
-
-
-class ConvolutionalStem(nn.Module):
-    """A token per patch from convolutions that halve the image until a patch is left: learnt from fewer images."""
-
-    def __init__(self, dim: int, patch: int) -> None:
-        super().__init__()
-        halvings = patch.bit_length() - 1
-        widths = [3, *(dim >> k for k in reversed(range(halvings)))]
-        self.layers = nn.Sequential(
-            *(
-                layer
-                for wide, wider in pairwise(widths)
-                for layer in (nn.Conv2d(wide, wider, 3, 2, 1), nn.GroupNorm(1, wider), nn.GELU())
-            )
-        )
-        self.proj = nn.Conv2d(dim, dim, 3, 1, 1)
-
-    def forward(self, images: Float[Tensor, "b 3 h w"]) -> Tokens:
-        return self.proj(self.layers(images)).flatten(2).mT
 
 
 class Attention(nn.Module):
@@ -338,16 +265,6 @@ class CrossAttention(nn.Module):
         )
         out = F.scaled_dot_product_attention(rotate(q, rotary_x), rotate(k, rotary_y), v)
         return self.proj(out.transpose(1, 2).flatten(2))
-
-    def matching_scores(
-        self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary
-    ) -> Float[Tensor, "b half n m"]:
-        """Logits of the first half of the heads, those that are taught to look where the same points are."""
-        q, k = (
-            project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)[:, : self.heads // 2 or 1]
-            for project, tokens in ((self.projq, x), (self.projk, y))
-        )
-        return (rotate(q, rotary_x) @ rotate(k, rotary_y).mT).float() / q.shape[-1] ** 0.5
 
 
 class Mlp(nn.Module):
@@ -385,13 +302,6 @@ class DecoderBlock(nn.Module):
         x = x + self.cross_attn(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
         return x + self.mlp(self.norm3(x))
 
-    def matching_scores(
-        self, x: Tokens, y: Tokens, rotary_x: Rotary, rotary_y: Rotary
-    ) -> Float[Tensor, "b half n m"]:
-        """Those of the cross-attention."""
-        x = x + self.attn(self.norm1(x), rotary_x)
-        return self.cross_attn.matching_scores(self.norm2(x), self.norm_y(y), rotary_x, rotary_y)
-
 
 def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
     """Points and confidence from a head's four channels: the length d of xyz becomes exp(d) − 1."""
@@ -401,12 +311,11 @@ def pointmap(raw: Float[Tensor, "b 4 h w"]) -> Pointmap:
 
 
 class LinearHead(nn.Module):
-    """A patch of raw outputs from each token of the last layer."""
+    """A 16x16 block of raw outputs from each token of the last layer."""
 
-    def __init__(self, dec_dim: int, patch: int) -> None:
+    def __init__(self, dec_dim: int) -> None:
         super().__init__()
-        self.patch = patch
-        self.proj = nn.Linear(dec_dim, 4 * patch**2)
+        self.proj = nn.Linear(dec_dim, 4 * PATCH**2)
 
     def finest(self, tokens: FeatureMap) -> None:
         """Nothing here comes from one image alone."""
@@ -414,7 +323,7 @@ class LinearHead(nn.Module):
     def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:
         with torch.autocast(layers[-1].device.type, enabled=False):
             tokens = self.proj(layers[-1].float())
-        return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), self.patch))
+        return pointmap(F.pixel_shuffle(tokens.mT.unflatten(-1, grid), PATCH))
 
 
 class DptHead(nn.Module):
