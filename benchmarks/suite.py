@@ -13,8 +13,9 @@ from pathlib import Path
 import jcr
 from jcr.errors import InputError
 from jcr.files import write_text
-from jcr.reconstruct.checkpoints import CHECKPOINTS
+from jcr.reconstruct.backends import BACKENDS
 
+CHECKOUT = Path(__file__).parents[1]
 CLAIM = "> "
 """Begins the lines of a bench's page that say in a sentence what was found."""
 MARKS = ("<!-- jcr bench all: begin -->", "<!-- jcr bench all: end -->")
@@ -63,7 +64,8 @@ def run(
 def _measured(name: str, out: Path, arguments: Sequence[str], threads: int) -> Outcome:
     begun = time.perf_counter()
     environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads)}
-    command = [sys.executable, "-m", "jcr", "bench", name, *arguments, "--out", str(out)]
+    environment["PYTHONPATH"] = os.pathsep.join([str(CHECKOUT), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "benchmarks", name, *arguments, "--out", str(out)]
     done = subprocess.run(
         command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
@@ -75,7 +77,7 @@ def _measured(name: str, out: Path, arguments: Sequence[str], threads: int) -> O
 
 
 def _is_newer(page: Path) -> bool:
-    sources = Path(jcr.__file__).parent.rglob("*.py")
+    sources = [*Path(jcr.__file__).parent.rglob("*.py"), *Path(__file__).parent.rglob("*.py")]
     return page.is_file() and page.stat().st_mtime > max(path.stat().st_mtime for path in sources)
 
 
@@ -126,8 +128,8 @@ def absent_networks() -> list[str]:
     """The foundation models whose weights are not on this machine, so that no table has a line of theirs."""
     return [
         f"`{name}`: its weights ({row.licence}) are not on this machine; with them, table1 has lines of its own for it"
-        for name, row in CHECKPOINTS.items()
-        if not row.is_cached()
+        for name, row in BACKENDS.items()
+        if not row.has_weights()
     ]
 
 

@@ -2,24 +2,20 @@
 
 import os
 import re
-from dataclasses import replace
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.compact import scored
 
+from benchmarks.__main__ import BENCHES
 from benchmarks.peers import grid_search
 from benchmarks.suite import CLAIM, MARKS, Outcome, between_marks, claims, run, write_index
-from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
-from jcr.capture.read import read_capture
-from jcr.cli.bench import BENCHES
+from jcr.cli import dispatch
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg, rotation_exp, scale_translation, transform
-from jcr.pipeline import RunOptions, calibrate
-from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.global_alignment.pairs import write_pairs
-from jcr.simulate.capture import SimulateOptions, simulate
+from jcr.geometry import rotation_between_deg, scale_translation
 from jcr.simulate.problem import hand_eye_problem
 from places import ROOT
 
@@ -100,22 +96,27 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
         assert (abs(found - scale) < 3 / 20_000) == found_there
 
 
-def test_calibrations_are_scored_by_the_truth_of_their_capture(tmp_path: Path):
-    """Exact pointmaps score nothing; then an offset, a turn and a scale are changed by known amounts."""
-    folder = simulate(tmp_path / "capture", SimulateOptions(images=6, seed=200, texture=False))
-    exact = PairErrors(pixel=0.0, warp=0.0, outliers=0.0)
-    write_pairs(tmp_path / "pairs.npz", pairs_of_capture(folder, errors=exact)[0])
-    options = RunOptions(ReconstructOptions("predictions", weights=str(tmp_path / "pairs.npz")))
-    result = calibrate(read_capture(folder), tmp_path / "out", options)
-    right = scored(result, folder)
-    assert right.trusted and right.height_percent < 2
-    assert max(right.mm, 10 * right.deg, right.scale_percent) < 0.5
-    found = result.hand_eye
-    move = transform(rotation_exp(np.radians([0, 0, 3.0])), np.array([0.02, 0, 0]))
-    moved = replace(found, gripper_from_camera=found.gripper_from_camera @ move)
-    wrong = scored(replace(result, hand_eye=moved), folder)
-    assert wrong.mm == pytest.approx(20, abs=1) and wrong.deg == pytest.approx(3, abs=0.1)
-    assert wrong.sigmas > 10
-    large = scored(replace(result, hand_eye=replace(found, scale=1.1 * found.scale)), folder)
-    assert large.scale_percent == pytest.approx(10, abs=0.5)
-    assert large.height_percent > 9  # of views from several heights, which no longer agree
+def test_benches_run_as_a_package_of_their_own_and_are_not_installed(tmp_path: Path):
+    """`python -m benchmarks` is the command line; the package alone says where they are and completes all else."""
+
+    def ended(*arguments: str, source: Path, at: Path) -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": str(source)}
+        command = [sys.executable, "-m", *arguments]
+        return subprocess.run(command, env=environment, cwd=at, capture_output=True, text=True)
+
+    shutil.copytree(
+        ROOT / "src" / "jcr", tmp_path / "jcr", ignore=shutil.ignore_patterns("__pycache__", "*.html")
+    )
+    alone = ended("jcr", "bench", "run", "--out", "pages", source=tmp_path, at=tmp_path)
+    assert alone.returncode == 2 and "python -m benchmarks" in alone.stderr and alone.stderr.count("\n") == 1
+    script = ended("jcr", "--completion", "bash", source=tmp_path, at=tmp_path)
+    assert script.returncode == 0 and "--backend" in script.stdout and "table1" not in script.stdout
+
+    refused = ended("benchmarks", "real", source=ROOT / "src", at=ROOT)
+    assert refused.returncode == 2 and "name the folder" in refused.stderr and refused.stderr.count("\n") == 1
+    assert set(BENCHES) <= {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
+
+
+def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["bench", "pairs", "captures"]) == 2
+    assert "takes no folder of captures" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import io
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -34,7 +34,7 @@ COMMANDS = {
     "verify": "is a calibration still true of today's few images",
     "batch": "many captures, on this machine or a Ray cluster",
     "simulate": "a simulated capture with ground truth",
-    "bench": "the tables and timings of the README",
+    "bench": "the tables and timings of the README (in the source)",
     "models": "back ends, weights present or not, licences",
 }
 
@@ -95,8 +95,13 @@ def dispatch(arguments: Sequence[str]) -> int:
         return 0
     if name not in COMMANDS:
         return _fail(2, f"{name!r} is no command of jcr; there are {', '.join(COMMANDS)} (jcr --help)")
+    return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+
+
+def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
+    """The exit status of the command whose module `load` gives; what goes wrong is one line on stderr."""
     try:
-        return _call(import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+        return _call(load(), program, arguments)
     except InputError as error:
         return _fail(2, str(error))
     except NotTrustedError as error:

@@ -31,10 +31,18 @@ def script(shell: str) -> str:
     """The completion script for a shell, to be sourced by it; InputError for a shell there is none for."""
     if shell not in SHELLS:
         raise InputError(f"--completion {shell}: give one of {', '.join(SHELLS)}")
-    table = {name: tuple(arguments_of(import_module(f"jcr.cli.{name}").Arguments)) for name in COMMANDS}
+    table = {name: tuple(_arguments(name)) for name in COMMANDS}
     if shell == "fish":
         return _fish(table)
     return _bash(table) if shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{_bash(table)}"
+
+
+def _arguments(name: str) -> Iterator[Argument]:
+    try:
+        command = import_module(f"jcr.cli.{name}")
+    except InputError:  # what it needs is not installed
+        return
+    yield from arguments_of(command.Arguments)
 
 
 def arguments_of(record: type) -> Iterator[Argument]:

@@ -1,0 +1,190 @@
+"""`python -m benchmarks NAME`, or `jcr bench NAME`: the tables and timings that the README quotes."""
+
+import os
+import platform
+import shlex
+import sys
+import time
+from dataclasses import dataclass, field
+from datetime import date
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from jcr.cli.output import Output
+from jcr.errors import InputError
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A row of the table of benches, a module of this package each."""
+
+    what: str
+    timed: bool = False
+    """Measures time, so that nothing else may run beside it."""
+    draws: bool = False
+    """Writes pictures beside its page."""
+    of_captures: bool = False
+    """Asks for the folder of captures."""
+
+
+BENCHES = {
+    "run": Bench("the whole job on the bundled capture: error, time and memory", True),
+    "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
+    "real": Bench("real captures in DIR, against the references stored beside them", True, of_captures=True),
+    "calibrate": Bench(
+        "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
+    ),
+    "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
+    "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
+    "density": Bench(
+        "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
+    ),
+    "map": Bench(
+        "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
+    ),
+    "predictions": Bench(
+        "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
+    ),
+    "align": Bench(
+        "global alignment: fast against adam, kinematic against free, in error, time and memory", True
+    ),
+    "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
+    "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
+    "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
+    "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
+}
+"""In the order of the README's claims."""
+
+if TYPE_CHECKING:
+    BenchName = str
+else:
+    BenchName = Literal[("all", *sorted(BENCHES))]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measure, and print a Markdown table with the machine, versions and date.
+
+    examples:
+      jcr bench calibrate
+      jcr bench run --out docs/results
+      jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
+      jcr bench all captures --out docs/results --readme README.md
+    """
+
+    name: Annotated[
+        BenchName,
+        tyro.conf.Positional,
+        tyro.conf.arg(help=f"What to measure: {', '.join(('all', *sorted(BENCHES)))}."),
+    ]
+    captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
+    """For real: the folder that holds capture folders, each with a reference.json."""
+    boards: tuple[str, ...] = ()
+    """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
+    resume: bool = False
+    """For all: leave out the benches whose page is newer than the program's source files."""
+    readme: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """For all: a README in which the claims are put between its two marks."""
+    output: Output = field(default_factory=Output)
+
+
+def main(arguments: Arguments) -> int:
+    """Run one bench, or all of them."""
+    if arguments.name == "all":
+        return _all(arguments)
+    from jcr.files import write_text
+
+    name = arguments.name
+    if BENCHES[name].of_captures and arguments.captures is None:
+        raise InputError(
+            f"bench {name}: name the folder that holds the captures, as in jcr bench {name} captures"
+        )
+    if not BENCHES[name].of_captures and (arguments.captures is not None or arguments.boards):
+        raise InputError(f"bench {name}: takes no folder of captures and no --boards; leave them out")
+    bench = import_module(f"benchmarks.{name}")
+    if BENCHES[name].of_captures:
+        found = bench.run(arguments.captures, arguments.boards)
+    elif BENCHES[name].draws:
+        found = bench.run(arguments.out)
+    else:
+        found = bench.run()
+    table = heading(arguments) + found
+    arguments.output.result(table, {"bench": name, "markdown": table})
+    if arguments.out is not None:
+        write_text(arguments.out / f"{name}.md", table)
+    return 0
+
+
+def _all(arguments: Arguments) -> int:
+    """Every bench; 1 when one of them failed."""
+    if arguments.out is None:
+        raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
+    from benchmarks.suite import Outcome, absent_networks, between_marks, run, write_index
+    from jcr.files import write_text
+
+    names: dict[str, bool] = {name: bench.timed for name, bench in BENCHES.items()}
+    given: dict[str, list[str]] = {}
+    absent = absent_networks()
+    for name in (name for name, bench in BENCHES.items() if bench.of_captures):
+        if arguments.captures is None:
+            del names[name]
+            absent.append(f"{name}: no folder of captures was named")
+        else:
+            boards = ["--boards", *arguments.boards] if arguments.boards else []
+            given[name] = [str(arguments.captures), *boards]
+
+    def report(outcome: Outcome) -> None:
+        if not arguments.output.quiet:
+            sys.stderr.write(f"{outcome.name}: {outcome.trouble or 'done'}, {outcome.seconds or 0.0:.0f} s\n")
+
+    begun = time.perf_counter()
+    outcomes = run(names, arguments.out, given, arguments.resume, report)
+    command = " ".join(["jcr bench all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"])
+    write_index(outcomes, arguments.out, command, machine(), absent, time.perf_counter() - begun)
+    if arguments.readme is not None:
+        link = os.path.relpath(arguments.out, arguments.readme.parent)
+        text = between_marks(arguments.readme.read_text(), arguments.out, list(names), link)
+        write_text(arguments.readme, text)
+    index = arguments.out / "README.md"
+    facts = {outcome.name: {"seconds": outcome.seconds, "trouble": outcome.trouble} for outcome in outcomes}
+    arguments.output.result(index.read_text(), {"bench": "all", "benches": facts})
+    return int(any(outcome.trouble for outcome in outcomes))
+
+
+def heading(arguments: Arguments) -> str:
+    """What a reader needs to judge and repeat the numbers."""
+    command = ["jcr", "bench", arguments.name]
+    if arguments.captures is not None:
+        # Where they lie is the machine's own affair.
+        command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
+    return (
+        f"# jcr bench {arguments.name}\n\n{BENCHES[arguments.name].what}\n\n"
+        f"    {shlex.join(command)}\n\n{date.today().isoformat()}. {machine()}\n\n"
+    )
+
+
+def machine() -> str:
+    """Processor, cores and versions in a sentence."""
+    versions = ", ".join(f"{name} {version(name)}" for name in ("jcr", "numpy", "scipy", "torch", "pycolmap"))
+    return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+if __name__ == "__main__":
+    from jcr.cli import call
+
+    sys.exit(call(lambda: sys.modules["__main__"], "python -m benchmarks", sys.argv[1:]))
