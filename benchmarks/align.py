@@ -22,8 +22,9 @@ from jcr.geometry import (
     transform,
 )
 from jcr.handeye.solve import solve_hand_eye
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import AlignOptions, align
-from jcr.reconstruct.global_alignment.pairs import PairPredictions, complete_pairs, write_pairs
+from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
 from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.simulate.problem import HandEyeProblem, disturbed, error
 

@@ -52,7 +52,7 @@ def _measured(captures: list[Path], out: Path, processes: int) -> tuple[float, d
         pids = [os.getpid(), *(child.pid for child in multiprocessing.active_children())]
         memory[round(fraction * len(captures))] = sum(_resident_mib(pid) for pid in pids if pid)
 
-    reconstruct = ReconstructOptions(backend="predictions", weights=str(captures[0] / "pointmaps.npz"))
+    reconstruct = ReconstructOptions(predictions=captures[0] / "pointmaps.npz")
     options = BatchOptions(processes=processes, calibrate_only=True)
     begun = time.perf_counter()
     rows = batch(captures, out, RunOptions(reconstruct), options, watch)

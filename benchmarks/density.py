@@ -57,7 +57,7 @@ def run(out: Path | None = None) -> str:
         )
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, pairs_of_capture(made, errors=PUBLISHED, seed=SEED)[0])
-        options = ReconstructOptions("predictions", weights=str(pairs))
+        options = ReconstructOptions(predictions=pairs)
         _, predicted = _clouds(capture, options, "simulated predictions")
         surface, labels = truth_points(made)
         picture = read_image(capture.folder / capture.images[0])

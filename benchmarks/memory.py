@@ -18,7 +18,7 @@ from benchmarks.align import CHILD
 from benchmarks.pairs import random_network
 from jcr.files import write_text
 from jcr.memory import GB
-from jcr.reconstruct.global_alignment.pairs import PairOptions
+from jcr.reconstruct.dust3r.pair_graph import PairOptions
 from jcr.simulate.capture import SimulateOptions, simulate
 
 IMAGES = (8, 20, 40)

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from jcr.reconstruct.dust3r.network import Dust3r
-from jcr.reconstruct.dust3r.predict import GB, estimate_memory, predict_pairs
+from jcr.reconstruct.dust3r.pair_graph import PairOptions, complete_pairs
+from jcr.reconstruct.dust3r.predictor import GB, estimate_memory, predict_pairs
 from jcr.reconstruct.dust3r.weights import LoadedNetwork
-from jcr.reconstruct.global_alignment.pairs import PairOptions, PairPredictions, complete_pairs
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.preprocess import PreparedImages, image_grid
 
 IMAGES, HEIGHT, WIDTH = 10, 64, 96

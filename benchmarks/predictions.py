@@ -75,7 +75,7 @@ def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
         predictions, truth = pairs_of_capture(made, seed=seed)
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, predictions)
-        options = RunOptions(ReconstructOptions("predictions", weights=str(pairs)), CalibrateOptions())
+        options = RunOptions(ReconstructOptions(predictions=pairs), CalibrateOptions())
         result = run_all(read_capture(made), Path(folder) / "out", options)
         # Metres per geometric mean of the pairs' units.
         return scored(result, made, float(np.exp(-np.log(truth.pair_unit).mean())))

@@ -11,7 +11,8 @@ from numpy import ndarray
 from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
-from jcr.reconstruct.global_alignment.pairs import PairPredictions, complete_pairs
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.records import Intrinsics
 from jcr.simulate.truth import read_truth, true_depth
 

@@ -14,7 +14,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import NotTrustedError
 from jcr.geometry import Transforms, fit_similarity, rotation_between_deg, rotation_log, scale_translation
 from jcr.handeye.residuals import paper_residuals
-from jcr.reconstruct.backends import BackendName, ReconstructOptions, candidates, reconstruct
+from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
 from jcr.reconstruct.colmap import ColmapOptions
 from jcr.reconstruct.colmap import reconstruct as reconstruct_with_colmap
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
@@ -193,19 +193,15 @@ def _first(predictions: PairPredictions, count: int) -> PairPredictions:
 
 
 def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cell]]:
-    """Every method on one set of images; networks where their weights are, but for the small one that has a bench."""
-    networks: list[BackendName] = [
-        name for name in candidates(ReconstructOptions()) if name not in ("colmap", "compact")
-    ]
+    """Every method on one set of images; networks where their weights are."""
+    networks = [name for name in candidates(ReconstructOptions()) if BACKENDS[name].hub_id]
     try:
         sparse = reconstruct_with_colmap(capture, ColmapOptions(dense=False))
         on_colmap = _papers(capture, truth, sparse), _ours(capture, truth, sparse)
     except NotTrustedError:
         on_colmap = Cell(0), Cell(0, trusted=False)
     cells = [(f"{PAPERS} on {ON_COLMAP}", on_colmap[0]), (f"ours on {ON_COLMAP}", on_colmap[1])]
-    options: list[tuple[str, ReconstructOptions]] = [
-        (ON_PREDICTIONS, ReconstructOptions("predictions", weights=str(pairs)))
-    ]
+    options: list[tuple[str, ReconstructOptions]] = [(ON_PREDICTIONS, ReconstructOptions(predictions=pairs))]
     options += [(name, ReconstructOptions(name)) for name in networks]
     for name, option in options:
         predicted = reconstruct(capture, option)

@@ -7,18 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import load_file, save_file
 
-from jcr import auto
+from jcr import attempts
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.stage import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
-from jcr.reconstruct.backends import Backend, ReconstructOptions, candidates
-from jcr.reconstruct.checkpoints import CHECKPOINTS, Checkpoint
-from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
@@ -42,26 +38,9 @@ def quick(monkeypatch: pytest.MonkeyPatch):
 def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Names of the back ends whose weights are to count as present; none at first."""
     names: set[str] = set()
-    hub_ids = {checkpoint.hub_id: name for name, checkpoint in CHECKPOINTS.items()}
-    monkeypatch.setattr(Checkpoint, "is_cached", lambda self: hub_ids[self.hub_id] in names)
+    monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
     return names
-
-
-def test_the_best_whose_weights_are_here_comes_first(present: set[str], monkeypatch: pytest.MonkeyPatch):
-    assert candidates(ReconstructOptions()) == ("colmap", "direct")
-    present |= {"dust3r", "mapanything"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "mapanything", "colmap", "direct")
-    present.add("mast3r")
-    assert candidates(ReconstructOptions())[0] == "mast3r"
-    monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
-    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
-    present.add("compact")
-    assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "compact")
-    assert candidates(ReconstructOptions("colmap")) == ("colmap",)
-    assert candidates(ReconstructOptions(weights="pairs.npz")) == ("predictions",)
-    assert candidates(ReconstructOptions(board="chessboard:9x6:0.025")) == ("marker",)
-    assert candidates(ReconstructOptions(weights="folder")) == ("dust3r", "colmap")
 
 
 def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
@@ -87,17 +66,17 @@ def auto_result(
     """What auto keeps where each back end gives these camera poses or this error, and which ones it ran."""
     tried = []
 
-    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+    def answered(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         tried.append(options.backend)
         answer = answers[options.backend]
         if isinstance(answer, Exception):
             raise answer
         return reconstruction(options.backend, answer)
 
-    monkeypatch.setattr(auto, "reconstruct", door)
+    monkeypatch.setattr(attempts, "reconstruct", answered)
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
     capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
-    best = auto.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
+    best = attempts.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
     return best.reconstruction, tried
 
 
@@ -157,15 +136,13 @@ def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     good = problem.recon_from_camera
     shuffled = good[np.random.default_rng(4).permutation(8)]
     nothing = NotTrustedError("0 of 8 images registered")
-    for second in ("direct", "compact"):
-        kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
-        assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
-        kept, tried = auto_result(problem, {"colmap": shuffled, second: good}, monkeypatch)
-        assert tried == ["colmap", second] and kept.backend == second
-        kept, tried = auto_result(problem, {"colmap": nothing, second: good}, monkeypatch)
-        assert tried == ["colmap", second] and kept.backend == second
-        assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
-        present.add("compact")
+    kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
+    assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
+    kept, tried = auto_result(problem, {"colmap": shuffled, "direct": good}, monkeypatch)
+    assert tried == ["colmap", "direct"] and kept.backend == "direct"
+    kept, tried = auto_result(problem, {"colmap": nothing, "direct": good}, monkeypatch)
+    assert tried == ["colmap", "direct"] and kept.backend == "direct"
+    assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
 
 
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(
@@ -180,6 +157,11 @@ def test_no_other_back_end_cures_a_motion_that_shows_too_little(
 @pytest.fixture
 def garbage_weights(tmp_path: Path) -> Path:
     """A folder of weights that no training touched."""
+    import torch
+    from safetensors.torch import save_file
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     torch.manual_seed(0)
     network = Dust3r(**GARBAGE)
     folder = tmp_path / "weights"
@@ -194,11 +176,12 @@ def garbage_weights(tmp_path: Path) -> Path:
 def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_weights(
     tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
+    from safetensors.torch import load_file, save_file
+
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     weights = load_file(garbage_weights / "model.safetensors")
     flat = {key: 0 * tensor if "downstream" in key else tensor for key, tensor in weights.items()}
     save_file(flat, garbage_weights / "model.safetensors")
-    (garbage_weights / "config.json").write_text(json.dumps(GARBAGE | {"licence": "for tests alone"}))
     frames = []
     for k in range(3):
         grey = np.full((48, 64, 3), 90 + 5 * k, np.uint8)
@@ -212,7 +195,7 @@ def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_
         out = tmp_path / backend
         command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
         assert dispatch(command) == 3
-        licence = f"weights {garbage_weights}: licence for tests alone"
+        licence = f"weights {garbage_weights}: licence unknown, ask who made the file"
         assert licence in " ".join(json.loads((out / "calibration.json").read_text())["warnings"])
         assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
         assert licence in capsys.readouterr().err

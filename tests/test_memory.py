@@ -20,11 +20,11 @@ from benchmarks.pairs import random_network
 from benchmarks.synthetic_pairs import synthetic_pairs
 from jcr.errors import InputError
 from jcr.memory import GB, give_back, require, resident
-from jcr.reconstruct.dust3r import predict
+from jcr.reconstruct.dust3r import predictor
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import align
 from jcr.reconstruct.global_alignment.pairs import (
     PairPredictions,
-    complete_pairs,
     pairs_from_arrays,
     read_arrays,
     write_pairs,
@@ -101,7 +101,7 @@ def test_a_back_end_without_network_names_the_budget_it_needs(capture: Path, tmp
 
 def test_pointmaps_in_a_file_leave_the_resident_set(tmp_path: Path) -> None:
     shape = (100, 256, 256)
-    points, conf = predict._new_array((*shape, 3), False), predict._new_array(shape, False)
+    points, conf = predictor._new_array((*shape, 3), False), predictor._new_array(shape, False)
     pairs = PairPredictions(np.tile([[0, 1]], (100, 1)), points, conf, points, conf)
     give_back()
     before = resident()
@@ -143,8 +143,8 @@ def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
         monkeypatch.delattr(os, "posix_fallocate")
     size = 4 * 3 * 400_001
     with (tmp_path / "reserved").open("w+b") as stream:
-        monkeypatch.setattr(predict.tempfile, "TemporaryFile", lambda: stream)
-        array = predict._new_array((400_001, 3), False)
+        monkeypatch.setattr(predictor.tempfile, "TemporaryFile", lambda: stream)
+        array = predictor._new_array((400_001, 3), False)
     written = (tmp_path / "reserved").stat()
     assert written.st_size == size and 512 * written.st_blocks >= size
     array[-1] = 1.0
@@ -158,11 +158,11 @@ def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.Monk
     named = r"no room for pointmaps.*No space left.*TMPDIR"
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(InputError, match=named):
-        predict._new_array((4, 4), False)
+        predictor._new_array((4, 4), False)
     monkeypatch.delattr(os, "posix_fallocate")
     with Path("/dev/full").open("r+b") as stream, pytest.raises(InputError, match=named):
-        monkeypatch.setattr(predict.tempfile, "TemporaryFile", lambda: stream)
-        predict._new_array((4, 4), False)
+        monkeypatch.setattr(predictor.tempfile, "TemporaryFile", lambda: stream)
+        predictor._new_array((4, 4), False)
 
 
 def test_objects_in_a_mapped_file_are_refused(tmp_path: Path) -> None:

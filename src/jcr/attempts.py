@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from jcr.calibration.stage import CalibrateOptions, calibrate
 from jcr.errors import InputError, NotTrustedError
 from jcr.progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.checkpoints import CHECKPOINTS
+from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, for_backend, reconstruct
 from jcr.records import Capture, HandEye, HeldOut, Reconstruction
 
 
@@ -57,12 +56,10 @@ def best_reconstruction(
     """
     names = candidates(options)[:2]
     if len(names) == 1:
-        return Attempt(reconstruct(capture, replace(options, backend=names[0]), progress))
-    first = replace(options, backend=names[0])
-    # Weights that the user named are the first one's.
-    second = replace(options, backend=names[1], weights=None)
+        return Attempt(reconstruct(capture, for_backend(options, names[0]), progress))
+    first, second = (for_backend(options, name) for name in names)
     chose = f"back end {names[0]}"
-    if names[0] in CHECKPOINTS:
+    if BACKENDS[names[0]].hub_id:
         chose += ", the best whose weights are on this machine"
     try:
         one = _attempt(capture, first, calibrate_options, progress)
@@ -77,7 +74,7 @@ def best_reconstruction(
         return other.noted(f"{nothing}; {other.told()} was used instead")
     assert one.hand_eye is not None
     if one.hand_eye.converged or not one.hand_eye.observability.observable:
-        return one.noted(chose) if names[0] in CHECKPOINTS else one
+        return one.noted(chose) if BACKENDS[names[0]].hub_id else one
     doubt = f"{chose}, is not to be trusted ({one.hand_eye.warnings[0]})"
     try:
         other = _attempt(capture, second, calibrate_options, progress)

@@ -116,7 +116,7 @@ def run_one(task: Task) -> Row:
     failed = Row(str(task.capture), str(task.out), "failed")
     try:
         capture = read_capture(task.capture)
-        made_from = fingerprint(capture, asdict(task.run.reconstruct))
+        made_from = fingerprint(capture, task.run.reconstruct.as_json())
         others = json.dumps([asdict(task.run), task.calibrate_only], sort_keys=True, default=str)
         made_from += hashlib.sha256(others.encode()).hexdigest()
         if (row := _finished(task, made_from)) is not None:

@@ -36,7 +36,7 @@ from jcr.export.points import read_cloud, write_cloud
 from jcr.files import remove_unfinished, write_text
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
+from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of, with_cameras_of
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
@@ -170,14 +170,16 @@ def measure(out: str | Path) -> Measured:
 def options_of(out: str | Path) -> RunOptions:
     """The options that a run folder's calibration was made with."""
     state = _read_state(Path(out))["options"]
-    return RunOptions(ReconstructOptions(**state["reconstruct"]), CalibrateOptions(**state["calibrate"]))
+    return RunOptions(
+        ReconstructOptions.from_json(state["reconstruct"]), CalibrateOptions(**state["calibrate"])
+    )
 
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
     report = progress or silent
     # What auto stands for changes with the weights that are on this machine.
     made_from = fingerprint(
-        capture, asdict(options.reconstruct) | {"backend": candidates(options.reconstruct)}
+        capture, options.reconstruct.as_json() | {"backend": candidates(options.reconstruct)}
     )
     state = _read_state(folder)
     start = time.perf_counter()
@@ -193,7 +195,10 @@ def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Pr
         state = {
             "capture": str(capture.folder.resolve()),
             "reconstruct": made_from,
-            "options": {"reconstruct": asdict(options.reconstruct), "calibrate": asdict(options.calibrate)},
+            "options": {
+                "reconstruct": options.reconstruct.as_json(),
+                "calibrate": asdict(options.calibrate),
+            },
         }
         write_text(folder / STATE, json.dumps(state, indent=2) + "\n")
         reconstructed = time.perf_counter()
@@ -302,14 +307,8 @@ def _with_backend(options: RunOptions | None, backend: str | None, capture: Capt
     """The options with the back end of the call, or the one that takes the capture's own camera poses."""
     options = options or RunOptions()
     if backend is not None:
-        return replace(options, reconstruct=replace(options.reconstruct, backend=backend))
-    if capture.cameras is not None and (options.reconstruct.backend, options.reconstruct.weights) == (
-        "auto",
-        None,
-    ):
-        given = replace(options.reconstruct, backend="given", weights=str(capture.cameras.resolve()))
-        return replace(options, reconstruct=given)
-    return options
+        options = replace(options, reconstruct=replace(options.reconstruct, backend=backend))
+    return replace(options, reconstruct=with_cameras_of(capture, options.reconstruct))
 
 
 @contextmanager
@@ -367,13 +366,14 @@ def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
     digest.update(capture.base_from_gripper.tobytes())
     lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
-    if (
-        options["weights"] is not None
-    ):  # gigabytes at times: size and date tell one file of that name from another
-        weights = Path(options["weights"])
-        files = sorted(weights.iterdir()) if weights.is_dir() else [weights] if weights.is_file() else []
+    for name in ("weights", "predictions", "cameras"):
+        if options[name] is None:
+            continue
+        # Gigabytes at times: size and date tell one file of that name from another.
+        path = Path(options[name])
+        files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-        options = options | {"weights": states or options["weights"]}
+        options = options | {name: states or options[name]}
     digest.update(json.dumps([lens, options, __version__, FORMAT], sort_keys=True).encode())
     return digest.hexdigest()
 

@@ -173,7 +173,7 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
         (["fly"], "no command"),
         (["run"], "required"),
         (["run", "nowhere", "out"], "nowhere"),
-        (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, compact, direct, dust3r, given, "),
+        (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, direct, dust3r, given, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),
         (["query", "nowhere", "nowhere"], "nowhere"),
         (["map", "nowhere"], "nowhere"),

@@ -224,7 +224,7 @@ def predictions(change: Callable[[Path], Any]) -> Plant:
     def plant(case: Case) -> list[str]:
         file = case.capture.parent / "pairs.npz"
         change(file)
-        return [*case.calibrate, "--backend", "predictions", "--weights", str(file)]
+        return [*case.calibrate, "--predictions", str(file)]
 
     return plant
 

@@ -9,7 +9,8 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.geometry import apply, inverse, transform
-from jcr.reconstruct.global_alignment.pairs import PairPredictions, complete_pairs, pairs_from_arrays
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs
+from jcr.reconstruct.global_alignment.pairs import PairPredictions, pairs_from_arrays
 from jcr.reconstruct.pointmap_matches import MatchOptions, tracks_from_pairs, tracks_from_pointmaps
 from jcr.records import Tracks
 from places import SHARED

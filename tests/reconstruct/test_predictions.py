@@ -14,9 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
 from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
-from jcr.reconstruct import mapanything, predictions
-from jcr.reconstruct.dust3r import backend
+from jcr.reconstruct import backends, mapanything, predictions
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.dust3r import dust3r
+from jcr.reconstruct.dust3r.dust3r import Dust3rOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays
+from jcr.reconstruct.mapanything import MapAnythingOptions
 from jcr.reconstruct.predictions import PredictionsOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 from places import SHARED
@@ -211,12 +214,13 @@ def test_a_network_gives_the_same_record(
         images = predictions._images(capture, np.arange(COUNT), {}, (WIDTH, HEIGHT), "synthetic")
         return images, made, ("weights X: licence Y",)
 
-    monkeypatch.setattr(backend, "predict", predict)
-    result = backend.reconstruct(capture)
+    monkeypatch.setattr(dust3r, "predict", predict)
+    options = Dust3rOptions("X", "Y")
+    result = dust3r.reconstruct(capture, options)
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
     unknown = Capture(capture.folder, capture.images, capture.base_from_gripper, capture.image_size)
-    found = backend.reconstruct(unknown).intrinsics
+    found = dust3r.reconstruct(unknown, options).intrinsics
     # The principal point stays where the network has it; the focal length is aligned.
     assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
     assert (found.cx, found.cy) == pytest.approx((2.5 * WIDTH + 2, 2.5 * HEIGHT + 2))
@@ -256,7 +260,8 @@ def test_mapanything_is_given_our_intrinsics_and_its_poses_are_compared(
     capture: Capture, truth: dict[str, Any]
 ) -> None:
     model = FakeMapAnything(truth)
-    result = mapanything.reconstruct(capture, model=model)
+    options = MapAnythingOptions("X")
+    result = mapanything.reconstruct(capture, options, model=model)
     view = model.views[0]
     assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]
     assert view["img"][0, 1].mean() == pytest.approx(-0.456 / 0.224, abs=1e-5)
@@ -273,11 +278,11 @@ def test_mapanything_is_given_our_intrinsics_and_its_poses_are_compared(
         Rotation.from_euler("y", [[20], [40], [-30]], degrees=True).as_matrix() @ turned[:3, :3, :3]
     )
     off = Capture(capture.folder, capture.images, turned, capture.image_size, capture.intrinsics)
-    assert "by 0.00°" not in mapanything.reconstruct(off, model=model).notes[-1]
+    assert "by 0.00°" not in mapanything.reconstruct(off, options, model=model).notes[-1]
 
 
 def test_mapanything_that_is_not_installed_says_how_to_get_it(capture: Capture) -> None:
     if importlib.util.find_spec("mapanything"):
         pytest.skip("the mapanything package is installed here")
     with pytest.raises(InputError, match="pip install git"):
-        mapanything.reconstruct(capture)
+        backends.reconstruct(capture, ReconstructOptions("mapanything"))

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.cli.output import Output
-from jcr.reconstruct.global_alignment.pairs import PairOptions
+from jcr.reconstruct.backends import PairBackendName
+from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Arguments:
     """Folder of the capture."""
     out: Annotated[Path, tyro.conf.Positional]
     """npz file to write (docs/predictions.md)."""
-    backend: Literal["compact", "dust3r", "mast3r"] = "dust3r"
+    backend: PairBackendName = "dust3r"
     """Whose weights, where --weights names none."""
     weights: str | None = None
     """Path or hub id."""
@@ -40,19 +41,16 @@ def main(arguments: Arguments) -> int:
     from jcr.capture.read import read_capture
     from jcr.errors import InputError
     from jcr.progress import progress_bars
-    from jcr.reconstruct.backends import ReconstructOptions, device_of
-    from jcr.reconstruct.dust3r.backend import Dust3rOptions, predict
+    from jcr.reconstruct.backends import ReconstructOptions, device_of, weights_of
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, predict
     from jcr.reconstruct.global_alignment.pairs import write_pairs
 
     if arguments.out.suffix != ".npz":
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")
     capture = read_capture(arguments.capture)
-    options = Dust3rOptions(
-        arguments.backend,
-        arguments.weights,
-        device_of(ReconstructOptions(device=arguments.device)),
-        arguments.pairs,
-    )
+    asked = ReconstructOptions(arguments.backend, arguments.device, weights=arguments.weights)
+    weights, licence = weights_of(asked)
+    options = Dust3rOptions(weights, licence, device_of(asked), arguments.pairs)
     with progress_bars() as progress:
         _, predictions, notes = predict(capture, options, progress)
     write_pairs(arguments.out, predictions)

@@ -1,11 +1,10 @@
-"""The back ends: each makes the same Reconstruction of a capture. One file and one row here is a new one."""
+"""The back ends: each makes the same Reconstruction of a capture. A new one is a file and a row of this table."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from importlib import import_module
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Int
@@ -13,36 +12,75 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.progress import Progress
-from jcr.reconstruct.checkpoints import CHECKPOINTS
+from jcr.reconstruct.hub import cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
-BackendName = Literal[
-    "auto", "colmap", "compact", "direct", "dust3r", "mast3r", "mapanything", "marker", "predictions", "given"
-]
+CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 
 
-@dataclass(frozen=True)
-class ReconstructOptions:
-    """What turns images into camera poses and pointmaps."""
+def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
-    backend: BackendName = "auto"
-    """auto takes the best one whose weights are on this machine (without downloaded ones: colmap), and the next,
-    colmap or compact, where that is not to be trusted."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks and dense matching run."""
-    seed: int = 0
-    """Same seed, same result on the same machine."""
-    weights: str | None = None
-    """Path or hub id of a network's weights, unset: the published ones; for predictions the npz file, for given
-    the COLMAP model or transforms.json."""
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
-    board: str | None = None
-    """The board or tags that marker looks for, lengths in metres: charuco:7x5:0.030:0.022:DICT_4X4_50,
-    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
-    memory_gb: float = 8.0
-    """Most that the process may take of main memory (peak resident set, the program included), and a network of a
-    GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
+    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
+
+
+def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
+
+    made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
+
+
+def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct
+    from jcr.reconstruct.dust3r.pair_graph import PairOptions
+
+    weights, licence = weights_of(options)
+    pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
+    made = Dust3rOptions(weights, licence, device_of(options), pairs, backend=options.backend)
+    return reconstruct(capture, made, progress)
+
+
+def _mapanything(
+    capture: Capture, options: "ReconstructOptions", progress: Progress | None
+) -> Reconstruction:
+    from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
+
+    weights, _ = weights_of(options)
+    return reconstruct(capture, MapAnythingOptions(weights, device_of(options)), progress)
+
+
+def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.marker import MarkerOptions, reconstruct
+
+    if options.board is None:
+        raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
+    made = MarkerOptions(options.board, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, made, progress)
+
+
+def _predictions(
+    capture: Capture, options: "ReconstructOptions", progress: Progress | None
+) -> Reconstruction:
+    from jcr.reconstruct.predictions import PredictionsOptions, reconstruct
+
+    if options.predictions is None:
+        raise InputError(
+            "--backend predictions: name the file with --predictions FILE.npz (docs/predictions.md)"
+        )
+    return reconstruct(capture, PredictionsOptions(options.predictions, options.memory_gb), progress)
+
+
+def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    from jcr.reconstruct.colmap import ColmapOptions
+    from jcr.reconstruct.given import reconstruct
+
+    if options.cameras is None:
+        raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
+    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    return reconstruct(capture, options.cameras, made, progress)
 
 
 @dataclass(frozen=True)
@@ -50,49 +88,166 @@ class Backend:
     """A row of the table."""
 
     name: str
+    """For --backend."""
+    reconstruct: Callable[..., Reconstruction]
+    """A function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
     licence: str
-    metric: bool
-    """Whether its scale is metres already."""
-    door: str
-    """module:function of (capture, ReconstructOptions, progress)."""
+    metric: bool | None = False
+    """Whether its scale is metres already; None: its input says."""
+    auto: bool = False
+    """Whether `auto` may take it, where its package and its weights are on this machine."""
+    options: tuple[str, ...] = ()
+    """Fields of ReconstructOptions that it uses and not every back end does."""
+    selected_by: str = ""
+    """The one of these by which `auto` takes it."""
+    hub_id: str = ""
+    """Of its published weights; empty: it needs none."""
+    package: str = ""
+    """That must be installed beside this one's core."""
+    install: str = ""
+    """The command that does so."""
     keeps_order: bool = False
     """Whether its input counts images in the capture's own order."""
-    package: str = ""
-    """That must be installed beside this one."""
+    accuracy: str = ""
+    """As measured, and where that stands; empty: not measured here."""
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
         return not self.package or find_spec(self.package) is not None
 
-    def reconstruct(
-        self, capture: Capture, options: ReconstructOptions, progress: Progress | None
-    ) -> Reconstruction:
-        """Open the door: heavy imports happen here."""
-        module, function = self.door.split(":")
-        entry: Callable[..., Reconstruction] = getattr(import_module(module), function)
-        return entry(capture, options, progress)
+    def has_weights(self) -> bool:
+        """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
+        return not self.hub_id or bool(cached_files(self.hub_id))
 
 
-BACKENDS = {
+BACKENDS: dict[str, Backend] = {
     row.name: row
     for row in (
-        Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),
-        Backend("direct", "Apache-2.0", False, "jcr.reconstruct.backends:_direct"),
-        Backend("compact", CHECKPOINTS["compact"].licence, False, "jcr.reconstruct.backends:_compact"),
-        Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
-        Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
+        Backend(
+            "mast3r",
+            _dust3r,
+            f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
+            metric=True,
+            auto=True,
+            options=("weights", "pair_graph"),
+            hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
+            package="torch",
+            install="pip install torch",
+        ),
+        Backend(
+            "dust3r",
+            _dust3r,
+            CC_BY_NC_SA,
+            auto=True,
+            options=("weights", "pair_graph"),
+            selected_by="weights",
+            hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+            package="torch",
+            install="pip install torch",
+        ),
         Backend(
             "mapanything",
-            CHECKPOINTS["mapanything"].licence,
-            True,
-            "jcr.reconstruct.backends:_mapanything",
+            _mapanything,
+            "Apache-2.0",
+            metric=True,
+            auto=True,
+            options=("weights",),
+            hub_id="facebook/map-anything-apache",
             package="mapanything",
+            install="pip install git+https://github.com/facebookresearch/map-anything",
         ),
-        Backend("marker", "Apache-2.0", True, "jcr.reconstruct.backends:_marker"),
-        Backend("predictions", "your network's", False, "jcr.reconstruct.backends:_predictions", True),
-        Backend("given", "your reconstruction's", False, "jcr.reconstruct.backends:_given"),
+        Backend(
+            "colmap",
+            _colmap,
+            "BSD-3-Clause",
+            auto=True,
+            accuracy="0.05 mm and 0.005° on the bundled capture (docs/results/run.md)",
+        ),
+        Backend(
+            "direct",
+            _direct,
+            "Apache-2.0",
+            auto=True,
+            accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
+            "(docs/plain-tables.md)",
+        ),
+        Backend(
+            "marker",
+            _marker,
+            "Apache-2.0",
+            metric=True,
+            options=("board",),
+            selected_by="board",
+            accuracy="0.6 mm and 0.20° from the reference of a real capture (docs/results/real.md)",
+        ),
+        Backend(
+            "predictions",
+            _predictions,
+            "your network's",
+            metric=None,
+            options=("predictions",),
+            selected_by="predictions",
+            keeps_order=True,
+            accuracy="0.95 mm and 0.051° from simulated predictions (docs/results/predictions.md)",
+        ),
+        Backend("given", _given, "your reconstruction's", options=("cameras",), selected_by="cameras"),
     )
 }
+"""By name; `auto` takes the first that it may.
+
+Networks whose uncertainty is known come before the one whose is not, metric ones before others. COLMAP needs no
+weights, and sees what networks do not. Direct alignment comes after it: COLMAP matches what is printed on things, it
+the colours of plain ones.
+"""
+
+# The choices of --backend, and of `jcr predict`, whose networks are shown pairs of images.
+if TYPE_CHECKING:
+    BackendName = PairBackendName = str
+else:
+    BackendName = Literal[("auto", *BACKENDS)]
+    PairBackendName = Literal[tuple(row.name for row in BACKENDS.values() if "pair_graph" in row.options)]
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """What turns images into camera poses and pointmaps."""
+
+    backend: BackendName = "auto"
+    """auto takes the first of the list that needs no input of its own and whose package and weights are on this
+    machine (jcr models), and the next such one where its result is rejected."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where networks and dense matching run."""
+    seed: int = 0
+    """Same seed, same result on the same machine."""
+    weights: str | None = None
+    """A network's weights, a path or a hub id; unset: the published ones. Under auto they are taken for DUSt3R's or
+    MASt3R's."""
+    predictions: Path | None = None
+    """A network's output as an npz file (docs/predictions.md); selects the back end predictions."""
+    cameras: Path | None = None
+    """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    board: str | None = None
+    """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
+    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    memory_gb: float = 8.0
+    """Most that the process may take of main memory (peak resident set, the program included), and a network of a
+    GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields as JSON knows them, paths as text."""
+        return {
+            name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()
+        }
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> "ReconstructOptions":
+        """The inverse of `as_json`."""
+        paths: dict[str, Any] = {
+            name: Path(content[name]) for name in ("predictions", "cameras") if content.get(name)
+        }
+        return cls(**(content | paths))
 
 
 def reconstruct(
@@ -103,20 +258,21 @@ def reconstruct(
     Raises InputError for a back end that is not there, NotTrustedError when it finds too little.
     """
     options = options or ReconstructOptions()
-    name = candidates(options)[0]
-    options = replace(options, backend=name)
-    if name not in BACKENDS:
-        raise InputError(f"--backend {name}: no such back end; there are {', '.join(BACKENDS)}")
+    row = BACKENDS[candidates(options)[0]]
+    if not row.is_installed():
+        raise InputError(
+            f"--backend {row.name}: the package {row.package} is not installed; {row.install}, or choose another"
+        )
     # By name, so that the order of the frames changes nothing.
     order = np.argsort(np.array(capture.images), kind="stable")
-    if BACKENDS[name].keeps_order:
+    if row.keeps_order:
         order = np.arange(len(capture))
     by_name = replace(
         capture,
         images=tuple(capture.images[k] for k in order),
         base_from_gripper=capture.base_from_gripper[order],
     )
-    return _of_capture(BACKENDS[name].reconstruct(by_name, options, progress), order)
+    return _of_capture(row.reconstruct(by_name, replace(options, backend=row.name), progress), order)
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
@@ -145,23 +301,77 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """What `auto` stands for here, the best first, or the one back end that was asked for.
 
-    Networks whose uncertainty is known come before the one whose is not, metric ones before others; only those
-    whose weights (and package) are on this machine count. COLMAP needs none, and sees what networks do not. Direct
-    alignment comes last, started by the compact network where its weights are here: COLMAP matches what is printed
-    on things, it the colours of plain ones.
+    An option that only one back end uses selects that one. A network whose weights were named is followed by the
+    best back end that needs none. Raises InputError for a back end that is not there, for options that select
+    different ones, and for an option that none of the answer uses.
     """
+    given = _given_options(options)
+    selecting = [row for row in BACKENDS.values() if row.selected_by in given]
     if options.backend != "auto":
-        return (options.backend,)
-    if options.board is not None:
-        return ("marker",)
-    if options.weights is not None:
-        return ("predictions",) if options.weights.endswith(".npz") else ("dust3r", "colmap")
-    ranking: tuple[BackendName, ...] = ("mast3r", "dust3r", "mapanything")
-    return (
-        *(name for name in ranking if CHECKPOINTS[name].is_cached() and BACKENDS[name].is_installed()),
-        "colmap",
-        "compact" if CHECKPOINTS["compact"].is_cached() else "direct",
-    )
+        names = (options.backend,)
+        if options.backend not in BACKENDS:
+            raise InputError(
+                f"--backend {options.backend}: no such back end; there are {', '.join(BACKENDS)}"
+            )
+    elif len(selecting) > 1:
+        raise InputError(
+            f"{' and '.join(_flag(row.selected_by) for row in selecting)} select different back ends "
+            f"({', '.join(row.name for row in selecting)}); give one of them"
+        )
+    else:
+        allowed = [row for row in BACKENDS.values() if row.auto]
+        if not selecting:
+            names = tuple(row.name for row in allowed if row.is_installed() and row.has_weights())
+        elif selecting[0].hub_id:
+            names = (selecting[0].name, next(row.name for row in allowed if not row.hub_id))
+        else:
+            names = (selecting[0].name,)
+    for name, value in given.items():
+        if not any(name in BACKENDS[chosen].options for chosen in names):
+            users = [row.name for row in BACKENDS.values() if name in row.options]
+            raise InputError(
+                f"{_flag(name)} {value}: the back end here ({', '.join(names)}) does not use it; leave it out, or "
+                f"give --backend {' or '.join(users)}"
+            )
+    return names
+
+
+def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:
+    """The options as one of `candidates` takes them: without what is meant for another."""
+    unused = _given_options(options).keys() - set(BACKENDS[name].options)
+    defaults = {field.name: field.default for field in fields(options) if field.name in unused}
+    return replace(options, backend=name, **defaults)
+
+
+def with_cameras_of(capture: Capture, options: ReconstructOptions) -> ReconstructOptions:
+    """The options with the capture's own camera poses, where it has some and nothing else was asked for."""
+    if capture.cameras is None or options.cameras is not None:
+        return options
+    selecting = {row.selected_by for row in BACKENDS.values()} & _given_options(options).keys()
+    free = not selecting if options.backend == "auto" else "cameras" in BACKENDS[options.backend].options
+    return replace(options, cameras=capture.cameras.resolve()) if free else options
+
+
+def weights_of(options: ReconstructOptions) -> tuple[str, str]:
+    """The weights of the network that `options` names, a path or hub id, and their licence."""
+    row = BACKENDS[options.backend]
+    weights = options.weights or row.hub_id
+    for published in BACKENDS.values():
+        if published.hub_id == weights:
+            return weights, published.licence
+    return weights, f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
+
+
+def _given_options(options: ReconstructOptions) -> dict[str, Any]:
+    """Those that some back ends do not use, where they are not what they are unset."""
+    own = {name for row in BACKENDS.values() for name in row.options}
+    values = {field.name: getattr(options, field.name) for field in fields(options) if field.name in own}
+    unset = {field.name: field.default for field in fields(options)}
+    return {name: value for name, value in values.items() if value != unset[name]}
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def device_of(options: ReconstructOptions) -> str:
@@ -173,71 +383,3 @@ def device_of(options: ReconstructOptions) -> str:
     if options.device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return options.device
-
-
-def _colmap(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import ColmapOptions, reconstruct
-
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
-
-
-def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.dust3r.backend import Dust3rOptions, reconstruct
-    from jcr.reconstruct.global_alignment.pairs import PairOptions
-
-    pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
-    model = "mast3r" if options.backend == "mast3r" else "dust3r"
-    return reconstruct(capture, Dust3rOptions(model, options.weights, device_of(options), pairs), progress)
-
-
-def _direct(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
-
-    made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
-
-
-def _compact(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.compact import CompactOptions, reconstruct
-    from jcr.reconstruct.direct.direct import DirectOptions
-    from jcr.reconstruct.epipolar import EpipolarOptions
-
-    device = device_of(options)
-    made = DirectOptions(device=device, memory_gb=options.memory_gb)
-    epipolar = EpipolarOptions(seed=options.seed)
-    return reconstruct(capture, CompactOptions(options.weights, device, epipolar, made), progress)
-
-
-def _mapanything(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
-
-    weights = options.weights or CHECKPOINTS["mapanything"].hub_id
-    return reconstruct(capture, MapAnythingOptions(weights, device_of(options)), progress)
-
-
-def _marker(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.marker import MarkerOptions, reconstruct
-
-    if options.board is None:
-        raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    made = MarkerOptions(options.board, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
-
-
-def _predictions(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.predictions import PredictionsOptions, reconstruct
-
-    if options.weights is None:
-        raise InputError("--backend predictions: name the npz file with --weights FILE (docs/predictions.md)")
-    return reconstruct(capture, PredictionsOptions(Path(options.weights), options.memory_gb), progress)
-
-
-def _given(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import ColmapOptions
-    from jcr.reconstruct.given import reconstruct
-
-    if options.weights is None:
-        raise InputError("--backend given: name the COLMAP model or transforms.json with --weights PATH")
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, Path(options.weights), made, progress)

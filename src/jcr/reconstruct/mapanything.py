@@ -14,7 +14,6 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.geometry import inverse, nearest_rotation, rotation_angle
 from jcr.progress import Progress, silent
-from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
 from jcr.reconstruct.preprocess import PreparedImages, image_grid, prepare_images
 from jcr.records import Capture, Reconstruction
@@ -35,7 +34,7 @@ class Model(Protocol):
 class MapAnythingOptions:
     """One pass of a metric network over all images."""
 
-    weights: str = CHECKPOINTS["mapanything"].hub_id
+    weights: str
     """Hub id or folder; facebook/map-anything is better and non-commercial."""
     device: str = "cpu"
     """Where the network runs: cpu or cuda."""
@@ -43,16 +42,15 @@ class MapAnythingOptions:
 
 def reconstruct(
     capture: Capture,
-    options: MapAnythingOptions | None = None,
+    options: MapAnythingOptions,
     progress: Progress | None = None,
     model: Model | None = None,
 ) -> Reconstruction:
     """Camera poses, pointmaps and tracks in metres, as far as the network is right about them.
 
     The robot's poses are not shown to it, so its own can be held against them: how far the angles between
-    views differ is among the notes. Raises InputError when the package or its weights are not there.
+    views differ is among the notes. Raises InputError when its weights are not there.
     """
-    options = options or MapAnythingOptions()
     report = progress or silent
     model = model or _load(options)
     images = prepare_images(capture, lambda size: image_grid(size, LONG_EDGE, PATCH, keep_square=True))
@@ -118,13 +116,8 @@ def _against_robot(recon_from_camera: np.ndarray, base_from_gripper: np.ndarray)
 
 
 def _load(options: MapAnythingOptions) -> Model:
-    try:
-        from mapanything.models import MapAnything  # type: ignore[import-not-found]
-    except ImportError:
-        raise InputError(
-            "the mapanything package is not installed; "
-            "pip install git+https://github.com/facebookresearch/map-anything, or choose another --backend"
-        ) from None
+    from mapanything.models import MapAnything  # type: ignore[import-not-found]
+
     try:
         return MapAnything.from_pretrained(options.weights).to(options.device)
     except (OSError, ValueError, RuntimeError) as error:

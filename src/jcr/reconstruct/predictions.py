@@ -15,8 +15,7 @@ from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
-from jcr.reconstruct.dust3r.backend import reconstruction_from_pairs
-from jcr.reconstruct.dust3r.predict import memory_after
+from jcr.reconstruct.from_pairs import memory_after, reconstruction_from_pairs
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
 from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps

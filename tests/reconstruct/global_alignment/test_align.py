@@ -10,6 +10,7 @@ from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.reconstruct.global_alignment.align import align
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, pinhole_of
 from jcr.reconstruct.global_alignment.gauss_newton import FreeCameras, Problem, gauss_newton, moved
@@ -19,7 +20,7 @@ from jcr.reconstruct.global_alignment.normal_equations import (
     PairTies,
     ReducedEquations,
 )
-from jcr.reconstruct.global_alignment.pairs import complete_pairs, window_pairs, write_pairs
+from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.reconstruct.global_alignment.pointmap_residuals import State
 from jcr.records import Intrinsics
 from places import SHARED

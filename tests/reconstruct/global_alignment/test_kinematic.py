@@ -8,6 +8,7 @@ import pytest
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, transform
+from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import AlignOptions, align
 from jcr.reconstruct.global_alignment.kinematic import (
     KinematicAlignment,
@@ -15,7 +16,7 @@ from jcr.reconstruct.global_alignment.kinematic import (
     align_kinematic,
     hand_eye_from_motions,
 )
-from jcr.reconstruct.global_alignment.pairs import PairPredictions, complete_pairs
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
 SMALL = (48, 36)
 FEW_PIXELS = AlignOptions(pixels=432)

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.reconstruct.checkpoints import CHECKPOINTS, HUB_FILES, licence_of
 from jcr.reconstruct.dust3r.network import Dust3r
+from jcr.reconstruct.hub import HUB_FILES, cached_files
 
 
 @dataclass(frozen=True)
@@ -33,33 +33,24 @@ class LoadedNetwork:
     licence: str
     is_metric: bool
     """Its points are meant to be in metres."""
-    size: tuple[int, int] | None = None
-    """Width and height of the images that it was trained on, where it knows no others."""
-    matching_block: int | None = None
-    """The decoder block whose cross-attention was taught to look where the same points are; None: there is none."""
 
 
-def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
+def load_weights(source: str | Path, device: str = "cpu", licence: str = "unknown") -> LoadedNetwork:
     """A network with the weights of a .pth, a .safetensors beside its config.json, a folder, or a hub id.
 
     A hub id is downloaded (resumed where it stopped; HF_HUB_OFFLINE honoured) unless it is in the cache. The
-    licence is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
+    `licence` is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
     """
     path = Path(source)
     if not path.exists() and re.fullmatch(r"[\w.-]+/[\w.-]+", str(source)) and path.suffix not in _READERS:
         path = _download(str(source))
     elif not path.exists():
-        example = CHECKPOINTS["dust3r"].hub_id
-        raise InputError(f"{source}: no such weights; give a file, a folder or a hub id such as {example}")
+        raise InputError(f"{source}: no such weights; give a file, a folder or a hub id (jcr models)")
     if path.is_dir():
         path = _file_in(path)
     if path.suffix not in _READERS:
         raise InputError(f"{path}: weights are .pth, .pt or .safetensors, not {path.suffix or 'this'}")
     config, state = _READERS[path.suffix](path)
-    licence = str(config.pop("licence", None) or licence_of(str(source)))
-    size = _only_size(config)
-    config.pop("accuracy", None)
-    matching = config.pop("matching_block", None)
     # MASt3R is this network with one more head, for matching, which we do without; its points are metric.
     mast3r = [key for key in state if ".head_local_features." in key]
     network = _build(config, {key: state[key] for key in state if key not in mast3r}, path)
@@ -68,18 +59,8 @@ def load_weights(source: str | Path, device: str = "cpu") -> LoadedNetwork:
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
-    if matching is not None and not (isinstance(matching, int) and 0 <= matching < len(network.dec_blocks)):
-        raise InputError(f"{path}: its config.json names no decoder block by matching_block; fetch it again")
     _announce(str(source), licence)
-    return LoadedNetwork(network, str(source), licence, bool(mast3r), size, matching)
-
-
-def _only_size(config: dict[str, object]) -> tuple[int, int] | None:
-    """What stands in config.json as the one size, [width, height], that a network was trained on."""
-    size = config.pop("only_size", None)
-    if not isinstance(size, list) or len(size) != 2:
-        return None
-    return int(size[0]), int(size[1])
+    return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r))
 
 
 def fingerprint(network: Dust3r) -> str:
@@ -95,12 +76,11 @@ def fingerprint(network: Dust3r) -> str:
 def _download(hub_id: str) -> Path:
     """The model.safetensors of a hub id beside its config.json, from the cache where both are there."""
     import httpx
-    from huggingface_hub import hf_hub_download, try_to_load_from_cache
+    from huggingface_hub import hf_hub_download
     from huggingface_hub.utils import logging as hub_logging
 
-    cached = [try_to_load_from_cache(hub_id, name) for name in HUB_FILES]
-    if all(isinstance(path, str) for path in cached):
-        return Path(str(cached[1]))
+    if cached := cached_files(hub_id):
+        return cached[1]
     sys.stderr.write(f"fetching {hub_id} from the hub\n")
     verbosity = hub_logging.get_verbosity()
     hub_logging.set_verbosity_error()  # its retries, five of them, are no news to the user

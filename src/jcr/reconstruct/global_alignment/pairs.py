@@ -1,4 +1,4 @@
-"""Which pairs of images to predict, and their pointmaps as a record and a file, read by global alignment."""
+"""Pointmaps of pairs of images, as a record and a file: what global alignment reads, whoever predicted them."""
 
 import math
 import mmap
@@ -6,7 +6,6 @@ import struct
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -14,44 +13,11 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.files import written_whole
-from jcr.geometry import (
-    apply,
-    fit_similarity,
-    inverse,
-    nearest_rotation,
-    rotation_angle,
-    rotation_log,
-    transform,
-)
 from jcr.reconstruct.preprocess import ImageGrid
 from jcr.records import Intrinsics
 
 ARRAYS = {"edges": 2, "pts3d": 4, "conf": 3, "pts3d_in_other_view": 4, "conf2": 3}
 """Keys every file has, and their dimensions; the names are those of DUSt3R's own output."""
-
-
-FEW_IMAGES = 12
-"""Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
-
-
-@dataclass(frozen=True)
-class PairOptions:
-    """Which pairs of images the network sees, and within what memory."""
-
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """complete: all pairs; window: images near each other in the capture's order; robot: all but the pairs
-    that by the robot's poses have no view in common; auto: complete up to 12 images, robot beyond."""
-    window: int = 3
-    """How far apart in the capture's order two images of a pair may be (window only)."""
-    image_size: Literal[512, 224] = 512
-    """Long edge that the network sees, in pixels; 224 has a quarter of the pixels to compute."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process, the program itself included; on a GPU, what the network takes there, too.
-    Pointmaps that do not fit lie in a file."""
-    cache: Path | None = None
-    """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
-    cache_gb: float = 4.0
-    """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
 
 
 @dataclass(frozen=True)
@@ -256,120 +222,3 @@ def camera_of_arrays(
             )
         grid = ImageGrid(*((int(x), int(y)) for x, y in arrays["grid"]))
     return intrinsics, grid
-
-
-def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
-    """Every pair in both orders: (i, j) with i > j first, then each reversed, as published."""
-    return _both_orders(np.argwhere(np.tri(count, k=-1, dtype=bool)))
-
-
-def window_pairs(count: int, size: int) -> Int[ndarray, "e 2"]:
-    """Pairs of images at most `size` apart in the order of the capture, in both orders."""
-    near = np.tri(count, k=-1, dtype=bool) & ~np.tri(count, k=-size - 1, dtype=bool)
-    return _both_orders(np.argwhere(near))
-
-
-def _both_orders(edges: Int[ndarray, "e 2"]) -> Int[ndarray, "e2 2"]:
-    return np.concatenate([edges, edges[:, ::-1]])
-
-
-def overlapping_pairs(
-    chain: PairPredictions, base_from_gripper: Float[ndarray, "n 4 4"], least_overlap: float = 0.02
-) -> tuple[Int[ndarray, "e 2"], str]:
-    """Pairs that can see something in common, in both orders, and in words how that was found.
-
-    `chain` holds the pairs of neighbours, `window_pairs(n, 1)`. From their relative camera poses and the
-    robot's come a first hand-eye calibration and the pairs' scales; with them every image's points go into
-    the base frame and from there into every other camera. A pair is left out only when less than
-    `least_overlap` of the points of either image fall into half again the other's field of view. All pairs
-    are kept where the motions do not determine where the camera looks, or the chain contradicts the robot.
-    """
-    everything = complete_pairs(len(base_from_gripper))
-    views = _chain_views(chain, len(base_from_gripper))
-    fit = _first_calibration(views, base_from_gripper)
-    if isinstance(fit, str):
-        return everything, f"all pairs predicted: {fit}"
-    gripper_from_camera, metres = fit
-    base_from_camera = base_from_gripper @ gripper_from_camera
-    camera_from_base = inverse(base_from_camera)
-    points = [scale * view.points for scale, view in zip(metres, views, strict=True)]
-    points.append(metres[-1] * views[-1].next_points)
-    seen = np.zeros((len(points), len(points)))
-    for i, x_in_camera in enumerate(points):
-        x_in_base = apply(base_from_camera[i], x_in_camera)
-        for j, others in enumerate(points):
-            seen[i, j] = _share_in_view(apply(camera_from_base[j], x_in_base), others)
-    first, second = everything.T
-    keep = (np.maximum(seen, seen.T)[first, second] >= least_overlap) | (np.abs(first - second) == 1)
-    return everything[keep], f"{keep.sum()} of {len(keep)} pairs predicted: the others share no view"
-
-
-def _first_calibration(
-    views: list["_ChainView"], base_from_gripper: Float[ndarray, "n 4 4"]
-) -> tuple[Float[ndarray, "4 4"], Float[ndarray, " k"]] | str:
-    """A rough gripper_from_camera and metres per unit of each pair of neighbours, or why there is none."""
-    gripper_motion = inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]
-    camera_motion = np.stack([view.camera_from_next for view in views])
-    rotation_a, rotation_b = gripper_motion[:, :3, :3], camera_motion[:, :3, :3]
-    # Park and Martin 1994: log R_A = R log R_B for every motion.
-    cross = rotation_log(rotation_a).T @ rotation_log(rotation_b)
-    largest, second, _ = np.linalg.svd(cross, compute_uv=False)
-    if largest < 1e-3 or second < 0.02 * largest:
-        return "neighbours turn about less than two axes, so where the camera looks is unknown"
-    rotation = nearest_rotation(cross)
-    miss = rotation_angle(np.swapaxes(rotation_a @ rotation, -1, -2) @ rotation @ rotation_b)
-    if np.median(miss) > np.radians(10):
-        return "the pairs of neighbours do not agree with the robot's rotations"
-    # (R_A − I) t − λ_k R t_B = −t_A, linear in the lever arm t, held near 0 a little, and one λ_k per pair.
-    motions = np.arange(len(views))
-    lever, scales = rotation_a - np.eye(3), np.zeros((len(views), 3, len(views)))
-    scales[motions, :, motions] = -camera_motion[:, :3, 3] @ rotation.T
-    rows = np.concatenate([lever, scales], axis=2).reshape(-1, 3 + len(views))
-    matrix = np.concatenate([rows, 0.1 * np.eye(3, 3 + len(views))])
-    right = np.append(-gripper_motion[:, :3, 3].ravel(), np.zeros(3))
-    solution = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    if (solution[3:] <= 0).any():
-        return "the pairs of neighbours do not agree with the robot's translations"
-    return transform(rotation, solution[:3]), solution[3:]
-
-
-@dataclass(frozen=True)
-class _ChainView:
-    """Two neighbours in one pair's unit."""
-
-    camera_from_next: Float[ndarray, "4 4"]
-    points: Float[ndarray, "p 3"]
-    """Of the first, in its camera frame."""
-    next_points: Float[ndarray, "p 3"]
-    """Of the next, in its own camera frame."""
-
-
-def _chain_views(chain: PairPredictions, count: int, samples: int = 1000) -> list[_ChainView]:
-    row = {(int(first), int(second)): e for e, (first, second) in enumerate(chain.edges)}
-    views = []
-    for k in range(count - 1):
-        there, back = row[k, k + 1], row[k + 1, k]
-        # The same pixels of the next image, in the camera frame of image k and in their own.
-        confidence = np.minimum(chain.conf2[there], chain.conf[back]).ravel()
-        best = np.argsort(confidence)[-len(confidence) // 2 :]
-        pixels = best[:: max(1, len(best) // samples)]
-        in_camera = chain.pts3d_in_other_view[there].reshape(-1, 3)[pixels].astype(np.float64)
-        in_next = chain.pts3d[back].reshape(-1, 3)[pixels].astype(np.float64)
-        camera_from_next, scale = fit_similarity(in_camera, in_next)
-        own = np.argsort(chain.conf[there].ravel())[-len(confidence) // 2 :][:: max(1, len(best) // samples)]
-        points = chain.pts3d[there].reshape(-1, 3)[own].astype(np.float64)
-        views.append(_ChainView(camera_from_next, points, scale * in_next))
-        chain.release()
-    return views
-
-
-def _share_in_view(
-    x_in_camera: Float[ndarray, "n 3"], view: Float[ndarray, "p 3"], widen: float = 1.5
-) -> float:
-    """Fraction of points that fall into the field of view that a camera's own points span, widened."""
-    directions = view[:, :2] / np.maximum(view[:, 2:], 1e-6)
-    low, high = np.quantile(directions, [0.01, 0.99], axis=0)
-    middle, half = (low + high) / 2, widen * (high - low) / 2
-    ahead = x_in_camera[:, 2] > 1e-6
-    inside = np.abs(x_in_camera[ahead, :2] / x_in_camera[ahead, 2:] - middle) <= half
-    return float(inside.all(-1).sum() / len(x_in_camera))

@@ -15,26 +15,24 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.memory import ALLOWANCE, GB, MAP, announce, relieve, require, resident
+from jcr.memory import ALLOWANCE, GB, announce, relieve, require, resident
 from jcr.progress import Progress, silent
-from jcr.reconstruct.dust3r.network import DptHead, Dust3r, Features
+from jcr.reconstruct.dust3r.network import PATCH, DptHead, Dust3r, Features
 from jcr.reconstruct.dust3r.pair_cache import PairCache, user_cache
-from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
-from jcr.reconstruct.global_alignment.alignment import AlignOptions
-from jcr.reconstruct.global_alignment.pairs import (
+from jcr.reconstruct.dust3r.pair_graph import (
     FEW_IMAGES,
     PairOptions,
-    PairPredictions,
     complete_pairs,
     overlapping_pairs,
     window_pairs,
 )
+from jcr.reconstruct.dust3r.weights import LoadedNetwork, fingerprint
+from jcr.reconstruct.from_pairs import memory_after
+from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.preprocess import PreparedImages
 
 logger = logging.getLogger(__name__)
 
-OBSERVED, RECORDED = 80, 60
-"""Bytes per pixel, when the network has gone: of a pointmap in alignment, and of an image in the reconstruction."""
 MAX_BATCH = {"cpu": 1, "cuda": 16}
 """Pairs at a time. More do not help a CPU, whose cores one pair of 768 tokens keeps busy."""
 
@@ -64,7 +62,7 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
     weights = sum(
         x.numel() * x.element_size() * (2 if twice and x.ndim == 4 else 1) for x in network.parameters()
     )
-    pixels, tokens = height * width, height * width // network.patch**2
+    pixels, tokens = height * width, height * width // PATCH**2
     enc_dim, dec_dim = network.decoder_embed.in_features, network.decoder_embed.out_features
     # Every layer of both views is kept for the heads; a block works on about 12 arrays of its width.
     blocks = 4 * tokens * (2 * (len(network.dec_blocks) + 1) * dec_dim + 12 * max(enc_dim, dec_dim))
@@ -75,12 +73,6 @@ def estimate_memory(network: Dust3r, images: int, pairs: int, height: int, width
     finest = 2 * 256 * pixels // 16 if dpt else 0
     features = 4 * images * (tokens * enc_dim + finest)
     return MemoryEstimate(weights, features, blocks + head, pairs * pixels * 8 * 4)
-
-
-def memory_after(images: int, pairs: int, pixels: int) -> int:
-    """Bytes that aligning, matching and mapping pairs of `pixels` pixels take beside their pointmaps."""
-    observed = min(AlignOptions.pixels, pixels)
-    return max(MAP, 2 * pairs * observed * OBSERVED) + images * pixels * RECORDED
 
 
 def predict_pairs(

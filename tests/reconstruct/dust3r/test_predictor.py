@@ -12,19 +12,12 @@ from scipy.spatial.transform import Rotation
 from jcr import memory
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
-from jcr.reconstruct.dust3r import predict
+from jcr.reconstruct.dust3r import predictor
 from jcr.reconstruct.dust3r.network import Dust3r
-from jcr.reconstruct.dust3r.predict import estimate_memory, predict_pairs
+from jcr.reconstruct.dust3r.pair_graph import PairOptions, complete_pairs, overlapping_pairs, window_pairs
+from jcr.reconstruct.dust3r.predictor import estimate_memory, predict_pairs
 from jcr.reconstruct.dust3r.weights import LoadedNetwork
-from jcr.reconstruct.global_alignment.pairs import (
-    PairOptions,
-    PairPredictions,
-    complete_pairs,
-    overlapping_pairs,
-    read_pairs,
-    window_pairs,
-    write_pairs,
-)
+from jcr.reconstruct.global_alignment.pairs import PairPredictions, read_pairs, write_pairs
 from jcr.reconstruct.preprocess import PreparedImages, image_grid
 from jcr.records import Intrinsics
 
@@ -119,8 +112,8 @@ def test_the_cache_keeps_its_limit(loaded: LoadedNetwork, images: PreparedImages
 def test_pointmaps_too_large_for_the_budget_are_the_same_from_a_file(
     loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(predict, "resident", lambda: 0)
-    monkeypatch.setattr(predict, "ALLOWANCE", 0)
+    monkeypatch.setattr(predictor, "resident", lambda: 0)
+    monkeypatch.setattr(predictor, "ALLOWANCE", 0)
     estimate = estimate_memory(loaded.network, 4, 12, 48, 64)
     budget = estimate.weights + estimate.features + 1.01 * estimate.per_pair
     assert budget / 2 < estimate.pointmaps
@@ -139,7 +132,7 @@ def test_out_of_memory_halves_the_batch_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setitem(predict.MAX_BATCH, "cpu", 8)
+    monkeypatch.setitem(predictor.MAX_BATCH, "cpu", 8)
     decode = loaded.network.decode
     batches = []
 
@@ -167,7 +160,7 @@ def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_says_so(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(Dust3r, "device", torch.device("cuda"))
-    encode = predict._Predictor._encode
+    encode = predictor._Predictor._encode
     tried = []
 
     def encode_on_the_cpu_alone(self, rows):
@@ -176,8 +169,8 @@ def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_says_so(
             raise torch.cuda.OutOfMemoryError("out of memory")
         return encode(self, rows)
 
-    monkeypatch.setattr(predict._Predictor, "_encode", encode_on_the_cpu_alone)
-    monkeypatch.setitem(predict.MAX_BATCH, "cuda", 4)
+    monkeypatch.setattr(predictor._Predictor, "_encode", encode_on_the_cpu_alone)
+    monkeypatch.setitem(predictor.MAX_BATCH, "cuda", 4)
     poses = np.tile(np.eye(4), (4, 1, 1))
     with caplog.at_level(logging.WARNING):
         pairs, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))

@@ -1,0 +1,15 @@
+"""Weights on the Hugging Face hub: which files they are, and whether they are on this machine."""
+
+from pathlib import Path
+
+HUB_FILES = ("config.json", "model.safetensors")
+
+
+def cached_files(hub_id: str) -> list[Path]:
+    """HUB_FILES of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
+    from huggingface_hub import try_to_load_from_cache
+
+    # Not a path where a file is missing, or known to be missing on the hub.
+    found = [try_to_load_from_cache(hub_id, name) for name in HUB_FILES]
+    paths = [Path(path) for path in found if isinstance(path, str)]
+    return paths if len(paths) == len(HUB_FILES) else []
