@@ -39,10 +39,20 @@ SMALL = {
 """Three million parameters; its weights are random, for what it says of the pictures changes no size."""
 DPT = SMALL | {"dec_depth": 10, "head_type": "dpt"}
 """With the heads of the published network, 43 million."""
-GRID = [128, 96]
-"""Width and height that the small networks see: 40 images make 0.61 GB of pointmaps."""
-
 PREDICT, NEAR = ["--pair-graph", "complete", "--cache-gb", "0"], ["--pair-graph", "window"]
+SQUARE = ["--image-size", "224"]
+"""20 images then make 0.61 GB of pointmaps."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command, on captures of so many images."""
+
+    name: str
+    command: list[str]
+    images: Sequence[int]
+    loose: bool = False
+    """Whether the largest capture is run with LOOSE_GB, too."""
 
 
 @dataclass(frozen=True)
@@ -63,25 +73,27 @@ def run() -> str:
         folder = Path(place)
         captures = {count: _capture(folder, count) for count in IMAGES}
         linear, dpt = (_weights(folder / name, config) for name, config in (("linear", SMALL), ("dpt", DPT)))
+        run, predict = ["run", "--backend", "dust3r", "--weights"], ["predict", "--weights"]
         jobs = [
-            ("`jcr run`, COLMAP", ["run", "--backend", "colmap"], IMAGES),
-            ("`jcr run`, small network", ["run", "--backend", "dust3r", "--weights", linear], IMAGES[:2]),
-            (
-                "`jcr run`, small network, near pairs",
-                ["run", "--backend", "dust3r", "--weights", linear, *NEAR],
-                IMAGES[2:],
+            Job("`jcr run`, COLMAP", ["run", "--backend", "colmap"], IMAGES, loose=True),
+            Job("`jcr run`, small network", [*run, linear], IMAGES[:1]),
+            Job("`jcr run`, small network, near pairs", [*run, linear, *NEAR], IMAGES[2:], loose=True),
+            Job(
+                "`jcr predict`, small network, 224x224",
+                [*predict, linear, *PREDICT, *SQUARE],
+                IMAGES[1:2],
+                loose=True,
             ),
-            ("`jcr predict`, small network", ["predict", "--weights", linear, *PREDICT], IMAGES[2:]),
-            ("`jcr predict`, small network, DPT heads", ["predict", "--weights", dpt, *PREDICT], IMAGES[:1]),
+            Job("`jcr predict`, small network, DPT heads", [*predict, dpt, *PREDICT], IMAGES[:1]),
         ]
 
-        def peaks(job: tuple[str, list[str], int]) -> list[tuple[str, Peak]]:
-            name, command, count = job
-            least = _least(command, captures[count], folder)
-            budgets = (least, LOOSE_GB) if count == IMAGES[-1] else (least,)
-            return [(name, _peak(command, captures[count], folder, budget)) for budget in budgets]
+        def peaks(each: tuple[Job, int]) -> list[tuple[str, Peak]]:
+            job, count = each
+            least = _least(job.command, captures[count], folder)
+            budgets = (least, LOOSE_GB) if job.loose and count == job.images[-1] else (least,)
+            return [(job.name, _peak(job.command, captures[count], folder, budget)) for budget in budgets]
 
-        each = [(name, command, count) for name, command, counts in jobs for count in counts]
+        each = [(job, count) for job in jobs for count in job.images]
         with ThreadPoolExecutor(AT_ONCE) as pool:
             rows = [row for found in pool.map(peaks, each) for row in found]
     kept = sum(row.peak_gb <= row.budget_gb for _, row in rows)
@@ -92,8 +104,8 @@ def run() -> str:
         "announced.",
         "",
         f"Simulated tabletop, images of {WIDTH}x{WIDTH * 3 // 4}, a process each. The least budget is the one that the "
-        f"refusal of {TOO_LITTLE_GB:g} GB names. The small networks have random weights and see every pair at "
-        f"{GRID[0]}x{GRID[1]}; *near pairs*, those of images up to {PairOptions.window} apart. Peak: VmHWM, the program "
+        f"refusal of {TOO_LITTLE_GB:g} GB names. The small networks have random weights and see every pair, at "
+        f"512x384 unless said; *near pairs*, those of images up to {PairOptions.window} apart. Peak: VmHWM, the program "
         "itself included.",
         "",
         "| job | images | budget | announced | pointmaps in a file | peak |",
@@ -133,7 +145,7 @@ def _weights(folder: Path, config: dict) -> str:
     save_file(
         {key: value.contiguous() for key, value in network.state_dict().items()}, folder / "model.safetensors"
     )
-    write_text(folder / "config.json", json.dumps(config | {"only_size": GRID, "licence": "none: random"}))
+    write_text(folder / "config.json", json.dumps(config))
     return str(folder)
 
 

@@ -172,8 +172,8 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
         assert with_cameras_of(capture, options) == options
 
 
-def test_options_survive_json() -> None:
-    options = ReconstructOptions(predictions=Path("p.npz"), cameras=Path("sparse"), seed=2)
+def test_options_survive_json(tmp_path: Path) -> None:
+    options = ReconstructOptions(predictions=tmp_path / "p.npz", cameras=tmp_path / "sparse", seed=2)
     assert ReconstructOptions.from_json(json.loads(json.dumps(options.as_json()))) == options
 
 

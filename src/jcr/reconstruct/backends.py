@@ -236,10 +236,9 @@ class ReconstructOptions:
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
 
     def as_json(self) -> dict[str, Any]:
-        """The fields as JSON knows them, paths as text."""
-        return {
-            name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()
-        }
+        """The fields as JSON knows them; paths as text that holds in every working folder."""
+        values = asdict(self)
+        return {name: str(x.resolve()) if isinstance(x, Path) else x for name, x in values.items()}
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "ReconstructOptions":
