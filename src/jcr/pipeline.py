@@ -32,7 +32,6 @@ from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
-from jcr.export.points import read_cloud, write_cloud
 from jcr.files import remove_unfinished, write_text
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
@@ -41,6 +40,7 @@ from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, writ
 from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.options import MapOptions
 from jcr.results import PosesResult, RunResult
 from jcr.segment.measure import Measured

@@ -15,8 +15,8 @@ from safetensors.numpy import load_file
 
 from jcr.calibration.calibration_json import read_calibration
 from jcr.cli import dispatch, main
-from jcr.export.points import read_cloud
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
+from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.scene import load_map
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "3"))

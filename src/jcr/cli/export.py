@@ -189,7 +189,7 @@ class Run:
     @cached_property
     def cloud(self) -> "PointCloud":
         """cloud.ply."""
-        from jcr.export.points import read_cloud
+        from jcr.represent.cloud_ply import read_cloud
 
         return read_cloud(self.arguments.out / "cloud.ply")
 
@@ -236,9 +236,9 @@ def _camera_info(run: Run, path: Path) -> None:
 
 
 def _ply(run: Run, path: Path) -> None:
-    from jcr.export.points import write_cloud
+    from jcr.represent.cloud_ply import write_cloud
 
-    write_cloud(path, run.cloud, run.provenance)
+    write_cloud(path, run.cloud, run.provenance.notes)
 
 
 def _glb(run: Run, path: Path) -> None:

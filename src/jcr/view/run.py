@@ -9,11 +9,11 @@ from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile, read_calibration
 from jcr.errors import InputError
-from jcr.export.points import read_cloud
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.pipeline import read_capture_of
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.records import Intrinsics, PointCloud, Reconstruction
+from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.scene import FILE, SceneMap, load_map
 
 CLOUD_POINTS = 200_000
