@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from jcr import auto
+from jcr import attempts
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.stage import CalibrateOptions
 from jcr.cli import dispatch
@@ -94,11 +94,14 @@ def auto_result(
             raise answer
         return reconstruction(options.backend, answer)
 
-    monkeypatch.setattr(auto, "reconstruct", door)
+    monkeypatch.setattr(attempts, "reconstruct", door)
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
     capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
-    best = auto.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
-    return best.reconstruction, tried
+    choice = attempts.choose(capture, ReconstructOptions(), CalibrateOptions())
+    assert [attempt.backend for attempt in choice.attempts] == tried
+    kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
+    assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
+    return choice.reconstruction, tried
 
 
 def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(

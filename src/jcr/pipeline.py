@@ -1,61 +1,33 @@
-"""The stages in order, from a capture to a run folder that any of them can start again from.
+"""The stages in order, each timed, from a capture to a run folder that any of them can start again from.
 
 capture -> reconstruct -> calibrate -> cloud -> map -> report
 """
 
-import fcntl
-import hashlib
-import json
-import os
-import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from jcr import __version__
-from jcr.attempts import best_reconstruction
-from jcr.calibration.calibration_json import (
-    CalibrationFile,
-    calibration_file,
-    failed_file,
-    read_calibration,
-    write_calibration,
-)
-from jcr.calibration.stage import CalibrateOptions
-from jcr.calibration.stage import calibrate as calibrate_stage
+from jcr.attempts import Choice, NothingFoundError, again, choose, timings_of
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
+from jcr.calibration.stage import CalibrateOptions, is_one
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
-from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.capture.capture_json import kept
-from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
-from jcr.files import remove_unfinished, write_text
+from jcr.errors import InputError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
-from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
-from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
-from jcr.represent.build import build_scene
+from jcr.records import Capture, PointCloud, PosePairs
 from jcr.represent.cloud import CloudOptions, point_cloud
-from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.options import MapOptions
 from jcr.results import PosesResult, RunResult
+from jcr.run_folder import MadeWith, RunFolder, State, fingerprint, held
 from jcr.segment.measure import Measured
 from jcr.segment.measure import measure as measure_cloud
 from jcr.segment.options import SegmentOptions
 from jcr.segment.segments import image_labels, label_cloud
-
-CAPTURE = "capture"
-"""In the run folder: images and poses that were read from another format than capture.json."""
-STATE = "run.json"
-"""In the run folder: the capture, and what each finished stage was made from."""
-OF_CALIBRATION = ("cloud.ply", "map.safetensors", "report.html")
-"""In the run folder: what holds of one calibration alone."""
-LOCK = ".lock"
-"""In the run folder: held by the run that writes there."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +55,10 @@ def run(
     that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
-    with run_folder(Path(out)) as folder:
-        capture = kept(capture, folder / CAPTURE)
-        added = read_added(folder, capture)
-        result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result, progress)
-        return result
+    with held(Path(out)) as folder:
+        capture = folder.keep_capture(capture)
+        added = read_added(folder.path, capture)
+        return _all_stages(capture, added, folder, options, progress or silent)
 
 
 def calibrate(
@@ -102,23 +71,22 @@ def calibrate(
 ) -> RunResult:
     """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
     options = _with_backend(options, backend, capture)
-    with run_folder(Path(out)) as folder:
-        return _calibrate(kept(capture, folder / CAPTURE), folder, options, progress)
+    with held(Path(out)) as folder:
+        return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
 
 
 def calibrate_poses(
     pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
 ) -> PosesResult:
     """calibration.json in the folder `out` from camera poses that were given, without images."""
-    start = time.perf_counter()
-    with run_folder(Path(out)) as folder:
+    with held(Path(out)) as folder:
+        start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
-        timings = {"calibrate": round(time.perf_counter() - start, 3)}
+        timings = {"calibrate": _seconds_since(start)}
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
-        _forget_reconstruction(folder)
-        _replace_calibration(folder, content)
-        _write_log(folder, content)
-        return PosesResult(folder, content, hand_eye)
+        folder.forget_reconstruction()
+        folder.keep_calibration(content)
+        return PosesResult(folder.path, content, hand_eye, hand_eye.converged and is_one(hand_eye))
 
 
 def build_map(
@@ -135,27 +103,17 @@ def build_map(
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
     not the calibration, and every later map of the folder has them.
     """
-    capture = read_capture_of(out)
-    with run_folder(Path(out)) as folder:
-        options = replace(
-            options_of(out),
-            cloud=cloud or CloudOptions(),
-            map=map or MapOptions(),
-            segment=segment or SegmentOptions(),
-        )
-        added = with_images(read_added(folder, capture), add)
-        result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result, progress)
-        return result
-
-
-def read_capture_of(out: str | Path) -> Capture:
-    """The capture that a run folder was made from; InputError where there is no run, or no such capture any more."""
-    state = _read_state(Path(out))
-    if "capture" not in state:
-        raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
-    return read_capture(state["capture"])
+    made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
+    options = RunOptions(
+        made_with.reconstruct,
+        made_with.calibrate,
+        cloud or CloudOptions(),
+        map or MapOptions(),
+        segment or SegmentOptions(),
+    )
+    with held(Path(out)) as folder:
+        added = with_images(read_added(folder.path, capture), add)
+        return _all_stages(capture, added, folder, options, progress or silent)
 
 
 def measure(out: str | Path) -> Measured:
@@ -163,96 +121,76 @@ def measure(out: str | Path) -> Measured:
 
     Raises InputError where there is no map, and when no plane carries the scene.
     """
-    cloud = read_cloud(Path(out) / "cloud.ply")
-    return _measured(cloud, read_calibration(Path(out)))
+    folder = RunFolder(Path(out))
+    cloud = folder.cloud()
+    return _measured(cloud, folder.calibration())
 
 
-def options_of(out: str | Path) -> RunOptions:
-    """The options that a run folder's calibration was made with."""
-    state = _read_state(Path(out))["options"]
-    return RunOptions(ReconstructOptions(**state["reconstruct"]), CalibrateOptions(**state["calibrate"]))
+def _all_stages(
+    capture: Capture, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
+) -> RunResult:
+    calibrated = _calibrate(capture, folder, options, progress)
+    mapped = _map(calibrated, added, folder, options, progress)
+    return _report(mapped, folder, options, progress)
 
 
-def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
-    report = progress or silent
+def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
     # What auto stands for changes with the weights that are on this machine.
-    made_from = fingerprint(
-        capture, asdict(options.reconstruct) | {"backend": candidates(options.reconstruct)}
+    names = candidates(options.reconstruct)
+    made_from = fingerprint(capture, asdict(options.reconstruct) | {"backend": names})
+    state = State(
+        capture=str(capture.folder.resolve()),
+        reconstruct=made_from,
+        options=MadeWith(reconstruct=options.reconstruct, calibrate=options.calibrate),
     )
-    state = _read_state(folder)
-    start = time.perf_counter()
     try:
-        if state.get("reconstruct") == made_from:
-            reconstruction, hand_eye = read_reconstruction(folder / "reconstruction.npz"), None
-        else:
-            best = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
-            reconstruction, hand_eye = best.reconstruction, best.hand_eye
-            (folder / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
-            give_back()  # what the back end worked with
-            write_reconstruction(folder / "reconstruction.npz", reconstruction)
-        state = {
-            "capture": str(capture.folder.resolve()),
-            "reconstruct": made_from,
-            "options": {"reconstruct": asdict(options.reconstruct), "calibrate": asdict(options.calibrate)},
-        }
-        write_text(folder / STATE, json.dumps(state, indent=2) + "\n")
-        reconstructed = time.perf_counter()
-        report("calibrate", 0.0)
-        hand_eye = hand_eye or calibrate_stage(capture, reconstruction, options.calibrate)
-        give_back()
-        report("calibrate", 1.0)
-    except NotTrustedError as error:
-        if state.get("reconstruct") != made_from:  # what is there is another capture's, or of other options
-            _forget_reconstruction(folder)
-        timings = {"reconstruct": round(time.perf_counter() - start, 3)}
-        failed = failed_file(capture, candidates(options.reconstruct)[-1], str(error), timings, __version__)
-        _replace_calibration(folder, failed)
-        _write_log(folder, failed)
-        _report_failure(capture, folder, failed)
+        choice = _reconstruct_and_calibrate(capture, folder, state, progress)
+    except NothingFoundError as error:
+        if folder.made_from(made_from) is None:
+            folder.forget_reconstruction()
+        timings = timings_of(error.attempts)
+        failed = failed_file(capture, names[-1], str(error), timings, __version__, error.attempts)
+        folder.keep_calibration(failed)
+        _report_failure(capture, failed, folder, options)
         raise
-    timings = {
-        "reconstruct": round(reconstructed - start, 3),
-        "calibrate": round(time.perf_counter() - reconstructed, 3),
-    }
-    content = calibration_file(capture, reconstruction, hand_eye, timings, __version__)
-    _replace_calibration(folder, content)
-    _write_log(folder, content)
-    return RunResult(folder, content, hand_eye, reconstruction)
+    folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
+    content = calibration_file(
+        capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
+    )
+    folder.keep_calibration(content)
+    return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
+
+
+def _reconstruct_and_calibrate(
+    capture: Capture, folder: RunFolder, state: State, progress: Progress
+) -> Choice:
+    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried."""
+    reconstruct, calibrate = state.options.reconstruct, state.options.calibrate
+    earlier = folder.made_from(state.reconstruct)
+    if earlier is None:
+        return choose(
+            capture, reconstruct, calibrate, progress, lambda made: folder.keep_reconstruction(made, state)
+        )
+    start = time.perf_counter()
+    reconstruction = folder.reconstruction()
+    return again(capture, reconstruction, _seconds_since(start), earlier.attempts, calibrate, progress)
 
 
 def _map(
-    capture: Capture,
-    added: Capture,
-    folder: Path,
-    options: RunOptions,
-    result: RunResult,
-    progress: Progress | None,
+    result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
-    start = time.perf_counter()
-    reconstruction, device = result.reconstruction, device_of(options.reconstruct)
-    if len(added):
-        from jcr.reconstruct.added import extend
+    from jcr.represent.build import build_scene
 
-        reconstruction = extend(
-            reconstruction,
-            result.hand_eye,
-            len(capture),
-            added,
-            device,
-            progress or silent,
-            options.reconstruct.memory_gb,
-        )
-        write_added(added, capture)
-    cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
-    write_cloud(folder / "cloud.ply", cloud)
+    start = time.perf_counter()
+    device = device_of(options.reconstruct)
+    extended = _extended(result, added, device, options, progress)
+    cloud, notes = _cloud(extended, options, progress)
+    folder.keep_cloud(cloud)
     give_back()
     scene = build_scene(cloud, options.map, progress, device=device)
-    scene.save(folder / "map.safetensors")
-    timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
-    warnings = [*result.calibration.warnings, *notes]
-    content = result.calibration.model_copy(update={"timings_s": timings, "warnings": warnings})
-    write_calibration(folder / "calibration.json", content)
-    _write_log(folder, content)
+    folder.keep_scene(scene)
+    content = _timed(result.calibration, "map", start, notes)
+    folder.amend_calibration(content)
     try:
         measured = _measured(cloud, content)
     except InputError:  # no plane carries the scene
@@ -260,14 +198,23 @@ def _map(
     return replace(result, calibration=content, cloud=cloud, scene=scene, measured=measured)
 
 
-def _cloud(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    hand_eye: HandEye,
-    options: RunOptions,
-    progress: Progress | None,
-) -> tuple[PointCloud, tuple[str, ...]]:
+def _extended(
+    result: RunResult, added: Capture, device: str, options: RunOptions, progress: Progress
+) -> RunResult:
+    """With the reconstruction of images that were added later, which from now on are part of the run."""
+    if not len(added):
+        return result
+    from jcr.reconstruct.added import extend
+
+    memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
+    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, device, progress, memory_gb)
+    write_added(added, result.capture)
+    return replace(result, reconstruction=reconstruction)
+
+
+def _cloud(result: RunResult, options: RunOptions, progress: Progress) -> tuple[PointCloud, tuple[str, ...]]:
     """The labelled cloud, and what the user should know of its labels."""
+    capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
     given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
     cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
@@ -283,19 +230,39 @@ def _measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
     return measure_cloud(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
 
 
-def _report(capture: Capture, result: RunResult, progress: Progress | None) -> None:
+def _report(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
     from jcr.report.html import report_html
 
-    report = progress or silent
-    report("report", 0.0)
-    write_text(result.out / "report.html", report_html(capture, result))
-    report("report", 1.0)
+    start = time.perf_counter()
+    progress("report", 0.0)
+    folder.keep_report(report_html(result, _told(options)))
+    content = _timed(result.calibration, "report", start)
+    folder.amend_calibration(content)
+    progress("report", 1.0)
+    return replace(result, calibration=content)
 
 
-def _report_failure(capture: Capture, folder: Path, failed: CalibrationFile) -> None:
+def _report_failure(
+    capture: Capture, failed: CalibrationFile, folder: RunFolder, options: RunOptions
+) -> None:
     from jcr.report.html import failed_report_html
 
-    write_text(folder / "report.html", failed_report_html(capture, failed, folder))
+    folder.keep_report(failed_report_html(capture, failed, _told(options)))
+
+
+def _told(options: RunOptions) -> dict[str, Mapping[str, Any]]:
+    """The options that decide the calibration, a stage each."""
+    return {"reconstruct": asdict(options.reconstruct), "calibrate": asdict(options.calibrate)}
+
+
+def _timed(content: CalibrationFile, stage: str, start: float, notes: Sequence[str] = ()) -> CalibrationFile:
+    """With the seconds of one more stage, and what it found worth a warning."""
+    timings = content.timings_s | {stage: _seconds_since(start)}
+    return content.model_copy(update={"timings_s": timings, "warnings": [*content.warnings, *notes]})
+
+
+def _seconds_since(start: float) -> float:
+    return round(time.perf_counter() - start, 3)
 
 
 def _with_backend(options: RunOptions | None, backend: str | None, capture: Capture) -> RunOptions:
@@ -310,85 +277,3 @@ def _with_backend(options: RunOptions | None, backend: str | None, capture: Capt
         given = replace(options.reconstruct, backend="given", weights=str(capture.cameras.resolve()))
         return replace(options, reconstruct=given)
     return options
-
-
-@contextmanager
-def run_folder(folder: Path) -> Iterator[Path]:
-    """The folder, made and held, so that a second run on it writes nothing between the first one's files.
-
-    What a killed run had begun to write is removed, and so is a new folder into which nothing came.
-    """
-    new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / LOCK).open("w")
-    except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{folder}: is a file; name a folder for the results") from None
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{folder}: another jcr is writing there; wait for it or choose another"
-            ) from None
-        for place in (folder, *(folder / CAPTURE).rglob("."), folder / ADDED):
-            remove_unfinished(place)
-        try:
-            yield folder
-        finally:
-            if new and os.listdir(folder) == [LOCK]:
-                shutil.rmtree(folder)
-
-
-def _forget_reconstruction(folder: Path) -> None:
-    for name in (STATE, "reconstruction.npz"):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _replace_calibration(folder: Path, content: CalibrationFile) -> None:
-    """Write calibration.json; what was made from another one goes first, so that the two are never mixed."""
-    passing = {"timings_s", "warnings", "version"}
-    try:
-        same = read_calibration(folder).model_dump(exclude=passing) == content.model_dump(exclude=passing)
-    except InputError:
-        same = False
-    if not same:
-        for name in OF_CALIBRATION:
-            (folder / name).unlink(missing_ok=True)
-    write_calibration(folder / "calibration.json", content)
-
-
-def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
-    """A hash of all that a stage's result depends on: pictures, poses, lens, options and version."""
-    digest = hashlib.sha256()
-    for name in capture.images:
-        digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
-    digest.update(capture.base_from_gripper.tobytes())
-    lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
-    if (
-        options["weights"] is not None
-    ):  # gigabytes at times: size and date tell one file of that name from another
-        weights = Path(options["weights"])
-        files = sorted(weights.iterdir()) if weights.is_dir() else [weights] if weights.is_file() else []
-        states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-        options = options | {"weights": states or options["weights"]}
-    digest.update(json.dumps([lens, options, __version__, FORMAT], sort_keys=True).encode())
-    return digest.hexdigest()
-
-
-def _read_state(folder: Path) -> dict[str, Any]:
-    try:
-        state = json.loads((folder / STATE).read_text())
-        return state if isinstance(state, dict) else {}
-    except (OSError, ValueError, RecursionError):
-        return {}  # without a state every stage is made again, which is always right
-
-
-def _write_log(folder: Path, content: CalibrationFile) -> None:
-    lines = [f"jcr {content.version}, back end {content.backend}"]
-    lines += [f"{stage}: {seconds:.2f} s" for stage, seconds in content.timings_s.items()]
-    lines += [f"{image.image}: {image.reason or 'used'}" for image in content.images]
-    lines += [f"warning: {warning}" for warning in content.warnings]
-    write_text(folder / "log.txt", "\n".join(lines) + "\n")

@@ -2,23 +2,27 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.records import HandEye, PointCloud, Reconstruction
-from jcr.represent.scene import SceneMap
+from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
 from jcr.segment.measure import Measured
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run found, and where it is kept."""
+    """What a run found, and where it is kept; each stage adds its part."""
 
     out: Path
+    capture: Capture
     calibration: CalibrationFile
     hand_eye: HandEye
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
-    scene: SceneMap | None = None
+    scene: "SceneMap | None" = None
     measured: Measured | None = None
     """None without a map, and where no plane carries the scene."""
 
@@ -26,6 +30,11 @@ class RunResult:
     def converged(self) -> bool:
         """Whether the calibration may be trusted."""
         return self.hand_eye.converged
+
+    @property
+    def lens(self) -> Intrinsics:
+        """As the calibration left it."""
+        return self.hand_eye.intrinsics or self.reconstruction.intrinsics
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,8 @@ class PosesResult:
     out: Path
     calibration: CalibrationFile
     hand_eye: HandEye
+    scale_is_one: bool
+    """Whether it may be trusted and the scale is that of a marker whose size is right."""
 
     @property
     def converged(self) -> bool:
