@@ -5,7 +5,7 @@ capture -> reconstruct -> calibrate -> cloud -> map -> report
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,30 +15,15 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.stage import CalibrateOptions, is_one
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.errors import InputError
-from jcr.memory import give_back
+from jcr.mapping import mapped, measured
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
-from jcr.records import Capture, PointCloud, PosePairs
-from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.records import Capture, PosePairs
+from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
-from jcr.results import PosesResult, RunResult
-from jcr.run_folder import MadeWith, RunFolder, State, fingerprint, held
+from jcr.results import PosesResult, RunOptions, RunResult
+from jcr.run_folder import RunFolder, State, held, state_of
 from jcr.segment.measure import Measured
-from jcr.segment.measure import measure as measure_cloud
 from jcr.segment.options import SegmentOptions
-from jcr.segment.segments import image_labels, label_cloud
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """The options of every stage."""
-
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
-    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
-    cloud: CloudOptions = field(default_factory=CloudOptions)
-    map: MapOptions = field(default_factory=MapOptions)
-    segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 def run(
@@ -122,36 +107,30 @@ def measure(out: str | Path) -> Measured:
     Raises InputError where there is no map, and when no plane carries the scene.
     """
     folder = RunFolder(Path(out))
-    cloud = folder.cloud()
-    return _measured(cloud, folder.calibration())
+    return measured(folder.cloud(), folder.calibration())
 
 
 def _all_stages(
     capture: Capture, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     calibrated = _calibrate(capture, folder, options, progress)
-    mapped = _map(calibrated, added, folder, options, progress)
-    return _report(mapped, folder, options, progress)
+    with_map = _map(calibrated, added, folder, options, progress)
+    return _report(with_map, folder, options, progress)
 
 
 def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
-    # What auto stands for changes with the weights that are on this machine.
-    names = candidates(options.reconstruct)
-    made_from = fingerprint(capture, asdict(options.reconstruct) | {"backend": names})
-    state = State(
-        capture=str(capture.folder.resolve()),
-        reconstruct=made_from,
-        options=MadeWith(reconstruct=options.reconstruct, calibrate=options.calibrate),
-    )
+    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried."""
+    state = state_of(capture, options.reconstruct, options.calibrate)
     try:
-        choice = _reconstruct_and_calibrate(capture, folder, state, progress)
+        choice = _kept(capture, folder, state, progress) or choose(
+            capture,
+            options.reconstruct,
+            options.calibrate,
+            progress,
+            lambda made: folder.keep_reconstruction(made, state),
+        )
     except NothingFoundError as error:
-        if folder.made_from(made_from) is None:
-            folder.forget_reconstruction()
-        timings = timings_of(error.attempts)
-        failed = failed_file(capture, names[-1], str(error), timings, __version__, error.attempts)
-        folder.keep_calibration(failed)
-        _report_failure(capture, failed, folder, options)
+        _fail(capture, folder, state, options, error)
         raise
     folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
     content = calibration_file(
@@ -161,73 +140,41 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
 
 
-def _reconstruct_and_calibrate(
-    capture: Capture, folder: RunFolder, state: State, progress: Progress
-) -> Choice:
-    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried."""
-    reconstruct, calibrate = state.options.reconstruct, state.options.calibrate
-    earlier = folder.made_from(state.reconstruct)
-    if earlier is None:
-        return choose(
-            capture, reconstruct, calibrate, progress, lambda made: folder.keep_reconstruction(made, state)
-        )
+def _kept(capture: Capture, folder: RunFolder, state: State, progress: Progress) -> Choice | None:
+    """What an earlier run chose from the same input; None where it is to be made."""
     start = time.perf_counter()
+    if (earlier := folder.earlier(state)) is None:
+        return None
     reconstruction = folder.reconstruction()
-    return again(capture, reconstruction, _seconds_since(start), earlier.attempts, calibrate, progress)
+    seconds = _seconds_since(start)
+    return again(capture, reconstruction, seconds, earlier.attempts, state.options.calibrate, progress)
+
+
+def _fail(
+    capture: Capture, folder: RunFolder, state: State, options: RunOptions, error: NothingFoundError
+) -> None:
+    """Leave the reason where the results would be, and nothing of another capture or of other options."""
+    from jcr.report.html import failed_report_html
+
+    if folder.earlier(state) is None:
+        folder.forget_reconstruction()
+    backend, timings = error.attempts[-1].backend, timings_of(error.attempts)
+    failed = failed_file(capture, backend, str(error), timings, __version__, error.attempts)
+    folder.keep_calibration(failed)
+    folder.keep_report(failed_report_html(capture, failed, _told(options)))
 
 
 def _map(
     result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
-    from jcr.represent.build import build_scene
-
     start = time.perf_counter()
-    device = device_of(options.reconstruct)
-    extended = _extended(result, added, device, options, progress)
-    cloud, notes = _cloud(extended, options, progress)
-    folder.keep_cloud(cloud)
-    give_back()
-    scene = build_scene(cloud, options.map, progress, device=device)
-    folder.keep_scene(scene)
-    content = _timed(result.calibration, "map", start, notes)
+    made = mapped(result, added, options, progress)
+    folder.keep_map(made.cloud, made.scene)
+    if len(added):
+        write_added(added, result.capture)
+    content = _timed(result.calibration, "map", start, made.notes)
     folder.amend_calibration(content)
-    try:
-        measured = _measured(cloud, content)
-    except InputError:  # no plane carries the scene
-        measured = None
-    return replace(result, calibration=content, cloud=cloud, scene=scene, measured=measured)
-
-
-def _extended(
-    result: RunResult, added: Capture, device: str, options: RunOptions, progress: Progress
-) -> RunResult:
-    """With the reconstruction of images that were added later, which from now on are part of the run."""
-    if not len(added):
-        return result
-    from jcr.reconstruct.added import extend
-
-    memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
-    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, device, progress, memory_gb)
-    write_added(added, result.capture)
-    return replace(result, reconstruction=reconstruction)
-
-
-def _cloud(result: RunResult, options: RunOptions, progress: Progress) -> tuple[PointCloud, tuple[str, ...]]:
-    """The labelled cloud, and what the user should know of its labels."""
-    capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
-    given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
-    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
-    cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
-    cloud, notes = label_cloud(cloud, options.segment)
-    added = reconstruction.image_index >= len(capture)
-    if added.any() and options.segment.segments in ("auto", "labels") and given is not None:
-        notes += ("images added later have no label images; --segments tabletop labels what they show, too",)
-    return cloud, notes
-
-
-def _measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
-    uncertainty = calibration.uncertainty
-    return measure_cloud(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
+    return replace(result, calibration=content, cloud=made.cloud, scene=made.scene, measured=made.measured)
 
 
 def _report(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
@@ -240,14 +187,6 @@ def _report(result: RunResult, folder: RunFolder, options: RunOptions, progress:
     folder.amend_calibration(content)
     progress("report", 1.0)
     return replace(result, calibration=content)
-
-
-def _report_failure(
-    capture: Capture, failed: CalibrationFile, folder: RunFolder, options: RunOptions
-) -> None:
-    from jcr.report.html import failed_report_html
-
-    folder.keep_report(failed_report_html(capture, failed, _told(options)))
 
 
 def _told(options: RunOptions) -> dict[str, Mapping[str, Any]]:

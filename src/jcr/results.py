@@ -1,15 +1,31 @@
-"""What the whole job hands to the report, the command line and the caller."""
+"""What the whole job is told, and what it hands to the report, the command line and the caller."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.stage import CalibrateOptions
+from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.represent.cloud import CloudOptions
+from jcr.represent.options import MapOptions
 from jcr.segment.measure import Measured
+from jcr.segment.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of every stage."""
+
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from jcr.capture.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.files import remove_unfinished, write_text
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.backends import ReconstructOptions, candidates
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
 from jcr.represent.cloud_ply import read_cloud, write_cloud
@@ -149,16 +149,16 @@ class RunFolder:
         """Whether there is a map, sound or not."""
         return (self.path / MAP).is_file()
 
-    def made_from(self, fingerprint: str) -> State | None:
-        """The state, where the reconstruction was made from just that; else it is to be made again.
+    def earlier(self, state: State) -> State | None:
+        """The state of an earlier run whose reconstruction was made from the same; else it is to be made again.
 
         A state that cannot be read vouches for nothing: to make every stage again is always right.
         """
         try:
-            state = self.state()
+            found = self.state()
         except InputError:
             return None
-        return state if state.reconstruct == fingerprint else None
+        return found if found.reconstruct == state.reconstruct else None
 
     def keep_capture(self, capture: Capture) -> Capture:
         """The capture as later commands will find it: where it lies, or copied if it is of another format."""
@@ -197,12 +197,9 @@ class RunFolder:
         write_calibration(self.path / CALIBRATION, content)
         write_text(self.path / LOG, log(content))
 
-    def keep_cloud(self, cloud: PointCloud) -> None:
-        """Write cloud.ply."""
+    def keep_map(self, cloud: PointCloud, scene: "SceneMap") -> None:
+        """Write cloud.ply and map.safetensors."""
         write_cloud(self.path / CLOUD, cloud)
-
-    def keep_scene(self, scene: "SceneMap") -> None:
-        """Write map.safetensors."""
         scene.save(self.path / MAP)
 
     def keep_report(self, page: str) -> None:
@@ -236,6 +233,17 @@ def held(path: Path) -> Iterator[RunFolder]:
         finally:
             if new and os.listdir(path) == [LOCK]:
                 shutil.rmtree(path)
+
+
+def state_of(capture: Capture, reconstruct: ReconstructOptions, calibrate: CalibrateOptions) -> State:
+    """The state of a run with these options, before anything was tried."""
+    # What auto stands for changes with the weights that are on this machine.
+    options = asdict(reconstruct) | {"backend": candidates(reconstruct)}
+    return State(
+        capture=str(capture.folder.resolve()),
+        reconstruct=fingerprint(capture, options),
+        options=MadeWith(reconstruct=reconstruct, calibrate=calibrate),
+    )
 
 
 def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
