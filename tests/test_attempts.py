@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,7 @@ from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct.backends import Backend, ReconstructOptions
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
@@ -76,8 +78,11 @@ def auto_result(
     monkeypatch.setattr(attempts, "reconstruct", answered)
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
     capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
-    best = attempts.best_reconstruction(capture, ReconstructOptions(), CalibrateOptions())
-    return best.reconstruction, tried
+    choice = attempts.choose(capture, ReconstructOptions(), CalibrateOptions())
+    assert [attempt.backend for attempt in choice.attempts] == tried
+    kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
+    assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
+    return choice.reconstruction, tried
 
 
 def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
@@ -143,6 +148,105 @@ def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     kept, tried = auto_result(problem, {"colmap": nothing, "direct": good}, monkeypatch)
     assert tried == ["colmap", "direct"] and kept.backend == "direct"
     assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
+
+
+def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
+    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from jcr.capture.read import read_capture
+    from jcr.pipeline import calibrate
+    from jcr.run_folder import RunFolder
+
+    problem = hand_eye_problem(np.random.default_rng(3), 12)
+    capture = replace(read_capture(tabletop), base_from_gripper=problem.base_from_gripper)
+    shuffled = problem.recon_from_camera[np.random.default_rng(4).permutation(12)]
+    made, now_s = [], [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now_s[0])
+
+    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        made.append(options.backend)
+        now_s[0] += {"colmap": 20.0, "direct": 400.0}[options.backend]
+        poses = {"colmap": shuffled, "direct": problem.recon_from_camera}[options.backend]
+        return reconstruction(options.backend, poses)
+
+    def slow(*arguments: object) -> HandEye:
+        now_s[0] += 3.0
+        return calibration_stage.calibrate(*arguments)
+
+    monkeypatch.setattr(attempts, "reconstruct", door)
+    monkeypatch.setattr(attempts, "calibrate", slow)
+    result = calibrate(capture, tmp_path)
+    content = json.loads((tmp_path / "calibration.json").read_text())
+    colmap, direct = content["attempts"]
+    assert (colmap["backend"], direct["backend"]) == ("colmap", "direct")
+    assert colmap["images_registered"] == direct["images_registered"] == 12
+    assert colmap["why_not"].startswith("not to be trusted: ") and direct["why_not"] is None
+    assert (colmap["reconstruct_s"], direct["reconstruct_s"]) == (20.0, 400.0)
+    assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
+    assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0}
+    assert result.calibration.model_dump()["attempts"] == content["attempts"]
+    told = (tmp_path / "log.txt").read_text().splitlines()
+    assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (not to be trusted: ")
+    assert told[2] == (
+        "attempt 2: direct registered 12 of 12 images, kept; reconstruct 400.00 s, calibrate 3.00 s"
+    )
+
+    # The same again tries none: the account of how it was chosen stays, the times are those of now.
+    calibrate(capture, tmp_path)
+    again = RunFolder(tmp_path).calibration()
+    assert made == ["colmap", "direct"]
+    assert again.model_dump()["attempts"] == content["attempts"]
+    assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0}
+
+
+def test_where_nothing_is_found_each_attempt_says_why(
+    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from jcr.capture.read import read_capture
+    from jcr.pipeline import calibrate
+    from jcr.run_folder import RunFolder
+
+    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        raise NotTrustedError(f"{options.backend} saw nothing")
+
+    monkeypatch.setattr(attempts, "reconstruct", door)
+    with pytest.raises(NotTrustedError, match="direct saw nothing; back end colmap, gave nothing"):
+        calibrate(read_capture(tabletop), tmp_path)
+    tried = RunFolder(tmp_path).calibration().attempts
+    assert [(attempt.backend, attempt.images_registered, attempt.why_not) for attempt in tried] == [
+        ("colmap", None, "colmap saw nothing"),
+        ("direct", None, "direct saw nothing"),
+    ]
+    report = (tmp_path / "report.html").read_text()
+    assert "colmap registered nothing, not kept (colmap saw nothing)" in report
+
+
+def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
+    present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from jcr.capture.read import read_capture
+    from jcr.pipeline import RunOptions, calibrate
+    from jcr.run_folder import RunFolder
+
+    problem = hand_eye_problem(np.random.default_rng(3), 12)
+    capture, made = read_capture(tabletop), []
+
+    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        made.append(options.backend)
+        return reconstruction(options.backend, problem.recon_from_camera)
+
+    monkeypatch.setattr(attempts, "reconstruct", door)
+    lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
+    with pytest.raises(InputError, match="nowhere.png"):
+        calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
+    assert made == ["colmap"]
+    # Where there is no choice, the reconstruction is kept before it is calibrated: mended options find it there.
+    with pytest.raises(InputError, match="nowhere.png"):
+        calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
+    assert RunFolder(tmp_path / "colmap").reconstruction().backend == "colmap"
+    with pytest.raises(InputError, match="nowhere.png"):
+        calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
+    assert made == ["colmap", "colmap"]
 
 
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(

@@ -174,7 +174,9 @@ def out(tmp_path_factory: pytest.TempPathFactory, capture: Capture, reconstructi
     )
     write_reconstruction(folder / "out/reconstruction.npz", reconstruction)
     options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
-    (folder / "out/run.json").write_text(json.dumps({"capture": str(old.folder), "options": options}))
+    (folder / "out/run.json").write_text(
+        json.dumps({"capture": str(old.folder), "reconstruct": "", "options": options})
+    )
     return folder / "out"
 
 

@@ -1,97 +1,211 @@
-"""What `--backend auto` does: the best back end, and another one where that is not to be trusted."""
+"""Which back end a run goes on with: each that is tried is reconstructed, calibrated and timed, one after the other."""
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
-from jcr.progress import Progress
+from jcr.memory import give_back
+from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, for_backend, reconstruct
-from jcr.records import Capture, HandEye, HeldOut, Reconstruction
+from jcr.records import Attempt, Capture, HandEye, Reconstruction
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """What one back end came to."""
+class Choice:
+    """What the run goes on with, and how it came to that."""
 
     reconstruction: Reconstruction
-    hand_eye: HandEye | None = None
-    """What `calibrate` makes of it; None: it was not asked, as there was no choice."""
-
-    @property
-    def held_out(self) -> HeldOut | None:
-        """None where too few images were there to leave one out."""
-        return None if self.hand_eye is None else self.hand_eye.held_out
-
-    @property
-    def missed_m(self) -> float:
-        """Error on images left out; infinite where there were too few to leave one out."""
-        held_out = self.held_out
-        return float("inf") if held_out is None else held_out.missed_m
-
-    def told(self) -> str:
-        """The back end, and its error on images left out."""
-        held_out, name = self.held_out, self.reconstruction.backend
-        if held_out is None:
-            return f"{name} (too few images to leave one out)"
-        return f"{name} (held-out error {held_out.translation_mm:.2g} mm, {held_out.rotation_deg:.2g}°)"
-
-    def noted(self, note: str) -> "Attempt":
-        """The same with one more note."""
-        return replace(
-            self, reconstruction=replace(self.reconstruction, notes=(note, *self.reconstruction.notes))
-        )
+    hand_eye: HandEye
+    attempts: tuple[Attempt, ...]
+    """In the order in which they were made."""
+    timings_s: dict[str, float]
+    """What the stages took now, all attempts together."""
 
 
-def best_reconstruction(
+class NothingFoundError(NotTrustedError):
+    """No back end that was tried came to a calibration."""
+
+    def __init__(self, message: str, attempts: tuple[Attempt, ...]) -> None:
+        super().__init__(message)
+        self.attempts = attempts
+
+
+def choose(
     capture: Capture,
     options: ReconstructOptions,
     calibrate_options: CalibrateOptions,
     progress: Progress | None = None,
-) -> Attempt:
-    """The capture reconstructed; where `auto` had a choice, the notes say what it chose and why.
+    chosen: Callable[[Reconstruction], None] = lambda reconstruction: None,
+) -> Choice:
+    """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
     `auto` runs the best back end whose weights are on this machine, and the next one when that gives nothing or
     its calibration is not to be trusted for another reason than the motion. Of two results a trusted one is kept,
-    else the one with the smaller held-out error. Raises as `reconstruct` does for the last one that was tried.
+    else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure that the
+    run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
     names = candidates(options)[:2]
     if len(names) == 1:
-        return Attempt(reconstruct(capture, for_backend(options, names[0]), progress))
+        only = _tried(capture, for_backend(options, names[0]), calibrate_options, progress, chosen)
+        return _choice(only, (only.attempt(),))
     first, second = (for_backend(options, name) for name in names)
-    chose = f"back end {names[0]}"
-    if BACKENDS[names[0]].hub_id:
-        chose += ", the best whose weights are on this machine"
-    try:
-        one = _attempt(capture, first, calibrate_options, progress)
-    except (NotTrustedError, InputError) as error:
-        if isinstance(error, InputError) and options.weights is not None:
-            raise
-        nothing = f"{chose}, gave nothing ({error})"
-        try:
-            other = _attempt(capture, second, calibrate_options, progress)
-        except NotTrustedError as last:  # the licence of weights that were used belongs to this answer, too
-            raise NotTrustedError(f"{last}; {nothing}") from None
-        return other.noted(f"{nothing}; {other.told()} was used instead")
-    assert one.hand_eye is not None
-    if one.hand_eye.converged or not one.hand_eye.observability.observable:
-        return one.noted(chose) if BACKENDS[names[0]].hub_id else one
-    doubt = f"{chose}, is not to be trusted ({one.hand_eye.warnings[0]})"
-    try:
-        other = _attempt(capture, second, calibrate_options, progress)
-    except NotTrustedError as error:
-        return one.noted(f"{doubt}, and {names[1]} gave nothing ({error})")
-    assert other.hand_eye is not None
-    if other.hand_eye.converged:
-        return other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
-    kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
-    return kept.noted(f"{doubt}, nor is {names[1]}; {kept.told()} was used and not {left.told()}")
+    one = _tried(capture, first, calibrate_options, progress)
+    if isinstance(one.failure, InputError) and options.weights is not None:
+        raise one.failure
+    if one.hand_eye is not None and (one.hand_eye.converged or not one.hand_eye.observability.observable):
+        kept, attempts = one.noted(_about(names[0])) if BACKENDS[names[0]].hub_id else one, (one.attempt(),)
+    else:
+        kept, attempts = _better(one, _tried(capture, second, calibrate_options, progress))
+    choice = _choice(kept, attempts)
+    chosen(choice.reconstruction)
+    return choice
 
 
-def _attempt(
+def again(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    read_s: float,
+    earlier: tuple[Attempt, ...],
+    options: CalibrateOptions,
+    progress: Progress | None = None,
+) -> Choice:
+    """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated anew; raises as `choose` does.
+
+    The account of how it was chosen stays what it was.
+    """
+    tried = _calibrated(capture, _Tried(reconstruction.backend, read_s, reconstruction), options, progress)
+    choice = _choice(tried, (tried.attempt(),))
+    return replace(choice, attempts=earlier or choice.attempts)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """One attempt with all that it made."""
+
+    backend: str
+    reconstruct_s: float
+    reconstruction: Reconstruction | None = None
+    calibrate_s: float = 0.0
+    hand_eye: HandEye | None = None
+    failure: InputError | NotTrustedError | None = None
+    """Why there is no calibration."""
+
+    @property
+    def missed_m(self) -> float:
+        """Error on images left out; infinite where there were too few to leave one out."""
+        held_out = None if self.hand_eye is None else self.hand_eye.held_out
+        return float("inf") if held_out is None else held_out.missed_m
+
+    def told(self) -> str:
+        """The back end, and its error on images left out."""
+        held_out = None if self.hand_eye is None else self.hand_eye.held_out
+        error = (
+            "too few images to leave one out" if held_out is None else f"held-out error {missed(held_out)}"
+        )
+        return f"{self.backend} ({error})"
+
+    def noted(self, note: str) -> "_Tried":
+        """The same with one more note."""
+        assert self.reconstruction is not None
+        return replace(
+            self, reconstruction=replace(self.reconstruction, notes=(note, *self.reconstruction.notes))
+        )
+
+    def attempt(self, why_not: str | None = None) -> Attempt:
+        """The account of it; what failed has its own reason."""
+        return Attempt(
+            self.backend,
+            None if self.reconstruction is None else len(self.reconstruction.image_index),
+            round(self.reconstruct_s, 3),
+            round(self.calibrate_s, 3),
+            why_not if self.failure is None else str(self.failure),
+        )
+
+
+def _tried(
     capture: Capture,
     options: ReconstructOptions,
     calibrate_options: CalibrateOptions,
     progress: Progress | None,
-) -> Attempt:
-    reconstruction = reconstruct(capture, options, progress)
-    return Attempt(reconstruction, calibrate(capture, reconstruction, calibrate_options))
+    reconstructed: Callable[[Reconstruction], None] = lambda reconstruction: None,
+) -> _Tried:
+    """One back end's reconstruction, and what `calibrate` makes of it."""
+    start = time.perf_counter()
+    try:
+        reconstruction = reconstruct(capture, options, progress)
+    except (InputError, NotTrustedError) as error:
+        return _Tried(options.backend, time.perf_counter() - start, failure=error.with_traceback(None))
+    tried = _Tried(options.backend, time.perf_counter() - start, reconstruction)
+    give_back()  # what the back end worked with
+    reconstructed(reconstruction)
+    return _calibrated(capture, tried, calibrate_options, progress)
+
+
+def _calibrated(
+    capture: Capture, tried: _Tried, options: CalibrateOptions, progress: Progress | None
+) -> _Tried:
+    """Input that calibration cannot use, no other back end mends: its InputError is the caller's."""
+    report = progress or silent
+    assert tried.reconstruction is not None
+    report("calibrate", 0.0)
+    start = time.perf_counter()
+    try:
+        hand_eye = calibrate(capture, tried.reconstruction, options)
+    except NotTrustedError as error:
+        return replace(tried, calibrate_s=time.perf_counter() - start, failure=error.with_traceback(None))
+    seconds = time.perf_counter() - start
+    give_back()
+    report("calibrate", 1.0)
+    return replace(tried, calibrate_s=seconds, hand_eye=hand_eye)
+
+
+def _about(backend: str) -> str:
+    best = ", the best whose weights are on this machine" if BACKENDS[backend].hub_id else ""
+    return f"back end {backend}{best}"
+
+
+def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
+    """Which of two is kept, noting why, and the account of both; `one` is known to be doubtful."""
+    if isinstance(other.failure, InputError):
+        raise other.failure
+    if one.hand_eye is None:
+        nothing = f"{_about(one.backend)}, gave nothing ({one.failure})"
+        if other.hand_eye is None:
+            # The licence of weights that were used belongs to this answer, too.
+            failure = NotTrustedError(f"{other.failure}; {nothing}")
+            return replace(other, failure=failure), (one.attempt(), other.attempt())
+        kept = other.noted(f"{nothing}; {other.told()} was used instead")
+        return kept, (one.attempt(), other.attempt())
+    doubt = f"{_about(one.backend)}, is not to be trusted ({one.hand_eye.warnings[0]})"
+    if other.hand_eye is None:
+        kept = one.noted(f"{doubt}, and {other.backend} gave nothing ({other.failure})")
+        return kept, (one.attempt(), other.attempt())
+    untrusted = f"not to be trusted: {one.hand_eye.warnings[0]}"
+    if other.hand_eye.converged:
+        kept = other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
+        return kept, (one.attempt(untrusted), other.attempt())
+    kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
+    words = f"{doubt}, nor is {other.backend}; {kept.told()} was used and not {left.told()}"
+    farther = f"not to be trusted, and its held-out error is not the smaller one: {left.told()}"
+    attempts = tuple(tried.attempt(farther if tried is left else None) for tried in (one, other))
+    return kept.noted(words), attempts
+
+
+def _choice(kept: _Tried, attempts: tuple[Attempt, ...]) -> Choice:
+    """Raises InputError or NothingFoundError where there is nothing to keep."""
+    if isinstance(kept.failure, InputError):
+        raise kept.failure
+    if kept.failure is not None or kept.reconstruction is None or kept.hand_eye is None:
+        raise NothingFoundError(str(kept.failure), attempts)
+    return Choice(kept.reconstruction, kept.hand_eye, attempts, timings_of(attempts))
+
+
+def timings_of(attempts: tuple[Attempt, ...]) -> dict[str, float]:
+    """Seconds that the stages took, all attempts together."""
+    return {
+        "reconstruct": round(sum(attempt.reconstruct_s for attempt in attempts), 3),
+        "calibrate": round(sum(attempt.calibrate_s for attempt in attempts), 3),
+    }

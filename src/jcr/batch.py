@@ -19,12 +19,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-from jcr.calibration.calibration_json import CalibrationFile, read_calibration
+from jcr.calibration.calibration_json import CalibrationFile
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text
-from jcr.pipeline import RunOptions, calibrate, fingerprint, run
+from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
+from jcr.run_folder import RunFolder, fingerprint
 
 STATE = "batch.json"
 """In each run folder: its row of the table, and a fingerprint of what it was made from."""
@@ -125,10 +126,10 @@ def run_one(task: Task) -> Row:
             result = (calibrate if task.calibrate_only else run)(capture, task.out, task.run)
             content, reason = result.calibration, ""
         except NotTrustedError as error:
-            content, reason = read_calibration(task.out), str(error)
+            content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
-        if not content.converged:
-            row = replace(row, reason=reason or content.warnings[0])
+        if content.doubt is not None:
+            row = replace(row, reason=reason or content.doubt)
         write_text(
             task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
         )
@@ -155,7 +156,7 @@ def _row(task: Task, content: CalibrationFile) -> Row:
         "done" if content.converged else "not trusted",
         content.backend,
         len(content.images),
-        sum(image.used for image in content.images),
+        content.images_used,
     )
     if content.uncertainty is not None:
         uncertainty = content.uncertainty

@@ -12,12 +12,12 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.next_poses import NextPose, next_poses
+from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
 from jcr.handeye.solve import solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
-from jcr.records import Capture, HandEye, Observability, PosePairs, Reconstruction
+from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs, Reconstruction
 
 
 @dataclass(frozen=True)

@@ -1,72 +1,30 @@
-"""The stages in order, from a capture to a run folder that any of them can start again from.
+"""The stages in order, each timed, from a capture to a run folder that any of them can start again from.
 
 capture -> reconstruct -> calibrate -> cloud -> map -> report
 """
 
-import fcntl
-import hashlib
-import json
-import os
-import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from jcr import __version__
-from jcr.attempts import best_reconstruction
-from jcr.calibration.calibration_json import (
-    CalibrationFile,
-    calibration_file,
-    failed_file,
-    read_calibration,
-    write_calibration,
-)
-from jcr.calibration.stage import CalibrateOptions
-from jcr.calibration.stage import calibrate as calibrate_stage
+from jcr.attempts import Choice, NothingFoundError, again, choose, timings_of
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
+from jcr.calibration.stage import CalibrateOptions, is_one
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
-from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.capture.capture_json import kept
-from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
-from jcr.export.points import read_cloud, write_cloud
-from jcr.files import remove_unfinished, write_text
-from jcr.memory import give_back
+from jcr.mapping import mapped, measured
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of, with_cameras_of
-from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
-from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
-from jcr.represent.build import build_scene
-from jcr.represent.cloud import CloudOptions, point_cloud
+from jcr.reconstruct.backends import with_cameras_of
+from jcr.records import Capture, PosePairs
+from jcr.represent.cloud import CloudOptions
 from jcr.represent.options import MapOptions
-from jcr.results import PosesResult, RunResult
+from jcr.results import PosesResult, RunOptions, RunResult
+from jcr.run_folder import RunFolder, State, held, state_of
 from jcr.segment.measure import Measured
-from jcr.segment.measure import measure as measure_cloud
 from jcr.segment.options import SegmentOptions
-from jcr.segment.segments import image_labels, label_cloud
-
-CAPTURE = "capture"
-"""In the run folder: images and poses that were read from another format than capture.json."""
-STATE = "run.json"
-"""In the run folder: the capture, and what each finished stage was made from."""
-OF_CALIBRATION = ("cloud.ply", "map.safetensors", "report.html")
-"""In the run folder: what holds of one calibration alone."""
-LOCK = ".lock"
-"""In the run folder: held by the run that writes there."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """The options of every stage."""
-
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
-    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
-    cloud: CloudOptions = field(default_factory=CloudOptions)
-    map: MapOptions = field(default_factory=MapOptions)
-    segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 def run(
@@ -83,13 +41,10 @@ def run(
     that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
-    with run_folder(Path(out)) as folder:
-        capture = kept(capture, folder / CAPTURE)
-        added = read_added(folder, capture)
-        result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result, progress)
-        return result
+    with held(Path(out)) as folder:
+        capture = folder.keep_capture(capture)
+        added = read_added(folder.path, capture)
+        return _all_stages(capture, added, folder, options, progress or silent)
 
 
 def calibrate(
@@ -102,23 +57,22 @@ def calibrate(
 ) -> RunResult:
     """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
     options = _with_backend(options, backend, capture)
-    with run_folder(Path(out)) as folder:
-        return _calibrate(kept(capture, folder / CAPTURE), folder, options, progress)
+    with held(Path(out)) as folder:
+        return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
 
 
 def calibrate_poses(
     pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
 ) -> PosesResult:
     """calibration.json in the folder `out` from camera poses that were given, without images."""
-    start = time.perf_counter()
-    with run_folder(Path(out)) as folder:
+    with held(Path(out)) as folder:
+        start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
-        timings = {"calibrate": round(time.perf_counter() - start, 3)}
+        timings = {"calibrate": _seconds_since(start)}
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
-        _forget_reconstruction(folder)
-        _replace_calibration(folder, content)
-        _write_log(folder, content)
-        return PosesResult(folder, content, hand_eye)
+        folder.forget_reconstruction()
+        folder.keep_calibration(content)
+        return PosesResult(folder.path, content, hand_eye, hand_eye.converged and is_one(hand_eye))
 
 
 def build_map(
@@ -135,27 +89,17 @@ def build_map(
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
     not the calibration, and every later map of the folder has them.
     """
-    capture = read_capture_of(out)
-    with run_folder(Path(out)) as folder:
-        options = replace(
-            options_of(out),
-            cloud=cloud or CloudOptions(),
-            map=map or MapOptions(),
-            segment=segment or SegmentOptions(),
-        )
-        added = with_images(read_added(folder, capture), add)
-        result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
-        _report(capture, result, progress)
-        return result
-
-
-def read_capture_of(out: str | Path) -> Capture:
-    """The capture that a run folder was made from; InputError where there is no run, or no such capture any more."""
-    state = _read_state(Path(out))
-    if "capture" not in state:
-        raise InputError(f"{out}: holds no run; make one with `jcr run` or `jcr calibrate`")
-    return read_capture(state["capture"])
+    made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
+    options = RunOptions(
+        made_with.reconstruct,
+        made_with.calibrate,
+        cloud or CloudOptions(),
+        map or MapOptions(),
+        segment or SegmentOptions(),
+    )
+    with held(Path(out)) as folder:
+        added = with_images(read_added(folder.path, capture), add)
+        return _all_stages(capture, added, folder, options, progress or silent)
 
 
 def measure(out: str | Path) -> Measured:
@@ -163,144 +107,102 @@ def measure(out: str | Path) -> Measured:
 
     Raises InputError where there is no map, and when no plane carries the scene.
     """
-    cloud = read_cloud(Path(out) / "cloud.ply")
-    return _measured(cloud, read_calibration(Path(out)))
+    folder = RunFolder(Path(out))
+    return measured(folder.cloud(), folder.calibration())
 
 
-def options_of(out: str | Path) -> RunOptions:
-    """The options that a run folder's calibration was made with."""
-    state = _read_state(Path(out))["options"]
-    return RunOptions(
-        ReconstructOptions.from_json(state["reconstruct"]), CalibrateOptions(**state["calibrate"])
-    )
+def _all_stages(
+    capture: Capture, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
+) -> RunResult:
+    calibrated = _calibrate(capture, folder, options, progress)
+    with_map = _map(calibrated, added, folder, options, progress)
+    return _report(with_map, folder, options, progress)
 
 
-def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
-    report = progress or silent
-    # What auto stands for changes with the weights that are on this machine.
-    made_from = fingerprint(
-        capture, options.reconstruct.as_json() | {"backend": candidates(options.reconstruct)}
-    )
-    state = _read_state(folder)
-    start = time.perf_counter()
+def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried."""
+    state = state_of(capture, options.reconstruct, options.calibrate)
     try:
-        if state.get("reconstruct") == made_from:
-            reconstruction, hand_eye = read_reconstruction(folder / "reconstruction.npz"), None
-        else:
-            best = best_reconstruction(capture, options.reconstruct, options.calibrate, progress)
-            reconstruction, hand_eye = best.reconstruction, best.hand_eye
-            (folder / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
-            give_back()  # what the back end worked with
-            write_reconstruction(folder / "reconstruction.npz", reconstruction)
-        state = {
-            "capture": str(capture.folder.resolve()),
-            "reconstruct": made_from,
-            "options": {
-                "reconstruct": options.reconstruct.as_json(),
-                "calibrate": asdict(options.calibrate),
-            },
-        }
-        write_text(folder / STATE, json.dumps(state, indent=2) + "\n")
-        reconstructed = time.perf_counter()
-        report("calibrate", 0.0)
-        hand_eye = hand_eye or calibrate_stage(capture, reconstruction, options.calibrate)
-        give_back()
-        report("calibrate", 1.0)
-    except NotTrustedError as error:
-        if state.get("reconstruct") != made_from:  # what is there is another capture's, or of other options
-            _forget_reconstruction(folder)
-        timings = {"reconstruct": round(time.perf_counter() - start, 3)}
-        failed = failed_file(capture, candidates(options.reconstruct)[-1], str(error), timings, __version__)
-        _replace_calibration(folder, failed)
-        _write_log(folder, failed)
-        _report_failure(capture, folder, failed)
+        choice = _kept(capture, folder, state, progress) or choose(
+            capture,
+            options.reconstruct,
+            options.calibrate,
+            progress,
+            lambda made: folder.keep_reconstruction(made, state),
+        )
+    except NothingFoundError as error:
+        _fail(capture, folder, state, options, error)
         raise
-    timings = {
-        "reconstruct": round(reconstructed - start, 3),
-        "calibrate": round(time.perf_counter() - reconstructed, 3),
-    }
-    content = calibration_file(capture, reconstruction, hand_eye, timings, __version__)
-    _replace_calibration(folder, content)
-    _write_log(folder, content)
-    return RunResult(folder, content, hand_eye, reconstruction)
+    folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
+    content = calibration_file(
+        capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
+    )
+    folder.keep_calibration(content)
+    return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
+
+
+def _kept(capture: Capture, folder: RunFolder, state: State, progress: Progress) -> Choice | None:
+    """What an earlier run chose from the same input; None where it is to be made."""
+    start = time.perf_counter()
+    if (earlier := folder.earlier(state)) is None:
+        return None
+    reconstruction = folder.reconstruction()
+    seconds = _seconds_since(start)
+    return again(capture, reconstruction, seconds, earlier.attempts, state.options.calibrate, progress)
+
+
+def _fail(
+    capture: Capture, folder: RunFolder, state: State, options: RunOptions, error: NothingFoundError
+) -> None:
+    """Leave the reason where the results would be, and nothing of another capture or of other options."""
+    from jcr.report.html import failed_report_html
+
+    if folder.earlier(state) is None:
+        folder.forget_reconstruction()
+    backend, timings = error.attempts[-1].backend, timings_of(error.attempts)
+    failed = failed_file(capture, backend, str(error), timings, __version__, error.attempts)
+    folder.keep_calibration(failed)
+    folder.keep_report(failed_report_html(capture, failed, _told(options)))
 
 
 def _map(
-    capture: Capture,
-    added: Capture,
-    folder: Path,
-    options: RunOptions,
-    result: RunResult,
-    progress: Progress | None,
+    result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     start = time.perf_counter()
-    reconstruction, device = result.reconstruction, device_of(options.reconstruct)
+    made = mapped(result, added, options, progress)
+    folder.keep_map(made.cloud, made.scene)
     if len(added):
-        from jcr.reconstruct.added import extend
-
-        reconstruction = extend(
-            reconstruction,
-            result.hand_eye,
-            len(capture),
-            added,
-            device,
-            progress or silent,
-            options.reconstruct.memory_gb,
-        )
-        write_added(added, capture)
-    cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
-    write_cloud(folder / "cloud.ply", cloud)
-    give_back()
-    scene = build_scene(cloud, options.map, progress, device=device)
-    scene.save(folder / "map.safetensors")
-    timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
-    warnings = [*result.calibration.warnings, *notes]
-    content = result.calibration.model_copy(update={"timings_s": timings, "warnings": warnings})
-    write_calibration(folder / "calibration.json", content)
-    _write_log(folder, content)
-    try:
-        measured = _measured(cloud, content)
-    except InputError:  # no plane carries the scene
-        measured = None
-    return replace(result, calibration=content, cloud=cloud, scene=scene, measured=measured)
+        write_added(added, result.capture)
+    content = _timed(result.calibration, "map", start, made.notes)
+    folder.amend_calibration(content)
+    return replace(result, calibration=content, cloud=made.cloud, scene=made.scene, measured=made.measured)
 
 
-def _cloud(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    hand_eye: HandEye,
-    options: RunOptions,
-    progress: Progress | None,
-) -> tuple[PointCloud, tuple[str, ...]]:
-    """The labelled cloud, and what the user should know of its labels."""
-    given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
-    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
-    cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
-    cloud, notes = label_cloud(cloud, options.segment)
-    added = reconstruction.image_index >= len(capture)
-    if added.any() and options.segment.segments in ("auto", "labels") and given is not None:
-        notes += ("images added later have no label images; --segments tabletop labels what they show, too",)
-    return cloud, notes
-
-
-def _measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
-    uncertainty = calibration.uncertainty
-    return measure_cloud(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
-
-
-def _report(capture: Capture, result: RunResult, progress: Progress | None) -> None:
+def _report(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
     from jcr.report.html import report_html
 
-    report = progress or silent
-    report("report", 0.0)
-    write_text(result.out / "report.html", report_html(capture, result))
-    report("report", 1.0)
+    start = time.perf_counter()
+    progress("report", 0.0)
+    folder.keep_report(report_html(result, _told(options)))
+    content = _timed(result.calibration, "report", start)
+    folder.amend_calibration(content)
+    progress("report", 1.0)
+    return replace(result, calibration=content)
 
 
-def _report_failure(capture: Capture, folder: Path, failed: CalibrationFile) -> None:
-    from jcr.report.html import failed_report_html
+def _told(options: RunOptions) -> dict[str, Mapping[str, Any]]:
+    """The options that decide the calibration, a stage each."""
+    return {"reconstruct": asdict(options.reconstruct), "calibrate": asdict(options.calibrate)}
 
-    write_text(folder / "report.html", failed_report_html(capture, failed, folder))
+
+def _timed(content: CalibrationFile, stage: str, start: float, notes: Sequence[str] = ()) -> CalibrationFile:
+    """With the seconds of one more stage, and what it found worth a warning."""
+    timings = content.timings_s | {stage: _seconds_since(start)}
+    return content.model_copy(update={"timings_s": timings, "warnings": [*content.warnings, *notes]})
+
+
+def _seconds_since(start: float) -> float:
+    return round(time.perf_counter() - start, 3)
 
 
 def _with_backend(options: RunOptions | None, backend: str | None, capture: Capture) -> RunOptions:
@@ -309,86 +211,3 @@ def _with_backend(options: RunOptions | None, backend: str | None, capture: Capt
     if backend is not None:
         options = replace(options, reconstruct=replace(options.reconstruct, backend=backend))
     return replace(options, reconstruct=with_cameras_of(capture, options.reconstruct))
-
-
-@contextmanager
-def run_folder(folder: Path) -> Iterator[Path]:
-    """The folder, made and held, so that a second run on it writes nothing between the first one's files.
-
-    What a killed run had begun to write is removed, and so is a new folder into which nothing came.
-    """
-    new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / LOCK).open("w")
-    except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{folder}: is a file; name a folder for the results") from None
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{folder}: another jcr is writing there; wait for it or choose another"
-            ) from None
-        for place in (folder, *(folder / CAPTURE).rglob("."), folder / ADDED):
-            remove_unfinished(place)
-        try:
-            yield folder
-        finally:
-            if new and os.listdir(folder) == [LOCK]:
-                shutil.rmtree(folder)
-
-
-def _forget_reconstruction(folder: Path) -> None:
-    for name in (STATE, "reconstruction.npz"):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _replace_calibration(folder: Path, content: CalibrationFile) -> None:
-    """Write calibration.json; what was made from another one goes first, so that the two are never mixed."""
-    passing = {"timings_s", "warnings", "version"}
-    try:
-        same = read_calibration(folder).model_dump(exclude=passing) == content.model_dump(exclude=passing)
-    except InputError:
-        same = False
-    if not same:
-        for name in OF_CALIBRATION:
-            (folder / name).unlink(missing_ok=True)
-    write_calibration(folder / "calibration.json", content)
-
-
-def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
-    """A hash of all that a stage's result depends on: pictures, poses, lens, options and version."""
-    digest = hashlib.sha256()
-    for name in capture.images:
-        digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
-    digest.update(capture.base_from_gripper.tobytes())
-    lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
-    for name in ("weights", "predictions", "cameras"):
-        if options[name] is None:
-            continue
-        # Gigabytes at times: size and date tell one file of that name from another.
-        path = Path(options[name])
-        files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
-        states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-        options = options | {name: states or options[name]}
-    digest.update(json.dumps([lens, options, __version__, FORMAT], sort_keys=True).encode())
-    return digest.hexdigest()
-
-
-def _read_state(folder: Path) -> dict[str, Any]:
-    try:
-        state = json.loads((folder / STATE).read_text())
-        return state if isinstance(state, dict) else {}
-    except (OSError, ValueError, RecursionError):
-        return {}  # without a state every stage is made again, which is always right
-
-
-def _write_log(folder: Path, content: CalibrationFile) -> None:
-    lines = [f"jcr {content.version}, back end {content.backend}"]
-    lines += [f"{stage}: {seconds:.2f} s" for stage, seconds in content.timings_s.items()]
-    lines += [f"{image.image}: {image.reason or 'used'}" for image in content.images]
-    lines += [f"warning: {warning}" for warning in content.warnings]
-    write_text(folder / "log.txt", "\n".join(lines) + "\n")

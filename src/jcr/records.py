@@ -153,6 +153,30 @@ class Observability:
     """One cure per unobservable direction."""
 
 
+@dataclass(frozen=True)
+class Excitation:
+    """Principal directions of what the motions see, least seen first (handeye/observability.py)."""
+
+    value: Float[ndarray, "7"]
+    direction: Float[ndarray, "7 7"]
+    """Rows; unit vectors of (translation in m, rotation times the arm there, log scale times `spread`)."""
+    spread: float
+    """Root mean square distance (m) of the camera centres from their mean."""
+
+
+@dataclass(frozen=True)
+class NextPose:
+    """A gripper pose worth adding, and what is known with it and those before it."""
+
+    base_from_gripper: Float[ndarray, "4 4"]
+    expected_std: Float[ndarray, "7"]
+    """In COVARIANCE_ORDER."""
+    like: int
+    """Row of the existing pose that it is nearest to."""
+    moved_m: float
+    turned_rad: float
+
+
 REACH = 0.45
 """m. A joint's error shows in the gripper's position as in its orientation (rad) times the reach behind it."""
 ARM = 0.3
@@ -235,6 +259,36 @@ class HandEye:
     lens_shift: Float[ndarray, "7"] | None = None
     """How far the lens that the pictures show, in place of the one given, would move the answer; in COVARIANCE_ORDER,
     and in the covariance. None where nothing speaks against the lens."""
+    refinement: "Refinement | None" = None
+    """None where camera poses alone decided."""
+    excitation: Excitation | None = None
+    """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
+    next_poses: tuple[NextPose, ...] = ()
+    """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What the images' features changed of the fit to camera poses alone."""
+
+    before: HandEye
+    moved_m: float
+    """Of the camera on the gripper."""
+    turned_rad: float
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of one back end that was tried."""
+
+    backend: str
+    images_registered: int | None
+    """None where it gave nothing."""
+    reconstruct_s: float
+    calibrate_s: float
+    """0 where there was nothing to calibrate."""
+    why_not: str | None
+    """Why the run does not go on with it; None where it does."""
 
 
 @dataclass(frozen=True)

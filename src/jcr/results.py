@@ -1,24 +1,44 @@
-"""What the whole job hands to the report, the command line and the caller."""
+"""What the whole job is told, and what it hands to the report, the command line and the caller."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.records import HandEye, PointCloud, Reconstruction
-from jcr.represent.scene import SceneMap
+from jcr.calibration.stage import CalibrateOptions
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.represent.cloud import CloudOptions
+from jcr.represent.options import MapOptions
 from jcr.segment.measure import Measured
+from jcr.segment.options import SegmentOptions
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of every stage."""
+
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    cloud: CloudOptions = field(default_factory=CloudOptions)
+    map: MapOptions = field(default_factory=MapOptions)
+    segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run found, and where it is kept."""
+    """What a run found, and where it is kept; each stage adds its part."""
 
     out: Path
+    capture: Capture
     calibration: CalibrationFile
     hand_eye: HandEye
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
-    scene: SceneMap | None = None
+    scene: "SceneMap | None" = None
     measured: Measured | None = None
     """None without a map, and where no plane carries the scene."""
 
@@ -26,6 +46,11 @@ class RunResult:
     def converged(self) -> bool:
         """Whether the calibration may be trusted."""
         return self.hand_eye.converged
+
+    @property
+    def lens(self) -> Intrinsics:
+        """As the calibration left it."""
+        return self.hand_eye.intrinsics or self.reconstruction.intrinsics
 
 
 @dataclass(frozen=True)
@@ -35,6 +60,8 @@ class PosesResult:
     out: Path
     calibration: CalibrationFile
     hand_eye: HandEye
+    scale_is_one: bool
+    """Whether it may be trusted and the scale is that of a marker whose size is right."""
 
     @property
     def converged(self) -> bool:

@@ -8,19 +8,18 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.calibration_json import CalibrationFile, intrinsics_of, read_calibration
+from jcr.calibration.calibration_json import CalibrationFile, intrinsics_of
 from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.stage import CalibrateOptions, calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_log
 from jcr.handeye.fit import PoseFit, fit_poses
-from jcr.pipeline import options_of, read_capture_of
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction
+from jcr.run_folder import RunFolder
 
 MIN_TO_RECALIBRATE = 5
 """Images of another scene; with fewer a wrong one cannot be outvoted."""
@@ -55,6 +54,38 @@ class Verification:
     notes: tuple[str, ...]
     how: str
 
+    @property
+    def drift_m(self) -> float:
+        """How far the camera is from where it was calibrated."""
+        return float(np.linalg.norm(self.offset[:3]))
+
+    @property
+    def drift_rad(self) -> float:
+        """By how much it is turned."""
+        return float(np.linalg.norm(self.offset[3:]))
+
+    @property
+    def verdict(self) -> str:
+        """What has moved, in words."""
+        moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
+        return f"{moved[self.cause]} has moved" if self.moved else "still true"
+
+    @property
+    def advice(self) -> str:
+        """What to do, where something has moved."""
+        anew = "tighten the mount, then calibrate anew from 8 or more images (jcr run)"
+        if self.cause == "scene":
+            return (
+                "the scene or the robot's base was moved as a whole; the map is no longer true, the camera still "
+                "fits: build the map anew (jcr run)"
+            )
+        if self.cause == "either":
+            return (
+                f"moved: the camera on the gripper, or the whole scene; two more images with the wrist turned tell "
+                f"which; if it is the camera, {anew}"
+            )
+        return f"the camera has moved on the gripper; {anew}"
+
 
 def verify(
     out: Path, new: Capture, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
@@ -67,12 +98,13 @@ def verify(
     report = progress or silent
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: a rate of false alarms between 0 and 0.5")
-    calibration = read_calibration(out)
+    folder = RunFolder(out)
+    calibration, reconstruction = folder.calibrated()
     if not calibration.converged:
         raise InputError(
             f"{out}: its calibration is not to be trusted, so that nothing can be held against it"
         )
-    capture, reconstruction = read_capture_of(out), read_reconstruction(out / "reconstruction.npz")
+    capture, options_then = folder.capture(), folder.options()
     if [image.image for image in calibration.images] != list(capture.images):
         raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")
     if new.image_size != capture.image_size:
@@ -93,7 +125,7 @@ def verify(
     if shared:
         places = [place for place in located if isinstance(place, Located)]
         found = drift(
-            fitted(calibration, capture, reconstruction, options_of(out).calibrate),
+            fitted(calibration, capture, reconstruction, options_then.calibrate),
             new.base_from_gripper[shared],
             np.stack([place.recon_from_camera for place in places]),
             np.stack([place.covariance for place in places]),
@@ -105,7 +137,7 @@ def verify(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
-    return _by_recalibration(calibration, new, options_of(out).reconstruct, options, progress)
+    return _by_recalibration(calibration, new, options_then.reconstruct, options, progress)
 
 
 def fitted(

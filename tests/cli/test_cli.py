@@ -13,7 +13,7 @@ import pytest
 
 import jcr
 from jcr.cli import COMMANDS
-from jcr.export.points import read_cloud
+from jcr.represent.cloud_ply import read_cloud
 
 
 def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
@@ -84,7 +84,7 @@ def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabl
 
 def result_points(done: Path) -> np.ndarray:
     """A few hundred points of a run's cloud."""
-    from jcr.export.points import read_cloud
+    from jcr.represent.cloud_ply import read_cloud
 
     return read_cloud(done / "cloud.ply").points_in_base[::500]
 

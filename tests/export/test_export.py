@@ -28,11 +28,11 @@ from jcr.cli import dispatch
 from jcr.cli.export import FORMATS
 from jcr.errors import InputError
 from jcr.export import ros
-from jcr.export.points import read_cloud
 from jcr.export.provenance import Provenance
 from jcr.export.views import PosedImages, write_colmap, write_nerfstudio
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
+from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.scene import FREE, OCCUPIED, SceneMap
 from jcr.simulate.scenes import make_scene, solid_labels
 from jcr.simulate.truth import read_truth

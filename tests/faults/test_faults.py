@@ -23,8 +23,7 @@ import pytest
 import torch
 from PIL import Image
 
-from jcr import pipeline
-from jcr.attempts import Attempt
+from jcr import attempts, pipeline, run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
@@ -442,12 +441,15 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
     out = tmp_path / "out"
     shutil.copytree(done, out)
-    monkeypatch.setattr(
-        pipeline, "best_reconstruction", lambda *_: Attempt(read_reconstruction(done / "reconstruction.npz"))
-    )
-    monkeypatch.setattr(pipeline, "write_reconstruction", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    kept = read_reconstruction(done / "reconstruction.npz")
+    monkeypatch.setattr(attempts, "reconstruct", lambda *_: kept)
+
+    def killed(*_) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_folder, "write_reconstruction", killed)
     with pytest.raises(KeyboardInterrupt):
-        pipeline.calibrate(read_capture(sound), out)
+        pipeline.calibrate(read_capture(sound), out, backend="colmap")
     assert not (out / "run.json").exists()
 
 

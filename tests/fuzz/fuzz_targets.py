@@ -25,13 +25,13 @@ from jcr.capture.lerobot_files import read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
-from jcr.export.points import read_cloud, write_cloud
 from jcr.geometry import inverse
 from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
 from jcr.represent.build import build_scene
+from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.options import MapOptions
 from jcr.represent.scene import load_map
 from jcr.simulate.problem import hand_eye_problem

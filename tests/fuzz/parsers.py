@@ -16,7 +16,7 @@ READERS = [
     "jcr.capture",
     "jcr.calibration.calibration_json",
     "jcr.cli.query",
-    "jcr.export.points",
+    "jcr.represent.cloud_ply",
     "jcr.live",
     "jcr.reconstruct",
 ]

@@ -11,7 +11,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from jcr import pipeline
+from jcr import run_folder
+from jcr.calibration.stage import CalibrateOptions
 from jcr.cli import call, dispatch, models, run
 from jcr.errors import InputError
 from jcr.reconstruct import backends
@@ -172,9 +173,14 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
         assert with_cameras_of(capture, options) == options
 
 
-def test_options_survive_json(tmp_path: Path) -> None:
-    options = ReconstructOptions(predictions=tmp_path / "p.npz", cameras=tmp_path / "sparse", seed=2)
-    assert ReconstructOptions.from_json(json.loads(json.dumps(options.as_json()))) == options
+def test_options_survive_a_run_folder(tmp_path: Path) -> None:
+    options = ReconstructOptions(predictions=tmp_path / "p.npz", seed=2)
+    state = run_folder.state_of(
+        Capture(tmp_path, (), np.zeros((0, 4, 4)), (64, 48)), options, CalibrateOptions()
+    )
+    folder = run_folder.RunFolder(tmp_path)
+    folder.keep_state(state)
+    assert folder.options().reconstruct == options
 
 
 def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
@@ -183,10 +189,10 @@ def test_a_changed_file_of_predictions_is_another_input(tmp_path: Path) -> None:
         path = tmp_path / name
         path.write_text("one")
         options = ReconstructOptions(**{name: path}).as_json()
-        before = pipeline.fingerprint(capture, options)
-        assert pipeline.fingerprint(capture, options) == before
+        before = run_folder.fingerprint(capture, options)
+        assert run_folder.fingerprint(capture, options) == before
         path.write_text("another")
-        assert pipeline.fingerprint(capture, options) != before
+        assert run_folder.fingerprint(capture, options) != before
 
 
 def test_the_help_names_what_each_option_selects() -> None:

@@ -20,13 +20,14 @@ from jcr.calibration.calibration_json import calibration_file, failed_file, wors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.handeye.observability import excitation
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
-from jcr.report.images import MAGNIFIED
-from jcr.report.motion import _excitation_bars
+from jcr.report.map_samples import CLEARANCE, sample_surface, slices
+from jcr.report.motion import excitation_bars
 from jcr.report.notations import notations
-from jcr.report.samples import CLEARANCE, sample_surface, slices
+from jcr.report.pictures import MAGNIFIED
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
@@ -42,7 +43,7 @@ CELL = 0.02
 
 
 @pytest.fixture(scope="module")
-def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, RunResult]:
+def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A run on the bundled images whose pointmaps are cast against the true table and boxes."""
     truth = read_truth(tabletop)
     folder = tmp_path_factory.mktemp("report") / "a & <b>"
@@ -60,12 +61,12 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Captu
     names = ("none", *(f"<i>{thing.name}" for thing in truth.objects))
     cloud = point_cloud(capture, reconstruction, hand_eye, label, label_names=names)
     scene = build_scene(cloud, MapOptions(cell=CELL, max_seconds=4.0))
-    return capture, RunResult(folder, content, hand_eye, reconstruction, cloud, scene)
+    return RunResult(folder, capture, content, hand_eye, reconstruction, cloud, scene)
 
 
 @pytest.fixture(scope="module")
-def page(run: tuple[Capture, RunResult]) -> str:
-    return report_html(*run)
+def page(run: RunResult) -> str:
+    return report_html(run)
 
 
 def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
@@ -162,9 +163,8 @@ class Elements(HTMLParser):
         return next(a["data-copy"] or "" for _, a in self.found if a.get("aria-label") == label)
 
 
-def test_numbers_are_those_of_the_calibration_file(run, page: str):
-    _, result = run
-    written = json.loads(json.dumps(result.calibration.model_dump()))
+def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
+    written = json.loads(json.dumps(run.calibration.model_dump()))
     elements = Elements(page)
     assert json.loads(elements.copied("the matrix")) == written["gripper_from_camera"]
     x = np.array(written["gripper_from_camera"])
@@ -195,9 +195,8 @@ def test_numbers_are_those_of_the_calibration_file(run, page: str):
             assert f"{significant(image['reprojection_px'])} px" in elements.text
 
 
-def test_rejected_images_say_why(run, page: str):
-    _, result = run
-    images = result.calibration.images
+def test_rejected_images_say_why(run: RunResult, page: str):
+    images = run.calibration.images
     assert [k for k, image in enumerate(images) if not image.used] == [WRONG, UNREGISTERED]
     text = Elements(page).text
     for k in (WRONG, UNREGISTERED):
@@ -227,27 +226,26 @@ def test_page_is_one_small_file(page: str):
     assert "$" not in elements.text
 
 
-def test_sections_without_a_record_are_left_out(run):
-    capture, result = run
-    bare = report_html(capture, replace(result, cloud=None, scene=None))
+def test_sections_without_a_record_are_left_out(run: RunResult):
+    bare = report_html(replace(run, cloud=None, scene=None))
     ids = {a.get("id") for _, a in Elements(bare).found}
     assert "map" not in ids and {"transform", "scene", "images", "residuals", "uncertainty"} < ids
     assert "predicted colour" not in bare and "points as measured" not in bare
 
 
-def test_cameras_alone_are_reported_without_tracks_points_or_map(run):
-    capture, result = run
+def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult):
+    capture, result = run.capture, run
     nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
     reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
-    page = report_html(capture, RunResult(result.out, content, hand_eye, reconstruction))
+    page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
     assert "back end marker" in Elements(page).text and 'class="marks"' not in page
     assert "features refined" not in page
 
 
-def test_untrusted_calibration_is_not_recommended(run):
-    capture, result = run
+def test_untrusted_calibration_is_not_recommended(run: RunResult):
+    capture, result = run.capture, run
     still = capture.base_from_gripper.copy()
     still[:, :3, :3] = np.eye(3)
     cameras = still @ result.hand_eye.gripper_from_camera
@@ -255,15 +253,15 @@ def test_untrusted_calibration_is_not_recommended(run):
     reconstruction = replace(result.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
-    page = report_html(capture, RunResult(result.out, content, hand_eye, reconstruction))
+    page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
     text = Elements(page).text
     assert f"Do not trust this calibration: {content.warnings[0]}." in text
     assert "Trusted:" not in text and "number to believe" not in text
     assert all(advice in text for advice in content.observability.advice)
 
 
-def test_reprojections_and_poses_to_add_are_those_of_the_run(run, page: str):
-    capture, result = run
+def test_reprojections_and_poses_to_add_are_those_of_the_run(run: RunResult, page: str):
+    capture, result = run.capture, run
     marks = re.findall(r'<svg class="marks" viewBox="0 0 640 480".*?d="([^"]*)"', page)
     assert len(marks) == len(result.reconstruction.image_index)
     ways = np.array([re.findall(r"l(-?\d+) (-?\d+)", path)[:20] for path in marks], float) / MAGNIFIED
@@ -278,29 +276,29 @@ def test_reprojections_and_poses_to_add_are_those_of_the_run(run, page: str):
     assert all(part in elements.text for part in ("left of the tick", "tracked features in red"))
 
 
-def test_unseen_direction_has_a_red_bar(run):
-    capture, result = run
+def test_unseen_direction_has_a_red_bar(run: RunResult):
+    capture, result = run.capture, run
     turned = capture.base_from_gripper.copy()
     yaw = np.linspace(0, 2, len(turned))[:, None] * [0.0, 0.0, 1.0]
     turned[:, :3, :3] = rotation_exp(yaw) @ turned[0, :3, :3]
-    bars = _excitation_bars(turned, result.hand_eye.gripper_from_camera)
+    bars = excitation_bars(excitation(turned, result.hand_eye.gripper_from_camera))
     red = re.findall(r'class="rejected"><th>([^<]*)</th>', bars)
     assert len(red) == 1 and "offset" in red[0] and bars.index("rejected") < bars.index('"used"')
 
 
-def test_a_run_without_camera_poses_says_why_with_its_images(run, tmp_path: Path):
-    capture, _ = run
+def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
+    capture = run.capture
     reason = "only 2 of 12 images share features; lay <textured> things on the table"
     failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
-    elements = Elements(failed_report_html(capture, failed, tmp_path))
+    elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {reason}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
     assert names == list(capture.images)
     assert "together" in elements.text and "$" not in elements.text
 
 
-def test_uncertainty_of_metres_is_said_in_metres(run):
-    _, result = run
+def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
+    result = run
     covariance = result.hand_eye.covariance.copy()
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
@@ -346,8 +344,8 @@ def test_significant_digits():
     ]  # fmt: skip
 
 
-def test_figure_places_grippers_where_they_are(run):
-    capture, result = run
+def test_figure_places_grippers_where_they_are(run: RunResult):
+    capture, result = run.capture, run
     figure = camera_figure(
         "t", capture.base_from_gripper, capture.base_from_gripper, None, result.hand_eye.intrinsics, ABOVE
     )
@@ -370,8 +368,8 @@ def test_rendered_points_are_seen_from_the_front():
     assert rgba[5, 5, 3] == 0 and not (rgba[..., :3] == 9).any()
 
 
-def test_surface_is_sampled_on_the_surface(run, tabletop: Path):
-    _, result = run
+def test_surface_is_sampled_on_the_surface(run: RunResult, tabletop: Path):
+    result = run
     truth = read_truth(tabletop)
     surface = sample_surface(result.scene, 20_000)
     x = surface.points_in_base

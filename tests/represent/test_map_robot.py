@@ -11,9 +11,9 @@ import trimesh
 import analytic_scene
 from analytic_scene import BALL_CENTER, WORKSPACE
 from jcr.errors import InputError
-from jcr.export.points import write_cloud
 from jcr.geometry import apply, transform
 from jcr.represent.build import build_scene
+from jcr.represent.cloud_ply import write_cloud
 from jcr.represent.options import MapOptions
 from jcr.represent.robot import covering_spheres, load_robot
 from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap

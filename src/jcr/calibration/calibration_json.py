@@ -1,23 +1,22 @@
 """calibration.json: what a calibration is on disk."""
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_text
-from jcr.geometry import require_rigid
-from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.next_poses import NextPose, next_poses
+from jcr.geometry import HUGE, require_rigid
 from jcr.records import (
     COVARIANCE_ORDER,
+    Attempt,
     Capture,
     HandEye,
     ImageVerdict,
@@ -28,14 +27,44 @@ from jcr.records import (
 from jcr.rounding import significant
 
 FORMAT = "jcr.calibration/1"
-PROPOSED = 2
-"""Gripper poses proposed after a calibration."""
+LARGEST = 100_000
+"""Pixels across; no camera's image is wider."""
+
+
+def _rigid(rows: list[list[float]]) -> list[list[float]]:
+    require_rigid(np.array(rows), "the matrix")
+    return rows
+
+
+def _covariance(rows: list[list[float]]) -> list[list[float]]:
+    matrix = np.array(rows)
+    std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    largest = np.outer(std, std)  # Cauchy-Schwarz; of motions that show little, the last digits are not exact
+    if (np.diag(matrix) < 0).any() or not (np.abs(matrix) <= 1.001 * largest + 1e-30).all():
+        raise ValueError("no covariance: two errors vary together more than each by itself")
+    if not (np.abs(matrix - matrix.T) <= 1e-3 * largest + 1e-30).all():
+        raise ValueError("no covariance: not symmetric")
+    return rows
+
+
+def _order(names: list[str]) -> list[str]:
+    if tuple(names) != COVARIANCE_ORDER:
+        raise ValueError(f"not {', '.join(COVARIANCE_ORDER)}")
+    return names
+
+
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
+Spread = Annotated[float, Field(ge=0)]
+Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3)]
+Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
+Covariance = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_covariance)]
+Pixels = Annotated[int, Field(ge=1, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Residuals(_Part):
@@ -48,12 +77,13 @@ class Residuals(_Part):
 class Uncertainty(_Part):
     """One-sigma uncertainty; axes of the gripper frame."""
 
-    translation_std_mm: list[float]
-    rotation_std_deg: list[float]
-    scale_std_percent: float
-    covariance: list[list[float]]
-    order: list[str]
+    translation_std_mm: Spread3
+    rotation_std_deg: Spread3
+    scale_std_percent: Spread
+    covariance: Covariance
+    order: Annotated[list[str], AfterValidator(_order)]
     worst: str
+    """The least certain direction of the offset in words, and its size."""
 
 
 class HeldOutError(_Part):
@@ -85,13 +115,13 @@ class Image(_Part):
 
 
 class Lens(_Part):
-    fx: float
-    fy: float
+    fx: Positive
+    fy: Positive
     cx: float
     cy: float
-    distortion: list[float]
-    width: int
-    height: int
+    distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
+    width: Pixels
+    height: Pixels
 
 
 class NetworkScale(_Part):
@@ -106,7 +136,7 @@ class Proposal(_Part):
 
     base_from_gripper: Matrix
     like: str
-    expected_std: list[float]
+    expected_std: Numbers7
     """In the order of `uncertainty`."""
 
 
@@ -115,7 +145,7 @@ class CalibrationFile(_Part):
 
     format: Literal["jcr.calibration/1"] = FORMAT
     gripper_from_camera: Matrix | None
-    scale: float | None
+    scale: Positive | None
     base_from_recon: Matrix | None
     converged: bool
     backend: str
@@ -131,6 +161,36 @@ class CalibrationFile(_Part):
     version: str
     next_poses: list[Proposal] = []
     scale_check: NetworkScale | None = None
+    attempts: list[Attempt] = []
+    """The back ends that were tried, in order; empty where camera poses were given."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> "CalibrationFile":
+        found = self.gripper_from_camera is not None
+        parts = ("scale", "base_from_recon", "residuals", "uncertainty", "robot_noise")
+        for name in parts:
+            if (getattr(self, name) is not None) is not found:
+                raise ValueError(f"{name} is null and gripper_from_camera is not, or the other way round")
+        if self.converged and not found:
+            raise ValueError("converged without a gripper_from_camera")
+        if not self.converged and not self.warnings:
+            raise ValueError("not converged, and no warning says why")
+        return self
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the calibration is not to be trusted; None when it is."""
+        return None if self.converged else self.warnings[0]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What else the user should know."""
+        return self.warnings[0 if self.converged else 1 :]
+
+    @property
+    def images_used(self) -> int:
+        """How many images the calibration rests on."""
+        return sum(image.used for image in self.images)
 
 
 def calibration_file(
@@ -139,6 +199,7 @@ def calibration_file(
     hand_eye: HandEye,
     timings_s: dict[str, float],
     version: str,
+    attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     std = np.sqrt(np.diag(hand_eye.covariance))
@@ -184,36 +245,20 @@ def calibration_file(
                 like=names[pose.like],
                 expected_std=pose.expected_std.tolist(),
             )
-            for pose in _proposals(capture, reconstruction, hand_eye)
+            for pose in hand_eye.next_poses
         ],
         scale_check=None if check is None else NetworkScale(**vars(check)),
+        attempts=list(attempts),
     )
 
 
-def _proposals(
-    capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs, hand_eye: HandEye
-) -> list[NextPose]:
-    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used.
-
-    What they would leave is the reported standard deviation, less by the share by which their information shrinks
-    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ. No views make
-    up for a given lens that is wrong, nor for a robot that is worse than assumed.
-    """
-    used = capture.base_from_gripper[reconstruction.image_index[hand_eye.inliers]]
-    noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    by_lens = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
-    if hand_eye.converged:
-        expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
-        share = np.sqrt(np.diag(hand_eye.covariance) - by_lens**2) / expected
-    else:
-        at_least = max(noise[0], ASSUMED_NOISE[0]), max(noise[1], ASSUMED_NOISE[1])
-        _, proposed = next_poses(used, PROPOSED, noise=at_least)
-        share = 1.0
-    return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
-
-
 def failed_file(
-    capture: Capture, backend: str, reason: str, timings_s: dict[str, float], version: str
+    capture: Capture,
+    backend: str,
+    reason: str,
+    timings_s: dict[str, float],
+    version: str,
+    attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a capture whose images gave no camera poses at all."""
     return CalibrationFile(
@@ -243,6 +288,7 @@ def failed_file(
         warnings=[reason],
         timings_s=timings_s,
         version=version,
+        attempts=list(attempts),
     )
 
 
@@ -299,22 +345,7 @@ def read_calibration(path: Path) -> CalibrationFile:
     file = path / "calibration.json" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"{file}: no such file; run `jcr calibrate` or `jcr run` first")
-    try:
-        content = json.loads(file.read_bytes().decode())
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: damaged ({error}); run the calibration again") from None
-    kind = content.get("format") if isinstance(content, dict) else None
-    if kind != FORMAT:
-        raise InputError(f"{file}: format {kind!r}, this version reads {FORMAT!r}; use the jcr that wrote it")
-    try:
-        parsed = CalibrationFile.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{file}: {place}: {first['msg']}; run the calibration again") from None
-    if parsed.gripper_from_camera is not None:
-        require_rigid(np.array(parsed.gripper_from_camera), f"{file}: gripper_from_camera")
-    return parsed
+    return _validated(_content(file), file)
 
 
 def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 7"] | None]:
@@ -325,21 +356,60 @@ def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 
         file = next((path / name for name in names if (path / name).is_file()), path / names[0])
     if not file.is_file():
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
-    content = read_json(file)
-    matrix = content.get("gripper_from_camera") if isinstance(content, dict) else None
-    if isinstance(content, dict) and content.get("format", FORMAT) != FORMAT:
-        raise InputError(f"{file}: format {content['format']!r}, this version reads {FORMAT!r}; update jcr")
-    if matrix is None:
-        raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
+    content = _content(file)
+    if "format" in content:
+        _validated(content, file)
     try:
-        transform = require_rigid(
-            np.array(matrix, dtype=np.float64).reshape(4, 4), f"{file}: gripper_from_camera"
-        )
-    except (TypeError, ValueError) as error:
-        raise InputError(str(error) if isinstance(error, InputError) else f"{file}: no 4x4 matrix") from None
-    uncertainty = content.get("uncertainty")
-    covariance = None if not uncertainty else np.array(uncertainty["covariance"], dtype=np.float64)
-    return transform, covariance
+        found = _Transform.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; correct it there") from None
+    if found.gripper_from_camera is None:
+        raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
+    transform = require_rigid(np.array(found.gripper_from_camera), f"{file}: gripper_from_camera")
+    return transform, None if found.uncertainty is None else np.array(found.uncertainty.covariance)
+
+
+class _Known(BaseModel):
+    model_config = ConfigDict(allow_inf_nan=False)
+    covariance: Covariance
+
+
+class _Transform(BaseModel):
+    """What is asked of a file that somebody else wrote."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    gripper_from_camera: Matrix | None = None
+    uncertainty: _Known | None = None
+
+
+def _content(file: Path) -> dict[str, object]:
+    try:
+        content = read_json(file)
+    except InputError as error:
+        what = str(error).removeprefix(f"{file}: ")
+        raise InputError(f"{file}: damaged ({what}); run the calibration again") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{file}: no JSON object; run the calibration again")
+    return content
+
+
+def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
+    kind = content.get("format")
+    if kind != FORMAT:
+        raise InputError(f"{file}: format {kind!r}, this version reads {FORMAT!r}; use the jcr that wrote it")
+    try:
+        # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
+        return CalibrationFile.model_validate_json(json.dumps(content), strict=True)
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
+
+
+def first_fault(error: ValidationError) -> str:
+    """Where the first thing wrong is, and what."""
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    what = first["msg"].removeprefix("Value error, ")
+    return f"{place}: {what}" if place else what
 
 
 def _lens(intrinsics: Intrinsics | None) -> Lens | None:

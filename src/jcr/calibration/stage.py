@@ -9,18 +9,35 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, lens_of, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.words import scale_in_words
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
 from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.fit import Cues, deleted_residuals
+from jcr.handeye.next_poses import next_poses
+from jcr.handeye.observability import excitation
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import judged, solve_hand_eye
-from jcr.records import Capture, HandEye, HeldOut, PosePairs, Reconstruction, RobotNoise, ScaleCheck, Tracks
+from jcr.records import (
+    Capture,
+    HandEye,
+    HeldOut,
+    NextPose,
+    PosePairs,
+    Reconstruction,
+    Refinement,
+    RobotNoise,
+    ScaleCheck,
+    Tracks,
+)
 
 FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+PROPOSED = 2
+"""Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
 """Relative; a printed marker has the size that its maker says to half a percent."""
 
@@ -51,8 +68,38 @@ def calibrate(
     """
     hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
     # A unit that somebody vouches for was used for the scale, and is no check of it.
-    independent = reconstruction.is_metric and reconstruction.metric_std is None
-    return _scale_checked(hand_eye) if independent else hand_eye
+    if reconstruction.is_metric and reconstruction.metric_std is None:
+        hand_eye = _scale_checked(hand_eye)
+    return _with_advice(hand_eye, capture.base_from_gripper[reconstruction.image_index])
+
+
+def _with_advice(hand_eye: HandEye, gripper: Float[ndarray, "m 4 4"]) -> HandEye:
+    """With what the motions show of each direction, and the gripper poses to add."""
+    used = gripper[hand_eye.inliers]
+    return replace(
+        hand_eye,
+        excitation=excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None,
+        next_poses=tuple(_proposals(hand_eye, used)),
+    )
+
+
+def _proposals(hand_eye: HandEye, used: Float[ndarray, "k 4 4"]) -> list[NextPose]:
+    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used.
+
+    What they would leave is the reported standard deviation, less by the share by which their information shrinks
+    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ. No views make
+    up for a given lens that is wrong, nor for a robot that is worse than assumed.
+    """
+    noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
+    by_lens = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
+    if hand_eye.converged:
+        expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
+        share = np.sqrt(np.diag(hand_eye.covariance) - by_lens**2) / expected
+    else:
+        at_least = max(noise[0], ASSUMED_NOISE[0]), max(noise[1], ASSUMED_NOISE[1])
+        _, proposed = next_poses(used, PROPOSED, noise=at_least)
+        share = 1.0
+    return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
 
 
 def _calibrated(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> HandEye:
@@ -142,19 +189,8 @@ def _scale_checked(hand_eye: HandEye) -> HandEye:
     hand_eye = replace(hand_eye, scale_check=check)
     if abs(np.log(hand_eye.scale)) < max(FAR_SCALE, 3 * np.sqrt(hand_eye.covariance[6, 6])):
         return hand_eye
-    remark = f"{in_words(check)}; check the unit of the gripper poses"
+    remark = f"{scale_in_words(check)}; check the unit of the gripper poses"
     return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
-
-
-def in_words(check: ScaleCheck) -> str:
-    """How far the network's own scale is from the robot's, and how sure that is."""
-    off, std = check.off_percent, check.std_percent
-    if abs(off) < 2 * std:
-        return f"the network's own metre agrees with the robot's ({off:+.2g} ± {std:.2g} %)"
-    if off > 100:
-        return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
-    direction = "long" if off > 0 else "short"
-    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} by the robot's"
 
 
 def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
@@ -163,7 +199,10 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
     that do not show a scale are helped by taking it as 1.
     """
-    options = options or CalibrateOptions()
+    return _with_advice(_calibrated_poses(pairs, options or CalibrateOptions()), pairs.base_from_gripper)
+
+
+def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
     gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, _noise(options)
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
@@ -246,6 +285,12 @@ def _refined(
     reprojection = np.full(len(used), np.nan)
     reprojection[used] = median_reprojection(adjusted)
     delta_t, delta_r = paper_residuals(gripper, camera, x, adjusted.scale, used)
+    before = hand_eye.gripper_from_camera
+    refinement = Refinement(
+        hand_eye,
+        float(np.linalg.norm(x[:3, 3] - before[:3, 3])),
+        float(rotation_angle(before[:3, :3].T @ x[:3, :3])),
+    )
     return replace(
         hand_eye,
         gripper_from_camera=x,
@@ -260,6 +305,7 @@ def _refined(
         intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
+        refinement=refinement,
     )
 
 

@@ -29,19 +29,25 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     if not file.is_file():
         return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)))
     content = read_json(file)
-    if content["capture"] != str(capture.folder.resolve()):
+    try:
+        whose, frames = content["capture"], content["frames"]
+        names = tuple(str(frame["image"]) for frame in frames)
+        matrices = [frame["base_from_gripper"] for frame in frames]
+    except (KeyError, TypeError, IndexError):
         raise InputError(
-            f"{folder}: holds images added to the run of {content['capture']}; choose another folder for this "
-            f"run, or remove {folder}"
+            f"{file}: damaged; remove {folder}, and add the images again (jcr map --add)"
+        ) from None
+    if whose != str(capture.folder.resolve()):
+        raise InputError(
+            f"{folder}: holds images added to the run of {whose}; choose another folder for this run, or remove "
+            f"{folder}"
         )
-    names = tuple(frame["image"] for frame in content["frames"])
     for name in names:
         if not contained(folder, name, str(file)).is_file():
             raise InputError(f"{folder / name}: an added image is gone; put it back, or remove {folder}")
-    poses = [
-        read_rigid(frame["base_from_gripper"], f"{file}: {frame['image']}") for frame in content["frames"]
-    ]
-    return replace(capture, folder=folder, images=names, base_from_gripper=np.stack(poses))
+    poses = [read_rigid(matrix, f"{file}: {name}") for name, matrix in zip(names, matrices, strict=True)]
+    poses = np.array(poses).reshape(-1, 4, 4)
+    return replace(capture, folder=folder, images=names, base_from_gripper=poses)
 
 
 def with_images(added: Capture, images_and_poses: Sequence[tuple[Path, Path]]) -> Capture:

@@ -38,7 +38,6 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
-    from jcr.calibration.stage import is_one
     from jcr.pipeline import RunOptions, calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
@@ -48,9 +47,7 @@ def main(arguments: Arguments) -> int:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):
             found = calibrate_poses(capture, arguments.out, arguments.calibrate)
-            at_one = found.converged and is_one(found.hand_eye)
-            return show(
-                found, arguments.output, "the scale is 1, as the marker's size says\n" if at_one else ""
-            )
+            about = "the scale is 1, as the marker's size says\n" if found.scale_is_one else ""
+            return show(found, arguments.output, about)
         result = calibrate(capture, arguments.out, options, progress=progress)
     return show(result, arguments.output)

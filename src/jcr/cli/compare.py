@@ -32,21 +32,19 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Print the difference, and how many of the calibration's own sigmas it is where they are known."""
     from jcr.calibration.calibration_json import read_hand_eye
-    from jcr.geometry import rotation_between_deg, rotation_log
+    from jcr.calibration.difference import difference
 
     ours, covariance = read_hand_eye(arguments.out)
     reference, _ = read_hand_eye(arguments.reference)
-    offset = reference[:3, 3] - ours[:3, 3]
+    found = difference(ours, covariance, reference)
     result: dict[str, object] = {
-        "translation_mm": 1e3 * float(np.linalg.norm(offset)),
-        "rotation_deg": float(rotation_between_deg(ours[:3, :3], reference[:3, :3])),
-        "translation_xyz_mm": (1e3 * offset).tolist(),
+        "translation_mm": 1e3 * float(np.linalg.norm(found.translation_m)),
+        "rotation_deg": float(np.degrees(np.linalg.norm(found.rotation_vector))),
+        "translation_xyz_mm": (1e3 * found.translation_m).tolist(),
     }
     text = f"{result['translation_mm']:.3f} mm, {result['rotation_deg']:.4f}°"
-    if covariance is not None:
-        error = np.concatenate([offset, rotation_log(reference[:3, :3] @ ours[:3, :3].T)])
-        sigmas = (np.abs(error) / np.sqrt(np.diag(covariance)[:6])).tolist()
-        result["sigmas"] = sigmas
-        text += f"; at most {max(sigmas):.1f} of its reported standard deviations on any axis"
+    if found.sigmas is not None:
+        result["sigmas"] = found.sigmas.tolist()
+        text += f"; at most {found.sigmas.max():.1f} of its reported standard deviations on any axis"
     arguments.output.result(text + "\n", result)
     return 0

@@ -118,24 +118,23 @@ class Run:
     """A run folder and how to export it; what a format does not need is not read."""
 
     def __init__(self, arguments: Arguments) -> None:
-        self.arguments = arguments
+        from jcr.run_folder import RunFolder
+
+        self.arguments, self.folder = arguments, RunFolder(arguments.out)
         if self.calibration.gripper_from_camera is None:
-            why = self.calibration.warnings[0]
             raise InputError(
-                f"{arguments.out}: found no calibration to export ({why}); run it on a mended capture"
+                f"{arguments.out}: found no calibration to export ({self.doubt}); run it on a mended capture"
             )
 
     @cached_property
     def calibration(self) -> "CalibrationFile":
         """calibration.json."""
-        from jcr.calibration.calibration_json import read_calibration
-
-        return read_calibration(self.arguments.out)
+        return self.folder.calibration()
 
     @property
     def doubt(self) -> str | None:
         """Why the calibration is not to be trusted; None when it is."""
-        return None if self.calibration.converged else self.calibration.warnings[0]
+        return self.calibration.doubt
 
     @property
     def provenance(self) -> Provenance:
@@ -172,40 +171,35 @@ class Run:
     @property
     def lens(self) -> "Intrinsics":
         """As calibrated."""
-        from jcr.records import Intrinsics
+        from jcr.calibration.calibration_json import intrinsics_of
 
         lens = self.calibration.intrinsics
-        assert lens is not None  # wherever images were reconstructed
-        k1, k2, p1, p2, k3 = lens.distortion
-        return Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, (k1, k2, p1, p2, k3))
+        if lens is None:
+            raise InputError(
+                f"{self.arguments.out}: knows no intrinsics, for camera poses were given and no images; export "
+                "something else"
+            )
+        return intrinsics_of(lens)
 
     @cached_property
     def scene(self) -> "SceneMap":
         """map.safetensors."""
-        from jcr.represent.scene import load_map
-
-        return load_map(self.arguments.out)
+        return self.folder.scene()
 
     @cached_property
     def cloud(self) -> "PointCloud":
         """cloud.ply."""
-        from jcr.export.points import read_cloud
-
-        return read_cloud(self.arguments.out / "cloud.ply")
+        return self.folder.cloud()
 
     @cached_property
     def capture(self) -> "Capture":
         """The images and poses the run was made from."""
-        from jcr.pipeline import read_capture_of
-
-        return read_capture_of(self.arguments.out)
+        return self.folder.capture()
 
     @cached_property
     def reconstruction(self) -> "Reconstruction":
         """reconstruction.npz."""
-        from jcr.reconstruct.reconstruction_npz import read_reconstruction
-
-        return read_reconstruction(self.arguments.out / "reconstruction.npz")
+        return self.folder.reconstruction()
 
     @property
     def views(self) -> "PosedImages":
@@ -236,9 +230,9 @@ def _camera_info(run: Run, path: Path) -> None:
 
 
 def _ply(run: Run, path: Path) -> None:
-    from jcr.export.points import write_cloud
+    from jcr.represent.cloud_ply import write_cloud
 
-    write_cloud(path, run.cloud, run.provenance)
+    write_cloud(path, run.cloud, run.provenance.notes)
 
 
 def _glb(run: Run, path: Path) -> None:

@@ -30,15 +30,14 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is not to be trusted."""
-    from jcr.calibration.calibration_json import read_calibration
     from jcr.errors import NotTrustedError
     from jcr.pipeline import measure
+    from jcr.run_folder import RunFolder
 
     measured = measure(arguments.out)
     arguments.output.result(table(measured), content(measured))
-    calibration = read_calibration(arguments.out)
-    if not calibration.converged:
-        raise NotTrustedError(f"sizes not to be trusted: {calibration.warnings[0]}")
+    if (doubt := RunFolder(arguments.out).calibration().doubt) is not None:
+        raise NotTrustedError(f"sizes not to be trusted: {doubt}")
     return 0
 
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") -> "Capture | PosePairs":
     """What lies at a path, a recording's frames put in the run folder `out`; remarks of the reader on stderr."""
     from jcr.capture.read import read_source
-    from jcr.pipeline import CAPTURE, run_folder
+    from jcr.run_folder import CAPTURE, held
 
-    with run_folder(out):
+    with held(out):
         found = read_source(path, options, into=out / CAPTURE, progress=progress)
     for note in found.notes:
         sys.stderr.write(f"note: {note}\n")

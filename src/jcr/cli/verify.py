@@ -57,37 +57,20 @@ def main(arguments: Arguments) -> int:
     for note in found.notes:
         sys.stderr.write(f"warning: {note}\n")
     if found.moved:
-        raise NotTrustedError(_advice(found))
+        raise NotTrustedError(found.advice)
     return 0
 
 
 def _as_text(found: "Verification") -> str:
-    shift, turn = np.linalg.norm(found.offset[:3]), np.linalg.norm(found.offset[3:])
-    moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}[found.cause]
-    verdict = f"{moved} has moved" if found.moved else "still true"
+    drift = f"{1e3 * found.drift_m:.2f} mm and {np.degrees(found.drift_rad):.3f}°"
     offset, std = _spaced(1e3 * found.offset[:3], 2), _spaced(1e3 * found.std[:3], 2)
     angle, angle_std = _spaced(np.degrees(found.offset[3:]), 3), _spaced(np.degrees(found.std[3:]), 3)
     return (
-        f"{verdict}: {1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from the calibration, p = {found.p_value:.2g}\n"
+        f"{found.verdict}: {drift} from the calibration, p = {found.p_value:.2g}\n"
         f"  drift in gripper axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
         f"  {len(found.images)} images, {found.how}; a drift of {1e3 * found.detectable[0]:.1f} mm or "
         f"{np.degrees(found.detectable[1]):.2f}° would be noticed 9 times in 10\n"
     )
-
-
-def _advice(found: "Verification") -> str:
-    anew = "tighten the mount, then calibrate anew from 8 or more images (jcr run)"
-    if found.cause == "scene":
-        return (
-            "the scene or the robot's base was moved as a whole; the map is no longer true, the camera still "
-            "fits: build the map anew (jcr run)"
-        )
-    if found.cause == "either":
-        return (
-            f"moved: the camera on the gripper, or the whole scene; two more images with the wrist turned tell "
-            f"which; if it is the camera, {anew}"
-        )
-    return f"the camera has moved on the gripper; {anew}"
 
 
 def _spaced(values: np.ndarray, digits: int) -> str:

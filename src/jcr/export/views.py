@@ -17,11 +17,11 @@ from PIL import Image
 from jcr.camera import distort, pinhole_inside, undistort, undistort_image
 from jcr.capture.images import read_image
 from jcr.errors import InputError
-from jcr.export.points import write_cloud
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction, Tracks
+from jcr.represent.cloud_ply import write_cloud
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112
@@ -94,7 +94,7 @@ def write_nerfstudio(
             | {"axes": "camera x right, y up, z backward; world as the robot's base"},
         }
         (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n")
-        write_cloud(made / "points.ply", cloud, provenance)
+        write_cloud(made / "points.ply", cloud, provenance.notes)
 
 
 def write_colmap(

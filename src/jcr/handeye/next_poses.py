@@ -4,29 +4,15 @@ The information of a pose depends on where it is, not on what it shows, so candi
 the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.handeye.equation import ASSUMED_NOISE, Poses, expected_std, most_informative, pose_information
+from jcr.records import NextPose
 
 CANDIDATES = 600
-
-
-@dataclass(frozen=True)
-class NextPose:
-    """A gripper pose worth adding, and what is known with it and those before it."""
-
-    base_from_gripper: Float[ndarray, "4 4"]
-    expected_std: Float[ndarray, "7"]
-    """In records.COVARIANCE_ORDER."""
-    like: int
-    """Row of the existing pose that it is nearest to."""
-    moved_m: float
-    turned_rad: float
 
 
 def next_poses(

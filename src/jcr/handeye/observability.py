@@ -6,15 +6,13 @@ well as it can; rotations count by an arm of 0.3 m, scale by the spread of the c
 for general motion, and the sine of the deviation for a nearly degenerate one.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.geometry import skew
 from jcr.handeye.fit import Cues, Poses
-from jcr.records import Observability
+from jcr.records import Excitation, Observability
 
 ARM = 0.3
 """Metres per radian."""
@@ -24,17 +22,6 @@ WEAK = 0.06
 """Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
 EXACT = 0.005
 """Excitation below which no better measurement would help."""
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """Principal directions of what the motions see, least seen first."""
-
-    value: Float[ndarray, "7"]
-    direction: Float[ndarray, "7 7"]
-    """Rows; unit vectors of (translation in m, rotation times ARM, log scale times `spread`)."""
-    spread: float
-    """Root mean square distance (m) of the camera centres from their mean, at least MIN_SPREAD."""
 
 
 def excitation(

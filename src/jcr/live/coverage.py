@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.handeye.next_poses import NextPose, next_poses
+from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
 from jcr.live.asks import Answer
 from jcr.live.folder import LiveFolder
+from jcr.records import NextPose
 
 ENOUGH_STD = np.array([1e-3] * 3 + [np.radians(0.2)] * 3 + [5e-3])
 """Expected one sigma at which the page calls a direction covered: 1 mm, 0.2°, 0.5 % of scale."""

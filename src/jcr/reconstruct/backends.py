@@ -200,6 +200,9 @@ weights, and sees what networks do not. Direct alignment comes after it: COLMAP 
 the colours of plain ones.
 """
 
+PATHS = ("predictions", "cameras")
+"""Options that name files."""
+
 # The choices of --backend, and of `jcr predict`, whose networks are shown pairs of images.
 if TYPE_CHECKING:
     BackendName = PairBackendName = str
@@ -235,18 +238,15 @@ class ReconstructOptions:
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
 
+    def with_absolute_paths(self) -> "ReconstructOptions":
+        """The same with paths that hold in every working folder."""
+        paths = {name: path.resolve() for name in PATHS if isinstance(path := getattr(self, name), Path)}
+        return replace(self, **paths)
+
     def as_json(self) -> dict[str, Any]:
         """The fields as JSON knows them; paths as text that holds in every working folder."""
-        values = asdict(self)
-        return {name: str(x.resolve()) if isinstance(x, Path) else x for name, x in values.items()}
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> "ReconstructOptions":
-        """The inverse of `as_json`."""
-        paths: dict[str, Any] = {
-            name: Path(content[name]) for name in ("predictions", "cameras") if content.get(name)
-        }
-        return cls(**(content | paths))
+        values = asdict(self.with_absolute_paths())
+        return {name: str(x) if isinstance(x, Path) else x for name, x in values.items()}
 
 
 def reconstruct(

@@ -13,7 +13,7 @@ from PIL import Image
 
 from jcr.geometry import apply
 from jcr.records import Intrinsics
-from jcr.report.samples import Slice
+from jcr.report.map_samples import Slice
 
 WIDTH, HEIGHT = 440.0, 330.0
 """Of the panels; small enough that their text is still read when a phone shrinks them."""

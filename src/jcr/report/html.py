@@ -1,37 +1,37 @@
 """report.html: one file that says whether to trust a calibration, hands it over, and shows what was found."""
 
-import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.words import attempt_in_words, missed, pixels
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
-from jcr.report.images import images_section, lens_of, residuals_section, thumbnails
-from jcr.report.map import map_section
+from jcr.report.map_pictures import map_section
+from jcr.report.map_samples import sample_surface
 from jcr.report.markup import PAGE, filled
 from jcr.report.motion import motion_section
-from jcr.report.objects import objects_section
-from jcr.report.samples import sample_surface
+from jcr.report.object_table import objects_section
+from jcr.report.pictures import images_section, thumbnails
+from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
-from jcr.represent.scene import SceneMap
 from jcr.results import RunResult
 from jcr.rounding import significant
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
 
+Options = Mapping[str, Mapping[str, Any]]
+"""A stage's name, and its options by name."""
 
-def report_html(capture: Capture, result: RunResult) -> str:
-    """The report of a run as one HTML page that loads nothing else.
+
+def report_html(result: RunResult, options: Options | None = None) -> str:
+    """The report of a run, made with these options, as one HTML page that loads nothing else.
 
     Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
     become unreadable.
@@ -46,25 +46,25 @@ def report_html(capture: Capture, result: RunResult) -> str:
         _tiles(calibration),
         _warnings(calibration),
         transform_section(hand_eye),
-        scene_section(capture, result, base_from_camera, surface),
-        images_section(capture, result),
-        residuals_section(capture, result),
-        motion_section(capture, result),
-        filled("before_after.html", panels=_before_after(capture, result, base_from_camera)),
+        scene_section(result, base_from_camera, surface),
+        images_section(result),
+        residuals_section(result),
+        motion_section(result),
+        filled("before_after.html", panels=_before_after(result, base_from_camera)),
         ""
         if result.scene is None or surface is None
         else map_section(result, result.scene, surface, base_from_camera),
         ""
         if result.scene is None or result.measured is None
         else objects_section(result.measured, result.scene.label_names),
-        _details(calibration, result.out, result.scene),
+        _details(calibration, options or {}, {} if result.scene is None else result.scene.history),
     ]
-    return _page(capture, calibration, sections)
+    return _page(result.capture, calibration, sections)
 
 
-def failed_report_html(capture: Capture, calibration: CalibrationFile, out: Path) -> str:
-    """The report of a run in the folder `out` that found no camera poses: why, with the cure, and the images."""
-    reason = escape(calibration.warnings[0])
+def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
+    """The report of a run that found no camera poses: why, with the cure, and the images."""
+    reason = escape(calibration.doubt or "")
     verdict = f"<h2><b>No calibration:</b> {reason}.</h2><p>Nothing was calibrated and nothing mapped.</p>"
     cards = "".join(
         f'<figure><img src="{url}" alt="{escape(name)}"><figcaption><span class="file">{escape(name)}</span>'
@@ -75,7 +75,7 @@ def failed_report_html(capture: Capture, calibration: CalibrationFile, out: Path
     sections = [
         f'<section class="verdict bad">{verdict}</section>',
         filled("images.html", say=say, about="", cards=cards),
-        _details(calibration, out),
+        _details(calibration, options or {}),
     ]
     return _page(capture, calibration, sections)
 
@@ -94,12 +94,9 @@ def _page(capture: Capture, calibration: CalibrationFile, sections: Sequence[str
 
 def _verdict(calibration: CalibrationFile) -> str:
     held_out, uncertainty = calibration.held_out, calibration.uncertainty
-    miss = ""
-    if held_out is not None:
-        miss = f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
-    if not calibration.converged:
-        reason = calibration.warnings[0] if calibration.warnings else "no reason was recorded"
-        headline = f"<b>Do not trust this calibration:</b> {escape(reason)}."
+    miss = "" if held_out is None else missed(held_out)
+    if calibration.doubt is not None:
+        headline = f"<b>Do not trust this calibration:</b> {escape(calibration.doubt)}."
     elif miss:
         headline = f"<b>Trusted:</b> images left out of the calibration are predicted to {miss} on average."
     else:
@@ -125,20 +122,17 @@ def _verdict(calibration: CalibrationFile) -> str:
 def _tiles(calibration: CalibrationFile) -> str:
     tiles = []
     if (held_out := calibration.held_out) is not None:
-        pixels = "" if held_out.reprojection_px is None else f" · {significant(held_out.reprojection_px)} px"
-        degrees = f"{significant(held_out.rotation_deg)}°"
-        tiles.append(("Held-out error", f"{significant(held_out.translation_mm)} mm", degrees + pixels))
+        degrees = f"{significant(held_out.rotation_deg)}°{pixels(held_out).replace(', ', ' · ')}"
+        tiles.append(("Held-out error", f"{significant(held_out.translation_mm)} mm", degrees))
     if (uncertainty := calibration.uncertainty) is not None:
-        direction = uncertainty.worst.partition(":")[0]
-        offset_variance = np.array(uncertainty.covariance)[:3, :3]
-        worst_mm = significant(1e3 * float(np.sqrt(np.linalg.norm(offset_variance, 2))))
+        direction, _, size = uncertainty.worst.partition(": ")
         worst_deg = significant(max(uncertainty.rotation_std_deg))
-        tiles.append(("Offset, 1 σ", f"±{worst_mm} mm", f"at worst, {direction}"))
+        tiles.append(("Offset, 1 σ", size, f"at worst, {direction}"))
         tiles.append(("Orientation, 1 σ", f"±{worst_deg}°", "at worst, about gripper axes"))
         if calibration.scale is not None:
             percent = significant(uncertainty.scale_std_percent)
             tiles.append(("Scale", significant(calibration.scale, 4), f"m per unit, ±{percent}\u00a0%"))
-    used, all_images = sum(image.used for image in calibration.images), len(calibration.images)
+    used, all_images = calibration.images_used, len(calibration.images)
     tiles.append(
         (
             "Images used",
@@ -160,15 +154,14 @@ def _tiles(calibration: CalibrationFile) -> str:
 
 def _warnings(calibration: CalibrationFile) -> str:
     # What the verdict already says is not said twice.
-    warnings = calibration.warnings[0 if calibration.converged else 1 :]
-    if not warnings:
+    if not calibration.remarks:
         return ""
-    items = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
+    items = "".join(f"<li>{escape(remark)}</li>" for remark in calibration.remarks)
     return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
 
 
-def _before_after(capture: Capture, result: RunResult, base_from_camera: Transforms) -> str:
-    grippers, lens = capture.base_from_gripper, lens_of(result)
+def _before_after(result: RunResult, base_from_camera: Transforms) -> str:
+    grippers, lens = result.capture.base_from_gripper, result.lens
     before, rows = result.reconstruction.recon_from_camera, result.reconstruction.image_index
     return "".join(
         [
@@ -180,10 +173,14 @@ def _before_after(capture: Capture, result: RunResult, base_from_camera: Transfo
     )
 
 
-def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = None) -> str:
+def _details(
+    calibration: CalibrationFile, options: Options, map_history: Mapping[str, str] | None = None
+) -> str:
     timings = calibration.timings_s
     blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
     blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
+    for k, attempt in enumerate(calibration.attempts, start=1):
+        blocks["Time"][f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
     if (lens := calibration.intrinsics) is not None:
         blocks["Lens"] = {
             "size": f"{lens.width} × {lens.height} px",
@@ -191,12 +188,10 @@ def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = N
             "principal point": f"{lens.cx:.2f}, {lens.cy:.2f} px",
             "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
         }
-    if scene is not None:
-        blocks["Map"] = scene.history
-    for stage, options in _options(out).items():
-        blocks[f"Options: {stage}"] = {
-            name: "unset" if value is None else str(value) for name, value in options.items()
-        }
+    if map_history:
+        blocks["Map"] = dict(map_history)
+    for stage, chosen in options.items():
+        blocks[f"Options: {stage}"] = {name: _value(value) for name, value in chosen.items()}
     packages = ("numpy", "scipy", "torch", "pycolmap")
     blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}
     blocks["Versions"] |= {name: metadata.version(name) for name in packages}
@@ -207,9 +202,7 @@ def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = N
     return f'<section id="details"><h2>Details</h2><div class="columns">{"".join(columns)}</div></section>'
 
 
-def _options(out: Path) -> dict[str, dict[str, Any]]:
-    """The options that the run folder's run.json names, a stage each; none in a folder without one."""
-    try:
-        return json.loads((out / "run.json").read_text())["options"]
-    except (OSError, ValueError, KeyError):
-        return {}
+def _value(value: Any) -> str:
+    if value is None:
+        return "unset"
+    return str(list(value) if isinstance(value, tuple) else value)

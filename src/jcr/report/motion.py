@@ -5,13 +5,9 @@ from collections.abc import Sequence
 from html import escape
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
-from jcr.calibration.calibration_json import CalibrationFile, Proposal
-from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.observability import WEAK, excitation
-from jcr.records import Capture
+from jcr.handeye.observability import WEAK
+from jcr.records import Excitation, NextPose
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button
 from jcr.results import RunResult
@@ -25,7 +21,7 @@ GENERAL = 0.4
 """Excitation that general motions reach: the full length of a bar."""
 
 
-def motion_section(capture: Capture, result: RunResult) -> str:
+def motion_section(result: RunResult) -> str:
     """Excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     calibration = result.calibration
     observed, uncertainty = calibration.observability, calibration.uncertainty
@@ -43,18 +39,13 @@ def motion_section(capture: Capture, result: RunResult) -> str:
             '<p class="soft">One standard deviation, axes of the gripper frame; scale '
             f"±{significant(uncertainty.scale_std_percent)}\u00a0%.</p>"
         )
-    used = capture.base_from_gripper[result.reconstruction.image_index[result.hand_eye.inliers]]
-    bars = _excitation_bars(used, result.hand_eye.gripper_from_camera) if len(used) > 1 else ""
-    return filled(
-        "motion.html", says=says, bars=bars, spreads=spreads, next_poses=_next_poses(capture, calibration)
-    )
+    found = result.hand_eye.excitation
+    bars = "" if found is None else excitation_bars(found)
+    return filled("motion.html", says=says, bars=bars, spreads=spreads, next_poses=_next_poses(result))
 
 
-def _excitation_bars(
-    base_from_gripper: Float[ndarray, "n 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
-) -> str:
+def excitation_bars(found: Excitation) -> str:
     """A bar each principal direction, least seen first, with a tick at what counts as unseen."""
-    found = excitation(base_from_gripper, gripper_from_camera)
     tick, rows = 100 * WEAK / GENERAL, []
     for value, direction in zip(found.value, np.abs(found.direction), strict=True):
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
@@ -86,11 +77,15 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> str:
     return f'<table class="spread"><tbody>{"".join(rows)}</tbody></table>'
 
 
-def _next_poses(capture: Capture, calibration: CalibrationFile) -> str:
+def _next_poses(result: RunResult) -> str:
     """The proposed gripper poses, what each would leave uncertain, ready to copy."""
-    if not calibration.next_poses:
+    poses, told = result.hand_eye.next_poses, result.calibration.next_poses
+    if not poses:
         return ""
-    rows = "".join(_next_pose(capture, k, pose) for k, pose in enumerate(calibration.next_poses, start=1))
+    rows = "".join(
+        _next_pose(number, pose, like.like)
+        for number, (pose, like) in enumerate(zip(poses, told, strict=True), 1)
+    )
     return (
         '<h3>Poses to add</h3><p class="soft">Gripper poses that would shrink these most, one after the other, in '
         "reach of those of the capture; look that the arm is free to go there. The 3D view shows them in green.</p>"
@@ -99,15 +94,12 @@ def _next_poses(capture: Capture, calibration: CalibrationFile) -> str:
     )
 
 
-def _next_pose(capture: Capture, number: int, pose: Proposal) -> str:
-    near = capture.base_from_gripper[capture.images.index(pose.like)]
-    motion = inverse(near) @ np.array(pose.base_from_gripper)
-    std = np.array(pose.expected_std)
-    copy = copy_button(json.dumps(np.array(pose.base_from_gripper).round(6).tolist()), f"pose {number}")
+def _next_pose(number: int, pose: NextPose, near: str) -> str:
+    std = pose.expected_std
+    copy = copy_button(json.dumps(pose.base_from_gripper.round(6).tolist()), f"pose {number}")
     cells = (
-        f"{escape(pose.like)} {copy}",
-        f"{1e3 * np.linalg.norm(motion[:3, 3]):.0f}\u00a0mm, "
-        f"{np.degrees(rotation_angle(motion[:3, :3])):.0f}°",
+        f"{escape(near)} {copy}",
+        f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.turned_rad):.0f}°",
         f"±{significant(1e3 * float(std[:3].max()))}\u00a0mm, "
         f"±{significant(float(np.degrees(std[3:6].max())))}°, ±{significant(100 * float(std[6]))}\u00a0%",
     )

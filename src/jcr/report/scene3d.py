@@ -12,11 +12,10 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.geometry import apply_similarity
-from jcr.records import Capture
 from jcr.report.figures import TRACK_COLOR, label_colors
-from jcr.report.images import image_numbers, lens_of, shown_names
+from jcr.report.map_samples import SurfacePoints, point_size
 from jcr.report.markup import filled
-from jcr.report.samples import SurfacePoints, point_size
+from jcr.report.pictures import image_numbers, shown_names
 from jcr.results import RunResult
 
 POINTS = 60_000
@@ -33,10 +32,7 @@ class PointLayer:
 
 
 def scene_section(
-    capture: Capture,
-    result: RunResult,
-    base_from_camera: Float[ndarray, "m 4 4"],
-    surface: SurfacePoints | None,
+    result: RunResult, base_from_camera: Float[ndarray, "m 4 4"], surface: SurfacePoints | None
 ) -> str:
     """Cameras, grippers and points in the base frame, to be turned by hand."""
     layers, legend = _layers(result, surface)
@@ -47,7 +43,7 @@ def scene_section(
     )
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
     tracks = PointLayer("tracked features", tracked, red)
-    views = _views(capture, result, base_from_camera)
+    views = _views(result, base_from_camera)
     data = {
         **_packed_layers([*layers, tracks], base_from_camera[:, :3, 3]),
         "views": views,
@@ -60,7 +56,7 @@ def scene_section(
             }
             for pose in result.calibration.next_poses
         ],
-        "lens": asdict(lens_of(result)),
+        "lens": asdict(result.lens),
     }
     checks = [("cameras", "cameras", True), ("grippers", "grippers", True), ("grid", "base and grid", True)]
     if result.calibration.next_poses:
@@ -133,9 +129,7 @@ def _packed(layer: PointLayer, box: Float[ndarray, "2 3"]) -> dict[str, Any]:
     }
 
 
-def _views(
-    capture: Capture, result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]
-) -> list[dict[str, Any]]:
+def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list[dict[str, Any]]:
     """Per image its name, its numbers, and three rows of where its gripper and its camera (or null) were."""
     row_of = {int(row): k for k, row in enumerate(result.reconstruction.image_index)}
     images = result.calibration.images
@@ -144,7 +138,7 @@ def _views(
             "name": name,
             "used": image.used,
             "caption": image_numbers(image) if image.used else f"rejected: {image.reason}",
-            "gripper": capture.base_from_gripper[i, :3].round(6).tolist(),
+            "gripper": result.capture.base_from_gripper[i, :3].round(6).tolist(),
             "camera": base_from_camera[row_of[i], :3].round(6).tolist() if i in row_of else None,
         }
         for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))

@@ -7,14 +7,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.calibration.calibration_json import CalibrationFile, read_calibration
+from jcr.calibration.calibration_json import CalibrationFile
 from jcr.errors import InputError
-from jcr.export.points import read_cloud
 from jcr.geometry import apply_similarity, inverse, scale_translation
-from jcr.pipeline import read_capture_of
-from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.records import Intrinsics, PointCloud, Reconstruction
-from jcr.represent.scene import FILE, SceneMap, load_map
+from jcr.represent.scene import SceneMap
+from jcr.run_folder import RunFolder
 
 CLOUD_POINTS = 200_000
 """Of pointmaps that no map was made of yet, at most."""
@@ -48,25 +46,22 @@ def read_run(out: Path) -> ViewedRun:
 
     Raises InputError where there is no run, or one that found no calibration.
     """
-    calibration = read_calibration(out)
-    if calibration.gripper_from_camera is None or calibration.scale is None:
-        raise InputError(
-            f"{out}: found no calibration to show ({calibration.warnings[0]}); mend the capture, run it again"
-        )
-    reconstruction = read_reconstruction(out / "reconstruction.npz")
+    folder = RunFolder(out)
+    calibration, reconstruction = folder.calibrated()
+    assert calibration.scale is not None  # wherever there is a transform
     base_from_recon, scale = np.array(calibration.base_from_recon), calibration.scale
     base_from_camera = base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale)
     notes = []
     try:
-        capture = read_capture_of(out)
+        capture = folder.capture()
         base_from_gripper, gripper_image = capture.base_from_gripper, np.arange(len(capture))
     except InputError as error:
         base_from_gripper = base_from_camera @ inverse(np.array(calibration.gripper_from_camera))
         gripper_image = reconstruction.image_index
         notes.append(f"grippers stand where the calibration puts them, not where the robot did: {error}")
     scene = None
-    if (out / FILE).is_file():
-        scene = load_map(out)
+    if folder.has_map():
+        scene = folder.scene()
     else:
         notes.append(f"no map yet: make one with jcr map {out}")
     return ViewedRun(
@@ -81,7 +76,7 @@ def read_run(out: Path) -> ViewedRun:
         tracks_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
         cloud=_pointmap_cloud(reconstruction, base_from_camera, base_from_recon, scale)
         if scene is None
-        else read_cloud(out / "cloud.ply"),
+        else folder.cloud(),
         scene=scene,
         notes=tuple(notes),
     )

@@ -9,7 +9,8 @@ import pytest
 from benchmarks.align import camera_errors
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.stage import CalibrateOptions, calibrate, in_words
+from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.words import scale_in_words
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.from_pairs import reconstruction_from_pairs
@@ -155,9 +156,9 @@ def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: 
     content = calibration_file(made.capture, reconstruction, found, {}, "0")
     assert content.scale_check.off_percent == check.off_percent
     assert any("check the unit of the gripper poses" in text for text in content.warnings) == (factor > 10)
-    assert ("agrees with the robot's" in in_words(check)) == (factor == 1)
-    assert ("too long" in in_words(check)) == (factor == 1.05)
-    assert ("times the robot's" in in_words(check)) == (factor == 1000)
+    assert ("agrees with the robot's" in scale_in_words(check)) == (factor == 1)
+    assert ("too long" in scale_in_words(check)) == (factor == 1.05)
+    assert ("times the robot's" in scale_in_words(check)) == (factor == 1000)
     unknown = calibrate(made.capture, replace(reconstruction, is_metric=False))
     assert unknown.scale_check is None
 

@@ -1,11 +1,11 @@
-"""PLY point clouds in the base frame, metres, and back."""
+"""cloud.ply: a PointCloud on disk, as a PLY file that others open too."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from jcr.errors import InputError
-from jcr.export.provenance import Provenance
 from jcr.files import write_bytes
 from jcr.records import PointCloud
 
@@ -17,11 +17,11 @@ _VERTEX = np.dtype(
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
-def write_cloud(path: Path, cloud: PointCloud, provenance: Provenance | None = None) -> None:
+def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None = None) -> None:
     """Write points with colour, label, confidence, margin (m) and image as binary PLY.
 
-    The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back; a
-    `provenance` is added to them.
+    The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back;
+    `notes`, each of one line, are added to them.
     """
     vertices = np.empty(len(cloud.points_in_base), _VERTEX)
     for name, column in zip("xyz", cloud.points_in_base.T, strict=True):
@@ -35,7 +35,7 @@ def write_cloud(path: Path, cloud: PointCloud, provenance: Provenance | None = N
         "ply",
         "format binary_little_endian 1.0",
         "comment jcr cloud in the base frame, metres",
-        *(f"comment {name} {text}" for name, text in (provenance.notes if provenance else {}).items()),
+        *(f"comment {name} {text}" for name, text in (notes or {}).items()),
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
         *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
         f"element vertex {len(vertices)}",

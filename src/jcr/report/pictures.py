@@ -1,4 +1,4 @@
-"""The sections that go through the images: what each shows, and how well it fits."""
+"""The section that goes through the images: what each shows, and how well its features fit."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -7,15 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.calibration.calibration_json import Image
 from jcr.calibration.projection import parameters, project
 from jcr.capture.images import read_image
-from jcr.geometry import apply, inverse, rotation_between_deg
-from jcr.handeye.solve import solve_hand_eye
-from jcr.records import Capture, HandEye, Intrinsics
+from jcr.geometry import apply, inverse
+from jcr.records import Capture, Intrinsics
 from jcr.report.figures import picture_url
 from jcr.report.markup import filled
 from jcr.results import RunResult
@@ -26,11 +23,6 @@ THUMBNAIL = 320
 MANY = 40
 MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
-
-
-def lens_of(result: RunResult) -> Intrinsics:
-    """The lens as the calibration left it."""
-    return result.hand_eye.intrinsics or result.reconstruction.intrinsics
 
 
 def shown_names(images: Sequence[Image]) -> list[str]:
@@ -49,11 +41,11 @@ def image_numbers(image: Image) -> str:
     return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
 
 
-def images_section(capture: Capture, result: RunResult) -> str:
+def images_section(result: RunResult) -> str:
     """Every image with its numbers, and why it was rejected if it was."""
     images = result.calibration.images
     cards, marks = [], _reprojections(result)
-    pictures = zip(images, shown_names(images), thumbnails(capture, lens_of(result)), strict=True)
+    pictures = zip(images, shown_names(images), thumbnails(result.capture, result.lens), strict=True)
     for k, (image, name, picture) in enumerate(pictures):
         numbers = image_numbers(image)
         lines = [f'<span class="file" title="{escape(image.image)}">{escape(name)}</span>']
@@ -80,7 +72,7 @@ def images_section(capture: Capture, result: RunResult) -> str:
 
 def _reprojections(result: RunResult) -> dict[int, str]:
     """Per image of the capture a drawing over its picture: some features, and where their 3D points fall."""
-    reconstruction, lens = result.reconstruction, lens_of(result)
+    reconstruction, lens = result.reconstruction, result.lens
     tracks, own_lens = reconstruction.tracks, parameters(reconstruction.intrinsics)
     drawings, draw = {}, np.random.default_rng(0)
     for k, row in enumerate(reconstruction.image_index):
@@ -122,91 +114,3 @@ def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(thumbnail, capture.images))
-
-
-def residuals_section(capture: Capture, result: RunResult) -> str:
-    """Residuals image by image and of the whole, before and after the images' features refined the fit."""
-    now, before = result.hand_eye, _poses_alone(capture, result)
-    rows, used = [], now.inliers
-    fits = [now] if before is None else [now, before]
-    longest_mm, longest_deg = (
-        max(float(residual(fit)[used].max(initial=0.0)) for fit in fits) or 1.0
-        for residual in (_residual_mm, _residual_deg)
-    )
-    names = shown_names(result.calibration.images)
-    for k, row in enumerate(result.reconstruction.image_index):
-        position = _bar([_residual_mm(fit)[k] for fit in fits], longest_mm, " mm")
-        orientation = _bar([_residual_deg(fit)[k] for fit in fits], longest_deg, "°")
-        rows.append(
-            f'<tr class="{"used" if used[k] else "rejected"}"><th>{escape(names[int(row)])}</th>'
-            f"<td>{position}</td><td>{orientation}</td></tr>"
-        )
-    heads, moved, tick = ["from camera poses"], "", ""
-    if before is not None:
-        heads = ["from camera poses alone", "with the images' features"]
-        x, x_before = now.gripper_from_camera, before.gripper_from_camera
-        shift_mm = 1e3 * float(np.linalg.norm(x[:3, 3] - x_before[:3, 3]))
-        turn_deg = float(rotation_between_deg(x[:3, :3], x_before[:3, :3]))
-        moved = (
-            "<p>Refining with the images' features moved the camera on the gripper by "
-            f"{significant(shift_mm)} mm and {significant(turn_deg)}°.</p>"
-        )
-        tick = (
-            " The upright tick is the same image by camera poses alone, before its features refined the fit."
-        )
-    return filled(
-        "residuals.html",
-        tick=tick,
-        rows="".join(rows),
-        heads="".join(f"<th>{head}</th>" for head in heads),
-        whole=_whole(fits[::-1]),
-        moved=moved,
-    )
-
-
-def _poses_alone(capture: Capture, result: RunResult) -> HandEye | None:
-    """The calibration before the images' features refined it; None where they did not."""
-    if result.hand_eye.reprojection_px is None:
-        return None
-    noise = result.hand_eye.robot_noise
-    return solve_hand_eye(
-        capture.base_from_gripper[result.reconstruction.image_index],
-        result.reconstruction.recon_from_camera,
-        robot_noise=None if noise.estimated else (noise.translation, noise.rotation),
-    )
-
-
-def _residual_mm(fit: HandEye) -> Float[ndarray, " n"]:
-    return 1e3 * fit.translation_residual_m
-
-
-def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
-    return np.degrees(fit.rotation_residual_rad)
-
-
-def _bar(values: Sequence[float], longest: float, unit: str) -> str:
-    """A bar for the first value, a tick for the second if there is one."""
-    shares = [min(100 * value / longest, 100) for value in values]
-    tick = f'<b style="left:{shares[1]:.1f}%"></b>' if len(shares) > 1 else ""
-    return (
-        f'<div class="bar"><div class="track"><i style="width:{shares[0]:.1f}%"></i>{tick}</div>'
-        f"<span>{significant(values[0])}{unit}</span></div>"
-    )
-
-
-def _whole(fits: Sequence[HandEye]) -> str:
-    held_out = [
-        f"{significant(fit.held_out.translation_mm)} mm, {significant(fit.held_out.rotation_deg)}°"
-        if fit.held_out
-        else "–"
-        for fit in fits
-    ]
-    rows = {
-        "held-out error": held_out,
-        "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residual_translation)} mm" for fit in fits],
-        "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residual_rotation) for fit in fits],
-    }
-    return "".join(
-        f"<tr><th>{name}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
-        for name, cells in rows.items()
-    )

@@ -1,6 +1,7 @@
 """The section that shows the trained map: from the cameras' places, and cut open."""
 
 from html import escape
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -9,11 +10,13 @@ from numpy import ndarray
 
 from jcr.geometry import apply, apply_similarity, inverse
 from jcr.report.figures import TRACK_COLOR, label_colors, picture_url, rendered_points, slice_figure
-from jcr.report.images import THUMBNAIL, shown_names
+from jcr.report.map_samples import CLEARANCE, SurfacePoints, point_size, slices
 from jcr.report.markup import filled
-from jcr.report.samples import CLEARANCE, SurfacePoints, point_size, slices
-from jcr.represent.scene import SceneMap
+from jcr.report.pictures import THUMBNAIL, shown_names
 from jcr.results import RunResult
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 WIDE = 480
 """Pixels across of a picture that stands alone."""
@@ -23,7 +26,7 @@ PAIRS = 4
 
 def map_section(
     result: RunResult,
-    scene: SceneMap,
+    scene: "SceneMap",
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
 ) -> str:
@@ -70,7 +73,7 @@ def _overlaid(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> s
 
 def _pairs(
     result: RunResult,
-    scene: SceneMap,
+    scene: "SceneMap",
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
 ) -> str:

@@ -1,0 +1,34 @@
+"""How far apart two calibrations are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import rotation_log
+
+
+@dataclass(frozen=True)
+class Difference:
+    """From one gripper_from_camera to a reference, in gripper axes."""
+
+    translation_m: Float[ndarray, "3"]
+    rotation_vector: Float[ndarray, "3"]
+    """rad: R_reference = exp(r)·R."""
+    sigmas: Float[ndarray, "6"] | None
+    """Size on each axis in the standard deviations that the first one reports; None where it reports none."""
+
+
+def difference(
+    gripper_from_camera: Float[ndarray, "4 4"],
+    covariance: Float[ndarray, "7 7"] | None,
+    reference: Float[ndarray, "4 4"],
+) -> Difference:
+    """The difference of a reference from a calibration, whose covariance is in records.COVARIANCE_ORDER."""
+    translation = reference[:3, 3] - gripper_from_camera[:3, 3]
+    rotation = rotation_log(reference[:3, :3] @ gripper_from_camera[:3, :3].T)
+    sigmas = None
+    if covariance is not None:
+        sigmas = np.abs(np.concatenate([translation, rotation])) / np.sqrt(np.diag(covariance)[:6])
+    return Difference(translation, rotation, sigmas)

@@ -1,0 +1,80 @@
+"""The map stage: a calibrated reconstruction to the labelled cloud, the map, and what stands on the table."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from jcr.calibration.calibration_json import CalibrationFile
+from jcr.errors import InputError
+from jcr.memory import give_back
+from jcr.progress import Progress
+from jcr.reconstruct.backends import device_of
+from jcr.records import Capture, PointCloud
+from jcr.represent.cloud import point_cloud
+from jcr.results import RunOptions, RunResult
+from jcr.segment.measure import Measured, measure
+from jcr.segment.segments import image_labels, label_cloud
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """What the map stage made."""
+
+    cloud: PointCloud
+    scene: "SceneMap"
+    measured: Measured | None
+    """None where no plane carries the scene."""
+    notes: tuple[str, ...]
+    """What the user should know of the labels."""
+
+
+def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
+    """The map of a calibrated run and of images that were added to it later.
+
+    Raises InputError where no point is confident enough, or the options leave nothing to map.
+    """
+    from jcr.represent.build import build_scene  # torch takes seconds, and is asked for by maps alone
+
+    device = device_of(options.reconstruct)
+    cloud, notes = _cloud(_extended(result, added, device, options, progress), options, progress)
+    give_back()
+    scene = build_scene(cloud, options.map, progress, device=device)
+    try:
+        sizes = measured(cloud, result.calibration)
+    except InputError:
+        sizes = None
+    return Mapped(cloud, scene, sizes, notes)
+
+
+def measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
+    """The support plane and what stands on it; InputError when no plane carries the scene."""
+    uncertainty = calibration.uncertainty
+    return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
+
+
+def _extended(
+    result: RunResult, added: Capture, device: str, options: RunOptions, progress: Progress
+) -> RunResult:
+    """With the added images in the reconstruction."""
+    if not len(added):
+        return result
+    from jcr.reconstruct.added import extend
+
+    memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
+    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, device, progress, memory_gb)
+    return replace(result, reconstruction=reconstruction)
+
+
+def _cloud(result: RunResult, options: RunOptions, progress: Progress) -> tuple[PointCloud, tuple[str, ...]]:
+    """The labelled cloud, and what the user should know of its labels."""
+    capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
+    given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
+    labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
+    cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
+    cloud, notes = label_cloud(cloud, options.segment)
+    added = reconstruction.image_index >= len(capture)
+    if added.any() and options.segment.segments in ("auto", "labels") and given is not None:
+        notes += ("images added later have no label images; --segments tabletop labels what they show, too",)
+    return cloud, notes

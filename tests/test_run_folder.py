@@ -1,0 +1,210 @@
+"""Run folders that somebody edited or cut: refused in one line, or read; never a traceback."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jcr.cli import dispatch
+from jcr.errors import InputError
+from jcr.run_folder import RunFolder
+
+COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
+    from PIL import Image
+
+    from jcr.calibration.calibration_json import calibration_file, write_calibration
+    from jcr.calibration.stage import CalibrateOptions, calibrate_poses
+    from jcr.reconstruct.backends import ReconstructOptions
+    from jcr.records import Attempt, PosePairs
+    from jcr.simulate.problem import hand_eye_problem
+
+    out = tmp_path_factory.mktemp("sound") / "out"
+    (out / "capture").mkdir(parents=True)
+    problem = hand_eye_problem(np.random.default_rng(0), COUNT)
+    names = tuple(f"{k}.png" for k in range(COUNT))
+    frames = []
+    for name, pose in zip(names, problem.base_from_gripper, strict=True):
+        Image.fromarray(np.random.default_rng(len(frames)).integers(0, 255, (72, 96, 3), np.uint8)).save(
+            out / "capture" / name
+        )
+        frames.append({"image": name, "base_from_gripper": pose.tolist()})
+    (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
+    pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
+    attempt = Attempt("colmap", COUNT, 1.0, 0.5, None)
+    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
+    lens = {
+        "fx": 90.0,
+        "fy": 90.0,
+        "cx": 47.5,
+        "cy": 35.5,
+        "distortion": [0.0] * 5,
+        "width": 96,
+        "height": 72,
+    }
+    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": lens}))
+    write_calibration(out / "calibration.json", RunFolder(out).calibration())
+    options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
+    options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
+    state = {
+        "capture": str(out / "capture"),
+        "reconstruct": "0",
+        "options": options,
+        "attempts": [asdict(attempt)],
+    }
+    (out / "run.json").write_text(json.dumps(state))
+    return out
+
+
+def test_a_sound_folder_is_read(sound: Path):
+    folder = RunFolder(sound)
+    assert folder.options().calibrate.robot_noise == (0.1, 0.05)
+    assert len(folder.capture()) == COUNT and folder.calibration().converged
+    assert folder.state().attempts == tuple(folder.calibration().attempts)
+
+
+Content = dict[str, Any]
+
+
+def options(content: Content) -> Content:
+    return content["options"]
+
+
+STATES: dict[str, Callable[[Content], Any]] = {
+    "no options": lambda c: c.pop("options"),
+    "options a list": lambda c: c.update(options=[]),
+    "options null": lambda c: c.update(options=None),
+    "a stage is missing": lambda c: options(c).pop("calibrate"),
+    "a stage is a list": lambda c: options(c).update(reconstruct=["colmap"]),
+    "unknown option": lambda c: options(c)["reconstruct"].update(magic=1),
+    "unknown stage": lambda c: options(c).update(magic={}),
+    "number for text": lambda c: options(c)["reconstruct"].update(backend=7),
+    "text for a number": lambda c: options(c)["reconstruct"].update(seed="0"),
+    "no such back end": lambda c: options(c)["reconstruct"].update(backend="magic"),
+    "short list": lambda c: options(c)["calibrate"].update(robot_noise=[0.1]),
+    "short length": lambda c: options(c)["calibrate"].update(known_length=["0.png", 1.0]),
+    "NaN": lambda c: options(c)["reconstruct"].update(memory_gb=float("nan")),
+    "capture a number": lambda c: c.update(capture=3),
+    "capture empty": lambda c: c.update(capture=""),
+    "capture with NUL": lambda c: c.update(capture="a\0b"),
+    "capture of a million letters": lambda c: c.update(capture="x" * 1_000_000),
+    "capture of a name too long": lambda c: c.update(capture="/tmp/" + "x" * 300),
+    "capture gone": lambda c: c.update(capture="/nowhere"),
+    "no fingerprint": lambda c: c.pop("reconstruct"),
+    "attempts a number": lambda c: c.update(attempts=3),
+}
+
+CALIBRATIONS: dict[str, Callable[[Content], Any]] = {
+    "scale NaN": lambda c: c.update(scale=float("nan")),
+    "scale infinite": lambda c: c.update(scale=float("inf")),
+    "scale zero": lambda c: c.update(scale=0.0),
+    "scale negative": lambda c: c.update(scale=-1.0),
+    "scale null": lambda c: c.update(scale=None),
+    "uncertainty null": lambda c: c.update(uncertainty=None),
+    "NaN in the covariance": lambda c: c["uncertainty"]["covariance"][2].__setitem__(3, float("nan")),
+    "covariance of six": lambda c: c["uncertainty"]["covariance"].pop(),
+    "covariance that is none": lambda c: c["uncertainty"]["covariance"][0].__setitem__(1, 1.0),
+    "negative variance": lambda c: c["uncertainty"]["covariance"][0].__setitem__(0, -1.0),
+    "covariance in another order": lambda c: c["uncertainty"]["order"].reverse(),
+    "mirrored transform": lambda c: c["gripper_from_camera"][0].__setitem__(0, 3.0),
+    "base_from_recon not rigid": lambda c: c.update(base_from_recon=(2 * np.eye(4)).tolist()),
+    "base_from_recon of three rows": lambda c: c["base_from_recon"].pop(),
+    "base_from_recon null": lambda c: c.update(base_from_recon=None),
+    "fx negative": lambda c: c["intrinsics"].update(fx=-1.0),
+    "fx zero": lambda c: c["intrinsics"].update(fx=0.0),
+    "width of 10⁹": lambda c: c["intrinsics"].update(width=10**9),
+    "height 0": lambda c: c["intrinsics"].update(height=0),
+    "two coefficients": lambda c: c["intrinsics"].update(distortion=[0.1, 0.2]),
+    "no reason": lambda c: c.update(converged=False, warnings=[]),
+    "converged a text": lambda c: c.update(converged="yes"),
+    "images a number": lambda c: c.update(images=12),
+    "unknown key": lambda c: c.update(magic=1),
+    "attempts a text": lambda c: c.update(attempts="colmap"),
+}
+
+
+def edited(sound: Path, out: Path, name: str, change: Callable[[Content], Any]) -> Path:
+    shutil.copytree(sound, out)
+    content = json.loads((out / name).read_text())
+    change(content)
+    (out / name).write_text(json.dumps(content))
+    return out
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What is said where a command ends with status 2 and one line."""
+    assert dispatch(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and len(said) < 500
+    return said
+
+
+@pytest.mark.parametrize("variant", STATES)
+def test_an_edited_run_json_is_refused_in_one_line(sound: Path, tmp_path: Path, variant: str, capsys):
+    out = edited(sound, tmp_path / "out", "run.json", STATES[variant])
+    said = refused(["map", str(out), "--quiet"], capsys)
+    assert "run.json" in said or "/nowhere" in said
+
+
+@pytest.mark.parametrize("variant", CALIBRATIONS)
+def test_an_edited_calibration_is_refused_in_one_line(sound: Path, tmp_path: Path, variant: str, capsys):
+    out = edited(sound, tmp_path / "out", "calibration.json", CALIBRATIONS[variant])
+    for command in (
+        ["compare", str(out), str(sound)],
+        ["export", str(out), "ros2", str(tmp_path / "made.xml")],
+        ["verify", str(out), str(sound / "capture"), "--quiet"],
+    ):
+        assert "calibration.json" in refused(command, capsys)
+    assert not (tmp_path / "made.xml").exists()
+
+
+@pytest.mark.parametrize("name", ["run.json", "calibration.json"])
+@pytest.mark.parametrize("length", [0, 1, 40])
+def test_a_cut_file_is_refused(sound: Path, tmp_path: Path, name: str, length: int, capsys):
+    out = edited(sound, tmp_path / "out", name, lambda content: None)
+    (out / name).write_text((out / name).read_text()[:length])
+    command = ["map", str(out)] if name == "run.json" else ["compare", str(out), str(out)]
+    assert name in refused([*command, "--quiet"] if name == "run.json" else command, capsys)
+
+
+def places(content: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Every place of a value in JSON content, the first of each list alone."""
+    if path:
+        yield path
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from places(value, (*path, key))
+    if isinstance(content, list) and content:
+        yield from places(content[0], (*path, 0))
+
+
+@pytest.mark.parametrize("name", ["run.json", "calibration.json"])
+def test_any_value_exchanged_is_read_or_refused(sound: Path, tmp_path: Path, name: str):
+    """Each value in turn for one of another kind: what is read then is what the schema allows."""
+    original = json.loads((sound / name).read_text())
+    out = edited(sound, tmp_path / "out", name, lambda content: None)
+    folder, read = RunFolder(out), 0
+    for path in places(original):
+        for value in ("null", "-1", "0", "1e309", '""', "[]", "{}", f'"{"x" * 100_000}"'):
+            content = json.loads(json.dumps(original))
+            parent = content
+            for key in path[:-1]:
+                parent = parent[key]
+            parent[path[-1]] = "EXCHANGED"
+            (out / name).write_text(json.dumps(content).replace('"EXCHANGED"', value))
+            try:
+                folder.calibration()
+                folder.capture()
+                read += 1
+            except InputError as error:
+                assert "\n" not in str(error)
+    assert read > 20  # options that may be unset, and texts that may be any
