@@ -23,6 +23,9 @@ LAST = 8
 """Last steps, in which a redundant arm no longer moves towards its rest posture."""
 FITS = (1e-4, 1e-3)
 """m, rad: largest misfit of a pose that the arm reaches."""
+REFUSED = (0.01, np.radians(1.0))
+"""Of the reach, rad: poses with a larger misfit are not of this arm. Factory calibration and joint limits that were
+widened explain less."""
 TO_REST = 0.5
 """Share of the way to its rest posture that a redundant arm goes in a step."""
 MISSED_WEIGHT, REST_WEIGHT = 1e10, 0.05
@@ -86,7 +89,7 @@ def required_posture(
 ) -> Posture:
     """`inverse_kinematics`; InputError with the misfit where the poses do not fit the arm."""
     posture = inverse_kinematics(arm, base_from_gripper, flange_from_tool)
-    if not posture.fits:
+    if posture.missed_m.max() > REFUSED[0] * arm.reach or posture.missed_rad.max() > REFUSED[1]:
         raise InputError(
             f"poses do not fit a {arm.name}: {1e3 * posture.missed_m.max():.0f} mm, "
             f"{np.degrees(posture.missed_rad.max()):.1f}° off; name another robot, or leave it out"

@@ -20,7 +20,7 @@ identifiable: they add to the hand-eye transform or to the base, which the estim
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -56,8 +56,8 @@ class Arm:
     """Lowest and highest angle (rad)."""
     rest: Float[ndarray, " dof"]
     """A usual posture (rad) over a table, gripper down; the initial estimate of inverse kinematics."""
-    joint_names: tuple[str, ...] = ()
-    """As the URDF has them; empty where nothing names them."""
+    forward: Float[ndarray, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    """Unit vector in the gripper frame along which a tool points."""
 
     @property
     def dof(self) -> int:
@@ -115,6 +115,11 @@ def from_dh(
 
 def _dh_x(a: float, alpha: float) -> Float[ndarray, "4 4"]:
     return transform(rotation_exp(np.array([alpha, 0.0, 0.0])), np.array([a, 0.0, 0.0]))
+
+
+def with_tool(arm: Arm, flange_from_tool: Float[ndarray, "4 4"]) -> Arm:
+    """The arm with its gripper frame at a tool."""
+    return replace(arm, last_from_gripper=arm.last_from_gripper @ flange_from_tool)
 
 
 def joint_frames(arm: Arm, joints: Joints) -> tuple[Float[ndarray, "n dof 4 4"], Float[ndarray, "n 4 4"]]:

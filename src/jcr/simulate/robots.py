@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_exp, scale_translation, transform
-from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, ROTATION, TRANSLATION, residuals
+from jcr.geometry import inverse, rotation_exp, scale_translation, skew, transform
 from jcr.handeye.inverse_kinematics import reach_toward
+from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import (
     Arm,
     ErrorSizes,
@@ -25,6 +25,7 @@ from jcr.handeye.robots import (
     error_names,
     error_std,
     forward_kinematics,
+    kinematic_jacobian,
 )
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.problem import HandEyeProblem, disturbed
@@ -34,12 +35,15 @@ EFFECTIVE_POSES = 120
 """Poses to which the effective hand-eye transform is fitted."""
 EFFECTIVE_NOISE = (1e-3, 2e-3)
 """m, rad: errors of equal weight in that fit."""
-REACH_OF_VIEWS = 1.15
-"""m: `Arm.reach` of a UR5e, for which the views of simulate.poses are made; for other arms they are scaled."""
-TARGET = np.array([0.5, 0.0, 0.0])
-"""m: the middle of the table of such an arm."""
+WRIST_OF_VIEWS = 1.05
+"""m: reach without the last link of a UR5e, for which the views of simulate.poses are made; others are scaled."""
+TARGET_X = 0.5
+"""m: distance of the middle of the table from the base of such an arm."""
 IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
 """Largest angle from the optical axis to the aim; least elevation of the camera above the table."""
+ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
+"""Arms with fewer than six joints: rad by which the aim moves about the base, rad about the rest posture at which the
+search for a view begins, and its steps."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
 
@@ -99,6 +103,27 @@ def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
     return BentArm(arm, std * rng.normal(size=len(std)))
 
 
+def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
+    """A plausible gripper_from_camera (4,4) that looks where the gripper points."""
+    turn = np.cross([0.0, 0.0, 1.0], arm.forward)
+    angle = np.arctan2(np.linalg.norm(turn), arm.forward[2])
+    axis = turn / max(float(np.linalg.norm(turn)), 1e-12)
+    return transform(rotation_exp(angle * axis), np.zeros(3)) @ random_hand_eye(rng)
+
+
+def view_size(arm: Arm) -> float:
+    """Factor on the distances of the views, 1 for a UR5e."""
+    return (arm.reach - float(np.linalg.norm(arm.last_from_gripper[:3, 3]))) / WRIST_OF_VIEWS
+
+
+def table_center(arm: Arm) -> Float[ndarray, "3"]:
+    """The middle of a table as high as the arm's base: where its rest posture points, or farther ahead."""
+    at_rest = forward_kinematics(arm, arm.rest[None])[0]
+    ahead = at_rest[:3, :3] @ arm.forward
+    meets = at_rest[:3, 3] - ahead * at_rest[2, 3] / ahead[2]
+    return np.array([max(TARGET_X * view_size(arm), float(np.hypot(*meets[:2]))), 0.0, 0.0])
+
+
 def views(
     arm: Arm,
     count: int,
@@ -111,15 +136,22 @@ def views(
     Distances, and the target unless given, scale with the arm's reach. Where the arm cannot reach a view it takes the
     nearest pose that it can; InputError where too few of these show the target.
     """
-    size = arm.reach / REACH_OF_VIEWS
-    target = size * TARGET if target_in_base is None else target_in_base
+    size = view_size(arm)
+    target = table_center(arm) if target_in_base is None else target_in_base
     kept = np.zeros((0, arm.dof))
     for _ in range(8):
         wished, aim = _wished(max(count, 12), target, size, gripper_from_camera, rng)
         start = np.tile(arm.rest, (len(wished), 1))
         # The first joint faces the target.
         start[:, 0] += np.arctan2(target[1], target[0])
-        joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start)
+        if arm.dof < 6:
+            about_base = rotation_exp(ASIDE * rng.uniform(-1, 1, len(aim))[:, None] * [0.0, 0.0, 1.0])
+            wished = transform(about_base, np.zeros(3)) @ wished
+            aim = (about_base @ aim[..., None])[..., 0]
+            start += START_SPREAD * rng.uniform(-1, 1, start.shape)
+            joints = _looking(arm, wished, aim, gripper_from_camera, start)
+        else:
+            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start)
         camera = forward_kinematics(arm, joints) @ gripper_from_camera
         kept = np.concatenate([kept, joints[_shows(camera, wished, aim)]])[:count]
         if len(kept) == count:
@@ -128,6 +160,31 @@ def views(
         f"a {arm.name} shows a table at x = {target[0]:.2f} m, y = {target[1]:.2f} m in {len(kept)} of {count} images; "
         "choose an arm of longer reach"
     )
+
+
+def _looking(
+    arm: Arm,
+    wished: Float[ndarray, "n 4 4"],
+    aim: Float[ndarray, "n 3"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    start: Joints,
+) -> Joints:
+    """Joint angles near `start` that put each aim on the optical axis at the wished distance, from whatever direction.
+
+    For arms with fewer than six joints, which can take up hardly any given pose.
+    """
+    in_camera = np.zeros_like(aim)
+    in_camera[:, 2] = np.linalg.norm(aim - wished[:, :3, 3], axis=1)
+    joints = np.clip(start, *arm.limits.T)
+    for _ in range(LOOKING_STEPS):
+        gripper, jacobian = kinematic_jacobian(arm, joints)
+        camera = gripper @ gripper_from_camera
+        to_camera = np.swapaxes(camera[:, :3, :3], 1, 2)
+        error = in_camera - (to_camera @ (aim - camera[:, :3, 3])[..., None])[..., 0]
+        moved = jacobian[:, :3] - skew(aim - gripper[:, :3, 3]) @ jacobian[:, 3:]
+        step = -np.linalg.pinv(to_camera @ moved, rcond=1e-3) @ error[..., None]
+        joints = np.clip(joints + np.clip(step[..., 0], -0.3, 0.3), *arm.limits.T)
+    return joints
 
 
 def _wished(
@@ -167,17 +224,8 @@ def effective_hand_eye(
 
     Weighted least squares (1 mm and 2 mrad count alike), started from the physical transform.
     """
-    columns = np.r_[0:6, 7:13]
-    x, z = gripper_from_camera, np.eye(4)
-    weight = 1 / np.repeat(EFFECTIVE_NOISE, 3)
-    for _ in range(6):
-        residual, jacobian = residuals(x, 1.0, z, reported, base_from_camera)
-        rows = (weight[:, None] * jacobian[:, :, columns]).reshape(-1, 12)
-        step = np.zeros(13)
-        step[columns] = -np.linalg.lstsq(rows, (weight * residual).ravel(), rcond=None)[0]
-        x = transform(rotation_exp(step[ROTATION]) @ x[:3, :3], x[:3, 3] + step[TRANSLATION])
-        z = transform(rotation_exp(step[BASE_ROTATION]) @ z[:3, :3], z[:3, 3] + step[BASE_TRANSLATION])
-    return x
+    start = gripper_from_camera, np.eye(4)
+    return fit_known_scale(reported, base_from_camera, start, EFFECTIVE_NOISE).gripper_from_camera
 
 
 @dataclass(frozen=True)
@@ -207,7 +255,7 @@ def bent_problem(
     """
     errors = PRESETS[errors] if isinstance(errors, str) else errors
     hand_eye, motion, arms, noise, elsewhere = (np.random.default_rng([seed, k]) for k in range(5))
-    physical = random_hand_eye(hand_eye)
+    physical = hand_eye_on(arm, hand_eye)
     bent = bend(arm, errors.sizes, arms)
     joints = views(arm, count, physical, motion)
     true = bent.true(joints)
