@@ -27,7 +27,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     folder = run_folder / FOLDER
     file = folder / FILE
     if not file.is_file():
-        return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)))
+        return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)), joints=None)
     content = read_json(file)
     if content["capture"] != str(capture.folder.resolve()):
         raise InputError(
@@ -41,7 +41,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     poses = [
         read_rigid(frame["base_from_gripper"], f"{file}: {frame['image']}") for frame in content["frames"]
     ]
-    return replace(capture, folder=folder, images=names, base_from_gripper=np.stack(poses))
+    return replace(capture, folder=folder, images=names, base_from_gripper=np.stack(poses), joints=None)
 
 
 def with_images(added: Capture, images_and_poses: Sequence[tuple[Path, Path]]) -> Capture:
