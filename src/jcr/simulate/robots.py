@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_exp, scale_translation, skew, transform
-from jcr.handeye.inverse_kinematics import reach_toward
+from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import (
     Arm,
@@ -27,7 +27,7 @@ from jcr.handeye.robots import (
     forward_kinematics,
     kinematic_jacobian,
 )
-from jcr.simulate.poses import gripper_poses, random_hand_eye
+from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 from jcr.simulate.problem import HandEyeProblem, disturbed
 
 ALL_KINDS: tuple[Kind, ...] = ("joint", "link", "sag", "gear")
@@ -39,6 +39,9 @@ WRIST_OF_VIEWS = 1.05
 """m: reach without the last link of a UR5e, for which the views of simulate.poses are made; others are scaled."""
 TARGET_X = 0.5
 """m: distance of the middle of the table from the base of such an arm."""
+LOWER_TABLE, LEAST_SIZE = 0.2, 0.55
+"""m by which the table is lower than the base of an arm of no size, and least factor on the distances of the views: a
+small arm stands above what it looks at, or objects would fill its pictures."""
 IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
 """Largest angle from the optical axis to the aim; least elevation of the camera above the table."""
 ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
@@ -112,16 +115,17 @@ def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
 
 
 def view_size(arm: Arm) -> float:
-    """Factor on the distances of the views, 1 for a UR5e."""
+    """Size of the arm, 1 for a UR5e."""
     return (arm.reach - float(np.linalg.norm(arm.last_from_gripper[:3, 3]))) / WRIST_OF_VIEWS
 
 
 def table_center(arm: Arm) -> Float[ndarray, "3"]:
-    """The middle of a table as high as the arm's base: where its rest posture points, or farther ahead."""
+    """The middle of a table that suits the arm (m): where its rest posture points, or farther ahead."""
     at_rest = forward_kinematics(arm, arm.rest[None])[0]
     ahead = at_rest[:3, :3] @ arm.forward
     meets = at_rest[:3, 3] - ahead * at_rest[2, 3] / ahead[2]
-    return np.array([max(TARGET_X * view_size(arm), float(np.hypot(*meets[:2]))), 0.0, 0.0])
+    ahead_m = max(TARGET_X * view_size(arm), float(np.hypot(*meets[:2])))
+    return np.array([ahead_m, 0.0, -LOWER_TABLE * max(1 - view_size(arm), 0.0)])
 
 
 def views(
@@ -136,7 +140,7 @@ def views(
     Distances, and the target unless given, scale with the arm's reach. Where the arm cannot reach a view it takes the
     nearest pose that it can; InputError where too few of these show the target.
     """
-    size = view_size(arm)
+    size = max(view_size(arm), LEAST_SIZE)
     target = table_center(arm) if target_in_base is None else target_in_base
     kept = np.zeros((0, arm.dof))
     for _ in range(8):
@@ -215,6 +219,43 @@ def _shows(
     )
 
 
+def patterned(
+    arm: Arm,
+    pattern: Pattern,
+    count: int,
+    target_in_base: Float[ndarray, "3"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+) -> Joints:
+    """Joint angles (n,dof) of a pattern of views about a target; InputError where the arm does not reach them all.
+
+    The pattern `varied` is fitted to the arm (`views`); the others, of which each hides something, must be exact.
+    """
+    if pattern == "varied":
+        return views(arm, count, gripper_from_camera, rng, target_in_base)
+    posture = inverse_kinematics(
+        arm, gripper_poses(pattern, count, target_in_base, gripper_from_camera, rng), np.eye(4)
+    )
+    if not posture.fits:
+        raise InputError(
+            f"--pattern {pattern}: a {arm.name} does not reach all of its views (up to "
+            f"{1e3 * posture.missed_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
+        )
+    return posture.joints
+
+
+def effective_hand_eye_about(
+    bent: BentArm,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+    target_in_base: Float[ndarray, "3"] | None = None,
+) -> Float[ndarray, "4 4"]:
+    """The effective gripper_from_camera (4,4) of a bent arm over `views` other than the capture's about the target."""
+    joints = views(bent.arm, EFFECTIVE_POSES, gripper_from_camera, rng, target_in_base)
+    cameras = bent.true(joints) @ gripper_from_camera
+    return effective_hand_eye(bent.reported(joints), cameras, gripper_from_camera)
+
+
 def effective_hand_eye(
     reported: Float[ndarray, "n 4 4"],
     base_from_camera: Float[ndarray, "n 4 4"],
@@ -259,8 +300,7 @@ def bent_problem(
     bent = bend(arm, errors.sizes, arms)
     joints = views(arm, count, physical, motion)
     true = bent.true(joints)
-    others = views(arm, EFFECTIVE_POSES, physical, elsewhere)
-    effective = effective_hand_eye(bent.reported(others), bent.true(others) @ physical, physical)
+    effective = effective_hand_eye_about(bent, physical, elsewhere)
     recon_from_base = transform(rotation_exp(noise.normal(size=3)), noise.normal(size=3))
     scale = float(np.exp(noise.uniform(-2, 2)))
     cameras = disturbed(recon_from_base @ true @ physical, camera_noise, noise)
