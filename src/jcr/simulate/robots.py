@@ -47,6 +47,8 @@ IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
 ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
 """Arms with fewer than six joints: rad by which the aim moves about the base, rad about the rest posture at which the
 search for a view begins, and its steps."""
+REACHING_STEPS = 16
+"""Of other arms towards a wished view; where that leaves them is the view."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
 
@@ -155,7 +157,7 @@ def views(
             start += START_SPREAD * rng.uniform(-1, 1, start.shape)
             joints = _looking(arm, wished, aim, gripper_from_camera, start)
         else:
-            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start)
+            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start, REACHING_STEPS)
         camera = forward_kinematics(arm, joints) @ gripper_from_camera
         kept = np.concatenate([kept, joints[_shows(camera, wished, aim)]])[:count]
         if len(kept) == count:
