@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.transforms_json import OPENGL_FROM_OPENCV
+from jcr.capture.urdf_chain import read_chain
 from jcr.geometry import inverse
+from jcr.handeye.robots import forward_kinematics
 from jcr.records import Capture
 
 HALF_PIXEL = 0.5
@@ -240,6 +242,16 @@ def arm_poses(angles: np.ndarray) -> np.ndarray:
     tool = about("x", np.zeros(len(angles)), (0.1, 0, 0))
     lift = tilt @ about("y", angles[:, 1], (0, 0, 0))
     return about("z", angles[:, 0], (0, 0, 0.2)) @ lift @ about("x", angles[:, 2], (0.3, 0, 0)) @ tool
+
+
+def assert_joints(capture: Capture, angles: np.ndarray) -> None:
+    """The capture has these joint angles, in any order, and the URDF beside its images, which explains its poses."""
+    assert capture.joints is not None and capture.urdf == capture.folder / "robot.urdf"
+    order, expected = np.argsort(capture.joints[:, 0]), np.argsort(angles[:, 0])
+    np.testing.assert_allclose(capture.joints[order], angles[expected], atol=1e-6)
+    hand = forward_kinematics(read_chain(capture.urdf, 3), capture.joints)
+    tool = inverse(hand) @ capture.base_from_gripper
+    np.testing.assert_allclose(tool, np.broadcast_to(tool[0], tool.shape), atol=1e-6)
 
 
 def write_video(file: Path, pictures: list[np.ndarray], fps: int, codec: str) -> None:

@@ -49,6 +49,12 @@ class Capture:
     """A COLMAP model or transforms.json that holds the cameras' poses already."""
     notes: tuple[str, ...] = ()
     """What reading found that the user should know: how files were paired, frames left out."""
+    joints: Float[ndarray, "n dof"] | None = None
+    """Joint angles (rad) at each image, from the base on; None: not recorded."""
+    robot: str | None = None
+    """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
+    urdf: Path | None = None
+    """Of the arm, where it was given."""
 
     def __len__(self) -> int:
         return len(self.images)

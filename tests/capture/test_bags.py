@@ -105,6 +105,7 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
     assert len(got) == 8 and got.intrinsics is None
     for name, pose in zip(got.images, got.base_from_gripper, strict=True):
         assert np.allclose(pose, expected[(got.folder / name).read_bytes()], atol=1e-6)
+    writers.assert_joints(got, angles)
 
 
 def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 import jcr
+from jcr.capture import capture_json
 from jcr.capture.images import read_image
 
 
@@ -191,3 +193,50 @@ def test_an_animation_is_refused(tmp_path: Path):
     frames[0].save(tmp_path / "two.gif", save_all=True, append_images=frames[1:])
     with pytest.raises(jcr.InputError, match="holds 2 pictures"):
         read_image(tmp_path / "two.gif")
+
+
+JOINTS = [[0.1 * k, -1.6, 1.9, -1.9, -1.5, 0.2 * k] for k in range(4)]
+
+
+def set_joints(content: dict, rows: list) -> None:
+    for frame, row in zip(content["frames"], rows, strict=True):
+        frame["joints"] = row
+
+
+def test_joints_and_the_robot_are_kept_and_written_again(capture: Path, tmp_path: Path):
+    plain = jcr.read_capture(capture)
+    assert plain.joints is None and plain.robot is None and plain.urdf is None
+    (capture / "my_arm.urdf").write_text("<robot/>")
+    edit(capture, lambda c: (set_joints(c, JOINTS), c.update(robot="ur5e", urdf="my_arm.urdf")))
+    read = jcr.read_capture(capture)
+    assert read.joints is not None and read.robot == "ur5e" and read.urdf == capture / "my_arm.urdf"
+    np.testing.assert_array_equal(read.joints, JOINTS)
+    # A copy of a capture that was read from elsewhere is complete in its folder.
+    again = capture_json.kept(replace(read, source=capture), tmp_path / "copy")
+    np.testing.assert_array_equal(again.joints, JOINTS)
+    assert again.robot == "ur5e" and again.urdf == tmp_path / "copy" / "robot.urdf"
+    assert again.urdf.read_text() == "<robot/>"
+    edit(capture, lambda c: c.update(robot="cobot 9"))
+    read = jcr.read_capture(capture)
+    assert read.robot is None and "robot 'cobot 9' is not one of ur3e" in read.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: set_joints(c, [*JOINTS[:3], None]), r"no joints at images/03.jpg; give them for all"),
+        (lambda c: set_joints(c, [*JOINTS[:3], JOINTS[3][:5]]), r"frame 3 .*: 5 angles, but frame 0 has 6"),
+        (lambda c: set_joints(c, [*JOINTS[:3], [float("nan")] * 6]), r"must be a list of finite angles"),
+        (lambda c: set_joints(c, [*JOINTS[:3], "0 1 2"]), r"not numbers; write a list"),
+        (lambda c: set_joints(c, [[90.0] * 6] * 4), r"up to 90 rad; these look like degrees"),
+        (lambda c: (set_joints(c, JOINTS), c.update(robot="panda")), r"6 joints, but a panda has 7"),
+        (lambda c: c.update(urdf="../arm.urdf"), r"leads out of"),
+        (lambda c: c.update(urdf="arm.urdf"), r"urdf arm.urdf is not there"),
+        (lambda c: c.update(urdf=3), r"urdf must be a path"),
+    ],
+)
+def test_joints_that_cannot_be_are_refused_in_one_line(capture: Path, change, message):
+    edit(capture, change)
+    with pytest.raises(jcr.InputError, match=message) as error:
+        jcr.read_capture(capture)
+    assert "\n" not in str(error.value)

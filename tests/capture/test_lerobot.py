@@ -114,6 +114,7 @@ def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: P
     options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0", pose_units="m-deg", frames=8)
     got = jcr.read_capture(path, options, into=tmp_path / "frames")
     assert_paired(got, writers.arm_poses(angles))
+    writers.assert_joints(got, angles)
     with pytest.raises(jcr.InputError, match="if they are degrees, add --pose-units m-deg"):
         options = ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="tool0")
         jcr.read_capture(path, options, into=tmp_path / "more")

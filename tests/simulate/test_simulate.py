@@ -25,15 +25,6 @@ CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
 
 
 @pytest.fixture(scope="module")
-def opengl():
-    """Skips, with the cure, where nothing can be drawn: `make test` needs no system library."""
-    try:
-        next(render(make_scene("measuring", 0), CAMERA, np.eye(4)[None], textured=False, with_truth=False))
-    except InputError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="module")
 def simulated(opengl, tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
 
@@ -198,7 +189,11 @@ def test_capture_and_truth_agree(simulated):
 @pytest.mark.gl
 def test_the_bundled_example_is_what_its_command_makes(simulated, tabletop):
     for name in ("capture.json", "reference.json", "truth/scene.json"):
-        bundled, made = (json.loads((folder / name).read_text()) for folder in (tabletop, simulated))
+        bundled, made = (
+            # Another processor may round the last bit of a product otherwise.
+            json.loads((folder / name).read_text(), parse_float=lambda text: round(float(text), 12))
+            for folder in (tabletop, simulated)
+        )
         if name == "capture.json":
             assert bundled["source"]["options"].pop("truth") == "scene"
             made["source"]["options"].pop("truth")

@@ -27,7 +27,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     folder = run_folder / FOLDER
     file = folder / FILE
     if not file.is_file():
-        return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)))
+        return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)), joints=None)
     content = read_json(file)
     try:
         whose, frames = content["capture"], content["frames"]
@@ -47,7 +47,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
             raise InputError(f"{folder / name}: an added image is gone; put it back, or remove {folder}")
     poses = [read_rigid(matrix, f"{file}: {name}") for name, matrix in zip(names, matrices, strict=True)]
     poses = np.array(poses).reshape(-1, 4, 4)
-    return replace(capture, folder=folder, images=names, base_from_gripper=poses)
+    return replace(capture, folder=folder, images=names, base_from_gripper=poses, joints=None)
 
 
 def with_images(added: Capture, images_and_poses: Sequence[tuple[Path, Path]]) -> Capture:

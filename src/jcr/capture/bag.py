@@ -12,7 +12,7 @@ from jcr.capture.camera_info import lens_of_ros, read_camera_info
 from jcr.capture.extras import extra
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
-from jcr.capture.pose_track import PosesAt, speed
+from jcr.capture.pose_track import speed
 from jcr.capture.recording import capture_of_recording
 from jcr.capture.ros_image import picture_of
 from jcr.capture.tf_tree import TfTree
@@ -58,8 +58,10 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             raise InputError(f"{path}: topic {topic} has no images")
         order = np.unique(stamp_ns, return_index=True)[1]
         stamps, logs = np.array(stamp_ns)[order], np.array(log_ns)[order]
-        poses_at = _poses_at(tree, joint_states, options, path)
+        arm = None if options.urdf is None else _joint_track(joint_states, options, path)
+        poses_at = tree.poses_at(options.base_frame, options.gripper_frame, path) if arm is None else arm.at
         poses, gap_ns = poses_at(stamps)
+        joints = None if arm is None else arm.angles(stamps)
 
         def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
             for row in rows.tolist():
@@ -76,7 +78,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
         names = [str(stamp) for stamp in stamps]
         motion = speed(poses_at, stamps)
-        return capture_of_recording(path, names, poses, motion, gap_ns, pictures, lens, options, into, report)
+        return capture_of_recording(
+            path, names, poses, motion, gap_ns, pictures, lens, options, into, report, joints
+        )
 
 
 @contextmanager
@@ -166,9 +170,7 @@ def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any
     return [c for c in reader.connections if c.topic == wanted]
 
 
-def _poses_at(tree: TfTree, joint_states: list[Any], options: ReadOptions, path: Path) -> PosesAt:
-    if options.urdf is None:
-        return tree.poses_at(options.base_frame, options.gripper_frame, path)
+def _joint_track(joint_states: list[Any], options: ReadOptions, path: Path) -> JointTrack:
     arm = read_arm(options)
     stamps: dict[str, list[int]] = {}
     positions: dict[str, list[float]] = {}
@@ -181,7 +183,7 @@ def _poses_at(tree: TfTree, joint_states: list[Any], options: ReadOptions, path:
     sampled = tuple(
         np.array(positions[joint])[order] for joint, (_, order) in zip(arm.joints, rows, strict=True)
     )
-    return JointTrack(arm, tuple(stamp for stamp, _ in rows), sampled).at
+    return JointTrack(arm, tuple(stamp for stamp, _ in rows), sampled)
 
 
 def _stamp(message: Any, log_ns: int) -> int:

@@ -6,15 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.capture.checks import checked_capture, checked_lens, read_rigid
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
+from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.records import Capture, Intrinsics
 
-FILE = "capture.json"
+FILE, URDF = "capture.json", "robot.urdf"
+MOST_TURNS = 6 * np.pi + 0.01
+"""rad: no joint turns farther to either side."""
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:
@@ -40,7 +45,16 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         for i, (name, frame) in enumerate(zip(images, frames, strict=True))
     ]
     capture = checked_capture(folder, images, np.reshape(poses, (-1, 4, 4)), str(file))
-    return replace(capture, intrinsics=read_lens(content.get("intrinsics"), capture.image_size, file))
+    joints = _joints(frames, images, file)
+    robot, notes = _robot(content.get("robot"), joints, file)
+    return replace(
+        capture,
+        intrinsics=read_lens(content.get("intrinsics"), capture.image_size, file),
+        notes=notes,
+        joints=joints,
+        robot=robot,
+        urdf=_urdf(content.get("urdf"), file),
+    )
 
 
 def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None:
@@ -57,14 +71,25 @@ def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     """Write capture.json for images that lie in `folder` already; `remarks` are keys that readers ignore."""
-    frames = [
+    frames: list[dict[str, Any]] = [
         {"image": name, "base_from_gripper": pose.tolist()}
         for name, pose in zip(capture.images, capture.base_from_gripper, strict=True)
     ]
+    if capture.joints is not None:
+        for frame, row in zip(frames, capture.joints.tolist(), strict=True):
+            frame["joints"] = row
+    arm = {} if capture.robot is None else {"robot": capture.robot}
+    if capture.urdf is not None:
+        # Beside the images, whatever it was called: a capture is complete in its folder.
+        if capture.urdf.resolve() != (folder / URDF).resolve():
+            write_bytes(folder / URDF, capture.urdf.read_bytes())
+        arm["urdf"] = URDF
     lens = None
     if capture.intrinsics is not None:
         lens = {key: getattr(capture.intrinsics, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
-    write_text(folder / FILE, json.dumps({"frames": frames, "intrinsics": lens} | remarks, indent=1) + "\n")
+    write_text(
+        folder / FILE, json.dumps({"frames": frames, "intrinsics": lens} | arm | remarks, indent=1) + "\n"
+    )
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
@@ -78,6 +103,60 @@ def kept(capture: Capture, folder: Path) -> Capture:
         write_bytes(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, source=str(capture.source))
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)
+
+
+def _joints(frames: list[Any], images: list[str], file: Path) -> Float[ndarray, "n dof"] | None:
+    """Joint angles (rad) of all frames, or None where no frame has them; InputError where some lack them."""
+    with_joints = [frame.get("joints") is not None for frame in frames]
+    if not any(with_joints):
+        return None
+    if not all(with_joints):
+        without = [name for name, has in zip(images, with_joints, strict=True) if not has]
+        raise InputError(f"{file}: no joints at {', '.join(without)}; give them for all frames or for none")
+    rows = []
+    for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
+        where = f"{file}: joints of frame {i} ({name})"
+        try:
+            row = np.array(frame["joints"], dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
+        if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
+            raise InputError(f"{where}: must be a list of finite angles in radians")
+        if np.abs(row).max() > MOST_TURNS:
+            raise InputError(
+                f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them"
+            )
+        if rows and len(row) != len(rows[0]):
+            raise InputError(f"{where}: {len(row)} angles, but frame 0 has {len(rows[0])}; give all of each")
+        rows.append(row)
+    return np.stack(rows)
+
+
+def _robot(
+    name: Any, joints: Float[ndarray, "n dof"] | None, file: Path
+) -> tuple[str | None, tuple[str, ...]]:
+    """The name of an arm that is known, and a note where it is not."""
+    if name is None:
+        return None, ()
+    if name not in ROBOT_NAMES:
+        return None, (f"robot {name!r} is not one of {', '.join(ROBOT_NAMES)}: its kinematics are not used",)
+    dof = arm_named(name).dof
+    if joints is not None and joints.shape[1] != dof:
+        raise InputError(
+            f"{file}: frames have {joints.shape[1]} joints, but a {name} has {dof}; correct either"
+        )
+    return name, ()
+
+
+def _urdf(name: Any, file: Path) -> Path | None:
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise InputError(f"{file}: urdf must be a path inside the capture, as text")
+    contained(file.parent, name, f"{file}: urdf")
+    if not (file.parent / name).is_file():
+        raise InputError(f"{file}: urdf {name} is not there; add it, or remove the key")
+    return file.parent / name
 
 
 def _image_name(frame: Any, index: int, file: Path) -> str:

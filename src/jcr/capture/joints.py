@@ -12,6 +12,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_text
 from jcr.capture.pose_track import Stamps, bracket
 from jcr.capture.robot_poses import RADIANS_LIMIT
+from jcr.capture.urdf_chain import chain_of
 from jcr.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,6 +41,14 @@ class Arm:
                 f"{', '.join(names)}"
             )
         return [list(names).index(joint) for joint in self.joints]
+
+    def angles(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n j"] | None:
+        """Joint angles (rad) for the recorded positions; None where the arm is no chain of rotating joints."""
+        try:
+            chain_of(self.urdf, len(self.joints), "the URDF")
+        except InputError:
+            return None
+        return recorded * self.unit
 
     def poses(self, recorded: Float[ndarray, "n j"]) -> Float[ndarray, "n 4 4"]:
         """base_from_gripper (n,4,4) for the joints' recorded positions; InputError on degrees for radians."""
@@ -104,10 +113,18 @@ class JointTrack:
 
     def at(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]:
         """Poses with every joint linear between its samples, and the widest gap among the joints."""
+        rows, gap = self._between(stamp_ns)
+        return self.arm.poses(rows), gap
+
+    def angles(self, stamp_ns: Stamps) -> Float[ndarray, "n j"] | None:
+        """Joint angles (rad), likewise; None where the arm is no chain of rotating joints."""
+        return self.arm.angles(self._between(stamp_ns)[0])
+
+    def _between(self, stamp_ns: Stamps) -> tuple[Float[ndarray, "n j"], Int[ndarray, " n"]]:
         rows, gap = np.zeros((len(stamp_ns), len(self.positions))), np.zeros(len(stamp_ns), np.int64)
         for k, (samples, positions) in enumerate(zip(self.stamp_ns, self.positions, strict=True)):
             before, share, width = bracket(samples, stamp_ns)
             after = np.minimum(before + 1, len(samples) - 1)
             rows[:, k] = positions[before] + share * (positions[after] - positions[before])
             gap = np.maximum(gap, width)
-        return self.arm.poses(rows), gap
+        return rows, gap

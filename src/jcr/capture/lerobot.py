@@ -38,7 +38,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     camera, key = _camera(info["features"], options, path), _state_key(info["features"], options, path)
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     state = np.concatenate([episode.state for episode in episodes])
-    poses = _poses(state, key, info["features"][key], options, path)
+    poses, joints = _poses(state, key, info["features"][key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
     parts = np.split(np.arange(len(state)), ends[:-1])
     motion = np.concatenate(
@@ -70,7 +70,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         for k in range(len(episode.time_s))
     ]
     gap_ns = np.zeros(len(state), np.int64)  # a row is one instant: nothing is interpolated
-    return capture_of_recording(path, names, poses, motion, gap_ns, pictures, lens, options, into, report)
+    return capture_of_recording(
+        path, names, poses, motion, gap_ns, pictures, lens, options, into, report, joints
+    )
 
 
 def _camera(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
@@ -96,8 +98,11 @@ def _state_key(features: dict[str, Any], options: ReadOptions, path: Path) -> st
 
 def _poses(
     state: Float[ndarray, "n k"], key: str, feature: dict[str, Any], options: ReadOptions, path: Path
-) -> Float[ndarray, "n 4 4"]:
-    """Gripper poses from the state: a pose by the names of its numbers or the convention asked for, or joints."""
+) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
+    """Gripper poses from the state: a pose by the names of its numbers or the convention asked for, or joints.
+
+    The joint angles (rad) too, where the state has those of a chain of rotating joints.
+    """
     where = f"{path}: {key}"
     names = feature.get("names") or []
     while isinstance(names, dict):  # {"motors": [...]} or {"axes": [...]}
@@ -105,7 +110,8 @@ def _poses(
     names = [str(name).removesuffix(".pos").lower() for name in names]
     if options.urdf is not None:
         arm = read_arm(options)
-        return arm.poses(state[:, arm.columns(names, where)])
+        recorded = state[:, arm.columns(names, where)]
+        return arm.poses(recorded), arm.angles(recorded)
     wanted = CONVENTIONS["rpy" if options.pose_convention == "auto" else options.pose_convention].columns
     if key == CARTESIAN or options.pose_convention != "auto":
         names = list(wanted)
@@ -117,7 +123,7 @@ def _poses(
     if state.shape[1] < len(names):
         raise InputError(f"{where}: {state.shape[1]} numbers, a pose of this convention has {len(names)}")
     columns = {name: tuple(repr(float(value)) for value in state[:, k]) for k, name in enumerate(names)}
-    return poses_of_columns(columns, frozenset(), options, where)
+    return poses_of_columns(columns, frozenset(), options, where), None
 
 
 def _speed(episode: Episode, poses: Float[ndarray, "n 4 4"]) -> Float[ndarray, " n"]:

@@ -32,8 +32,10 @@ def capture_of_recording(
     options: ReadOptions,
     into: Path,
     report: Progress,
+    joints: Float[ndarray, "n j"] | None = None,
 ) -> Capture:
     """The best frames of a recording in the folder `into`; `names` are those of the frames, without ending.
+    `joints` (rad) are those of the arm in `options.urdf`, where they are known.
 
     Frames whose pose is interpolated over more than `options.max_gap_ms` are stale. Raises InputError when all
     are, or when too few are still and sharp.
@@ -74,4 +76,6 @@ def capture_of_recording(
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     capture = checked_capture(into, images, base_from_gripper[rows], str(source))
     notes = (f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks)
+    if joints is not None:
+        capture = replace(capture, joints=joints[rows], urdf=options.urdf)
     return replace(capture, intrinsics=lens_of_size(capture.image_size), notes=notes)

@@ -14,14 +14,16 @@ from jcr.simulate.capture import SimulateOptions, simulate
 class Arguments:
     """A capture of a simulated tabletop, rendered with MuJoCo, with the truth beside it.
 
-    OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye) and truth/
-    (scene.json: heights, boxes, poses; depth and labels per image).
+    OUT holds capture.json and images/ as any capture does, reference.json (the true hand-eye transform; of a robot
+    with errors the effective one, and the physical one beside it) and truth/ (scene.json: heights, boxes, poses;
+    robot.json: the robot's errors; depth and labels per image).
 
     examples:
       jcr simulate captures/simulated
       jcr simulate captures/noisy --seed 3 --robot-noise 0.5 0.1
       jcr simulate captures/measuring --scene measuring --images 10
       jcr simulate captures/orbit --pattern orbit --unknown-intrinsics
+      jcr simulate captures/bent --robot ur5e --joint-offsets 0.1 --link-errors 0.3 --lens-error 0.5
     """
 
     out: Annotated[Path, tyro.conf.Positional]

@@ -1,7 +1,7 @@
 """A simulated capture: what a wrist camera sees on its way over a scene, written with the truth beside it."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,12 +13,23 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import rotation_exp
+from jcr.handeye.arms import RobotName, arm_named
+from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, silent, steps
 from jcr.records import Intrinsics
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 from jcr.simulate.render import render
-from jcr.simulate.scenes import SceneName, TableName, make_scene
-from jcr.simulate.truth import Truth, write_depth, write_labels, write_truth
+from jcr.simulate.robots import (
+    EFFECTIVE_POSES,
+    BentArm,
+    bend,
+    effective_hand_eye_about,
+    hand_eye_on,
+    patterned,
+    table_center,
+)
+from jcr.simulate.scenes import SceneName, TableName, make_scene, moved
+from jcr.simulate.truth import Truth, write_depth, write_labels, write_robot, write_truth
 
 _WIDTH, _HEIGHT = 640, 480
 
@@ -36,6 +47,18 @@ class SimulateOptions:
     """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
     pure translation, a turntable, xyz + yaw (SCARA), turning about a tool point or about the camera's centre,
     two images."""
+    robot: RobotName | None = None
+    """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
+    its nominal kinematics (unset: a gripper without an arm)."""
+    joint_offsets: float = 0.0
+    """Sigma of the offsets of the robot's joints, in degrees. With this and the next three, reference.json has the
+    effective hand-eye transform, and the physical one beside it."""
+    link_errors: float = 0.0
+    """Sigma of the translations of the robot's joint axes, in mm; of their rotations, 0.19 degrees per mm."""
+    gear_errors: float = 0.0
+    """Sigma of eccentric gears or encoders, in degrees: amplitudes of sine and cosine of each joint's angle."""
+    sag: float = 0.0
+    """Sigma of the deflection of each joint under gravity, in degrees with the arm stretched out."""
     seed: int = 0
     """Objects, layout, textures, lamp, lens, hand-eye and poses all follow from it."""
     texture: bool = True
@@ -47,6 +70,9 @@ class SimulateOptions:
     show the true ones."""
     unknown_intrinsics: bool = False
     """Leave the intrinsics out of capture.json. (Known or not, the lens is a pinhole without distortion.)"""
+    lens_error: float = 0.0
+    """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
+    the image's width for each coordinate of the principal point. The images show the true ones."""
     noise: float = 0.0
     """Sigma of the pixel noise, in grey levels of 255."""
     blur: float = 0.0
@@ -70,10 +96,17 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
     # One stream of random numbers a matter: a change in one must not disturb the others.
     motion, lens, robot = (np.random.default_rng([options.seed, stream]) for stream in (4, 5, 6))
     scene = make_scene(options.scene, options.seed, options.table)
-    gripper_from_camera = random_hand_eye(motion)
-    base_from_gripper = gripper_poses(
-        options.pattern, options.images, scene.table_center_in_base, gripper_from_camera, motion
-    )
+    if options.robot is None:
+        arm = None
+        gripper_from_camera = random_hand_eye(motion)
+        base_from_gripper = reported = gripper_poses(
+            options.pattern, options.images, scene.table_center_in_base, gripper_from_camera, motion
+        )
+    else:
+        arm = _arm(options, options.robot, motion)
+        scene = moved(scene, table_center(arm.bent.arm))
+        gripper_from_camera = arm.physical
+        base_from_gripper, reported = arm.bent.true(arm.joints), arm.bent.reported(arm.joints)
     suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
     truth = Truth(
         folder=out,
@@ -99,11 +132,55 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
             write_depth(truth, k, view.depth)
             write_labels(truth, k, view.label)
     write_truth(truth)
-    reference = {"gripper_from_camera": gripper_from_camera.tolist(), "how": "simulated, exact"}
+    if arm is None:
+        reference = {"gripper_from_camera": gripper_from_camera.tolist(), "how": "simulated, exact"}
+    else:
+        write_robot(truth, arm.bent, arm.joints)
+        reference = {
+            "gripper_from_camera": arm.effective.tolist(),
+            "physical_gripper_from_camera": arm.physical.tolist(),
+            "how": f"simulated: best for the reported poses of {EFFECTIVE_POSES} other views, exact cameras",
+        }
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
+    frames: list[dict[str, object]] = [
+        {"image": image, "base_from_gripper": matrix.tolist()}
+        for image, matrix in zip(
+            truth.images, with_robot_noise(reported, *options.robot_noise, robot), strict=True
+        )
+    ]
+    if arm is not None:
+        for frame, row in zip(frames, arm.joints.tolist(), strict=True):
+            frame["joints"] = row
     # Last: a folder with a capture.json is a complete capture.
-    write_text(out / "capture.json", json.dumps(_capture_json(truth, options, robot), indent=1) + "\n")
+    write_text(out / "capture.json", json.dumps(_capture_json(truth, options, frames), indent=1) + "\n")
     return out
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """The robot of a capture."""
+
+    bent: BentArm
+    joints: Float[ndarray, "n dof"]
+    physical: Float[ndarray, "4 4"]
+    """gripper_from_camera where the camera is bolted."""
+    effective: Float[ndarray, "4 4"]
+
+
+def _arm(options: SimulateOptions, robot: RobotName, motion: np.random.Generator) -> _Arm:
+    errors, elsewhere = (np.random.default_rng([options.seed, stream]) for stream in (8, 9))
+    sizes = ErrorSizes(
+        joint_offset=np.radians(options.joint_offsets),
+        link=1e-3 * options.link_errors,
+        sag=np.radians(options.sag),
+        gear=np.radians(options.gear_errors),
+    )
+    bent = bend(arm_named(robot), sizes, errors)
+    target = table_center(bent.arm)
+    physical = hand_eye_on(bent.arm, motion)
+    joints = patterned(bent.arm, options.pattern, options.images, target, physical, motion)
+    effective = effective_hand_eye_about(bent, physical, elsewhere, target)
+    return _Arm(bent, joints, physical, effective)
 
 
 def _check(out: Path, options: SimulateOptions) -> None:
@@ -111,10 +188,25 @@ def _check(out: Path, options: SimulateOptions) -> None:
         raise InputError(f"--images {options.images}: give 1 to 1000")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: give 0 or more")
+    bends = {
+        "--joint-offsets": options.joint_offsets,
+        "--link-errors": options.link_errors,
+        "--gear-errors": options.gear_errors,
+        "--sag": options.sag,
+    }
+    for option, size in bends.items():
+        if size and options.robot is None:
+            raise InputError(f"{option} {size:g}: errors of an arm; name it with --robot")
+    if options.lens_error and options.unknown_intrinsics:
+        raise InputError(
+            f"--lens-error {options.lens_error:g}: no intrinsics are given; leave one of both out"
+        )
     if options.jpeg_quality != "lossless" and not 1 <= options.jpeg_quality <= 100:
         raise InputError(f"--jpeg-quality {options.jpeg_quality}: give 1 to 100, or lossless for PNG")
-    if min(*options.robot_noise, options.noise, options.blur) < 0:
-        raise InputError("--robot-noise, --noise and --blur are sigmas: give 0 or more")
+    if min(*options.robot_noise, options.noise, options.blur, options.lens_error, *bends.values()) < 0:
+        raise InputError(
+            f"--robot-noise, --noise, --blur, --lens-error, {', '.join(bends)}: sigmas; give 0 or more"
+        )
     if not 0 <= options.vignetting <= 1:
         raise InputError(f"--vignetting {options.vignetting}: give 0 to 1")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
@@ -130,16 +222,27 @@ def _pinhole(rng: np.random.Generator) -> Intrinsics:
     return Intrinsics(focal_px, focal_px, (_WIDTH - 1) / 2, (_HEIGHT - 1) / 2, _WIDTH, _HEIGHT)
 
 
-def _capture_json(truth: Truth, options: SimulateOptions, rng: np.random.Generator) -> dict[str, object]:
-    camera = truth.intrinsics
+def with_lens_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
+    """Intrinsics that are off by Gaussian errors: fx and fy by one of `percent`, cx and cy each of that of the width."""
+    focal, x, y = 0.01 * percent * rng.normal(size=3)
+    return replace(
+        camera,
+        fx=camera.fx * (1 + focal),
+        fy=camera.fy * (1 + focal),
+        cx=camera.cx + x * camera.width,
+        cy=camera.cy + y * camera.width,
+    )
+
+
+def _capture_json(
+    truth: Truth, options: SimulateOptions, frames: list[dict[str, object]]
+) -> dict[str, object]:
+    camera = with_lens_error(truth.intrinsics, options.lens_error, np.random.default_rng([options.seed, 10]))
     known = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy")}
-    reported = with_robot_noise(truth.base_from_gripper, *options.robot_noise, rng)
     return {
-        "frames": [
-            {"image": image, "base_from_gripper": matrix.tolist()}
-            for image, matrix in zip(truth.images, reported, strict=True)
-        ],
+        "frames": frames,
         "intrinsics": None if options.unknown_intrinsics else known | {"distortion": list(camera.distortion)},
+        **({} if options.robot is None else {"robot": options.robot}),
         "source": {"program": "jcr simulate", "options": asdict(options)},
     }
 

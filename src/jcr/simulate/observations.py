@@ -14,7 +14,7 @@ def observed(problem: HandEyeProblem, rng: np.random.Generator, points: int, noi
     """Points scattered over the table, seen with noise (px) by every camera that has them in its image."""
     low, high = np.array([0.25, -0.25, 0.0]), np.array([0.75, 0.25, 0.12])
     x_in_base = rng.uniform(low, high, (points, 3))
-    base_from_camera = problem.true_base_from_gripper @ problem.gripper_from_camera
+    base_from_camera = problem.base_from_camera
     image, point, pixels = [], [], []
     for i, camera in enumerate(base_from_camera):
         x_in_camera = apply(inverse(camera), x_in_base)

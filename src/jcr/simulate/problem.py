@@ -23,6 +23,11 @@ class HandEyeProblem:
     scale: float
     true_base_from_gripper: Float[ndarray, "n 4 4"]
 
+    @property
+    def base_from_camera(self) -> Float[ndarray, "n 4 4"]:
+        """Where the cameras were."""
+        return self.true_base_from_gripper @ self.gripper_from_camera
+
 
 def hand_eye_problem(
     rng: np.random.Generator,

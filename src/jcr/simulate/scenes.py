@@ -91,6 +91,16 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     return Scene(name, parts, center, _placed(layout, things, center), light)
 
 
+def moved(scene: Scene, center_in_base: Float[ndarray, "3"]) -> Scene:
+    """The scene with the middle of its objects, on the table top, somewhere else in the base frame (m)."""
+    shift = center_in_base - scene.table_center_in_base
+    by = transform(np.eye(3), shift)
+    objects = tuple(replace(thing, base_from_object=by @ thing.base_from_object) for thing in scene.objects)
+    return replace(
+        scene, table_center_in_base=center_in_base, objects=objects, light_in_base=scene.light_in_base + shift
+    )
+
+
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
     """Label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
     table_frame = transform(np.eye(3), scene.table_center_in_base)

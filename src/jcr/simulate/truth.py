@@ -13,6 +13,7 @@ from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
 from jcr.records import Intrinsics
+from jcr.simulate.robots import BentArm
 
 _DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
@@ -64,6 +65,19 @@ def write_truth(truth: Truth) -> None:
     content = {"format": "jcr.truth/1", "depth_unit_m": _DEPTH_UNIT_M} | asdict(truth)
     del content["folder"]
     write_text(_folder(truth) / "scene.json", json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n")
+
+
+def write_robot(truth: Truth, bent: BentArm, joints: Float[ndarray, "n dof"]) -> None:
+    """Write truth/robot.json: the errors of the arm that carried the camera, by name in m and rad."""
+    content = {
+        "format": "jcr.robot_truth/1",
+        "robot": bent.arm.name,
+        "joints": joints.tolist(),
+        "errors": bent.named_errors(),
+        "reported_base_from_gripper": bent.reported(joints).tolist(),
+        "base_from_gripper": truth.base_from_gripper.tolist(),
+    }
+    write_text(_folder(truth) / "robot.json", json.dumps(content, indent=1) + "\n")
 
 
 def read_truth(folder: Path) -> Truth:

@@ -1,0 +1,93 @@
+"""The chain of revolute joints in a URDF, as the kinematics of an arm."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.plain_files import read_text
+from jcr.errors import InputError
+from jcr.handeye.robots import Arm
+
+if TYPE_CHECKING:
+    import yourdfpy
+
+FULL_TURN = (-2 * np.pi, 2 * np.pi)
+
+
+def read_chain(file: Path, dof: int, gripper: str | None = None) -> Arm:
+    """The arm of `dof` joints in a URDF file; its gripper frame is `gripper`, or the link behind the last joint.
+
+    InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not rotate.
+    """
+    import yourdfpy
+
+    read_text(file)
+    try:
+        urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
+    except Exception as error:  # the parser raises whatever its XML library does
+        raise InputError(f"{file}: not a readable URDF ({error}); expand xacro first") from None
+    return chain_of(urdf, dof, str(file), gripper)
+
+
+def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str, gripper: str | None = None) -> Arm:
+    """The arm of `dof` joints in a loaded URDF, as `read_chain`; `where` begins the messages."""
+    by_child = {joint.child: joint for joint in urdf.robot.joints}
+    links = [link.name for link in urdf.robot.links] if gripper is None else [gripper]
+    chains = {link: _chain(by_child, link) for link in links}
+    if gripper is None:
+        # A chain that ends with its last moving joint: what is fixed behind that is the gripper's affair.
+        chains = {
+            link: chain
+            for link, chain in chains.items()
+            if chain and chain[-1].type != "fixed" and _moving(chain) == dof
+        }
+    if len(chains) != 1:
+        found = f"chains to {', '.join(chains)}" if chains else "no chain"
+        raise InputError(f"{where}: {found} with {dof} joints; give as many joints per frame as the arm has")
+    ((link, chain),) = chains.items()
+    if _moving(chain) != dof:
+        raise InputError(f"{where}: {_moving(chain)} joints move {link}, but frames have {dof} joints")
+    return _arm(chain, where)
+
+
+def _chain(by_child: dict, link: str) -> list:
+    chain = []
+    while link in by_child:
+        chain.insert(0, by_child[link])
+        link = by_child[link].parent
+    return chain
+
+
+def _moving(chain: list) -> int:
+    return sum(joint.type != "fixed" for joint in chain)
+
+
+def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
+    limit = joint.limit
+    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
+        return FULL_TURN
+    return (limit.lower, limit.upper) if limit.upper > limit.lower else FULL_TURN
+
+
+def _arm(chain: list, where: str) -> Arm:
+    frames, axes, limits = [], [], []
+    frame: Float[ndarray, "4 4"] = np.eye(4)
+    for joint in chain:
+        frame = frame @ (np.eye(4) if joint.origin is None else joint.origin)
+        if joint.type == "fixed":
+            continue
+        if joint.type not in ("revolute", "continuous") or joint.mimic is not None:
+            raise InputError(
+                f"{where}: joint {joint.name} is {'coupled to another' if joint.mimic else joint.type}; errors of arms "
+                "are modelled for rotating joints only: leave the URDF out"
+            )
+        frames.append(frame)
+        axes.append(joint.axis / np.linalg.norm(joint.axis))
+        limits.append(_limits(joint))
+        frame = np.eye(4)
+    both = np.array(limits, float)
+    rest = np.where((both[:, 0] <= 0) & (both[:, 1] >= 0), 0.0, both.mean(1))
+    return Arm("robot of the URDF", np.stack(frames), np.array(axes, float), frame, both, rest)

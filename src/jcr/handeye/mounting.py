@@ -1,0 +1,49 @@
+"""How an arm with known joint angles is mounted: the constant base and tool between its kinematics and reported poses.
+
+Controllers report poses in a base and of a tool of the user's choice. Both are constant, so joint angles and poses of a
+few images determine them, and what remains shows whether angles and poses belong to this arm at all.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.geometry import inverse, rotation_exp, transform
+from jcr.handeye.closed_form import closed_form
+from jcr.handeye.known_scale import fit_known_scale
+from jcr.handeye.robots import Arm, Joints, forward_kinematics, with_tool
+from jcr.records import ARM
+
+NOISE = (1e-3, 1e-3 / ARM)
+"""m, rad: differences of equal weight."""
+AGREE = (0.015, np.radians(1.5))
+"""Of the reach, rad; root mean square. Controllers use kinematics calibrated at the factory, which are millimetres
+from the nominal arm."""
+
+
+def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]) -> Arm:
+    """The arm with the base and tool with which its forward kinematics gives the reported poses best.
+
+    Where the motions do not determine them, those nearest the arm's own. InputError where angles and poses disagree.
+    """
+    nominal = forward_kinematics(arm, joints)
+    weights = np.ones(len(joints))
+    half_turn = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    tool, _, base = closed_form(base_from_gripper, nominal, weights)
+    fits = [
+        fit_known_scale(base_from_gripper, nominal, start, NOISE)
+        for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_turn), (tool, base))
+    ]
+    best = min(fits, key=lambda fit: float((fit.residual / np.repeat(NOISE, 3)) ** 2 @ np.ones(6) @ weights))
+    metres, radians = np.sqrt((best.residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+    if metres > AGREE[0] * arm.reach or radians > AGREE[1]:
+        raise InputError(
+            f"joint angles and gripper poses disagree on a {arm.name}: {1e3 * metres:.0f} mm, "
+            f"{np.degrees(radians):.1f}° apart; check the robot, the order of its joints and their unit (rad)"
+        )
+    frames = arm.parent_from_joint.copy()
+    frames[0] = best.base_from_recon @ frames[0]
+    return with_tool(replace(arm, parent_from_joint=frames), inverse(best.gripper_from_camera))

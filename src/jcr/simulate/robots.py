@@ -1,0 +1,318 @@
+"""Simulated systematic robot errors: reported poses from nominal kinematics, true poses from a bent arm.
+
+The truth for a hand-eye calibration of such an arm is the *effective* transform: of all hand-eye transforms and
+bases, the one that best predicts the camera from the reported poses over the workspace of the capture. The physical
+transform differs from it by a constant that no pose shows.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.errors import InputError
+from jcr.geometry import inverse, rotation_exp, scale_translation, skew, transform
+from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
+from jcr.handeye.known_scale import fit_known_scale
+from jcr.handeye.robots import (
+    Arm,
+    ErrorSizes,
+    Joints,
+    Kind,
+    bent_kinematics,
+    error_names,
+    error_std,
+    forward_kinematics,
+    kinematic_jacobian,
+)
+from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
+from jcr.simulate.problem import HandEyeProblem, disturbed
+
+ALL_KINDS: tuple[Kind, ...] = ("joint", "link", "sag", "gear")
+EFFECTIVE_POSES = 120
+"""Poses to which the effective hand-eye transform is fitted."""
+EFFECTIVE_NOISE = (1e-3, 2e-3)
+"""m, rad: errors of equal weight in that fit."""
+WRIST_OF_VIEWS = 1.05
+"""m: reach without the last link of a UR5e, for which the views of simulate.poses are made; others are scaled."""
+TARGET_X = 0.5
+"""m: distance of the middle of the table from the base of such an arm."""
+LOWER_TABLE, LEAST_SIZE = 0.2, 0.55
+"""m by which the table is lower than the base of an arm of no size, and least factor on the distances of the views: a
+small arm stands above what it looks at, or objects would fill its pictures."""
+IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
+"""Largest angle from the optical axis to the aim; least elevation of the camera above the table."""
+ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
+"""Arms with fewer than six joints: rad by which the aim moves about the base, rad about the rest posture at which the
+search for a view begins, and its steps."""
+REACHING_STEPS = 16
+"""Of other arms towards a wished view; where that leaves them is the view."""
+NEAREST, FARTHEST = 0.6, 1.5
+"""Accepted distance to the aim, over that of the wished view."""
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """One-sigma errors of an arm's reported poses."""
+
+    white: tuple[float, float] = (0.0, 0.0)
+    """m, rad per axis, independent at each pose."""
+    sizes: ErrorSizes = ErrorSizes()
+    """Systematic errors, the same for all poses."""
+
+
+PresetName = Literal["white", "factory-calibrated", "typical", "poor", "low-cost"]
+
+
+def _bent(joint_offset_deg: float, link_mm: float) -> ArmErrors:
+    return ArmErrors((5e-5, np.radians(0.01)), ErrorSizes(np.radians(joint_offset_deg), 1e-3 * link_mm))
+
+
+PRESETS: dict[PresetName, ArmErrors] = {
+    "white": ArmErrors((5e-4, np.radians(0.1))),
+    "factory-calibrated": _bent(0.03, 0.1),
+    "typical": _bent(0.1, 0.3),
+    "poor": _bent(0.3, 1.0),
+    "low-cost": _bent(1.0, 1.0),
+}
+"""Random noise alone, or systematic errors beside a small repeatability (0.05 mm, 0.01°)."""
+
+
+@dataclass(frozen=True)
+class BentArm:
+    """An arm with drawn errors."""
+
+    arm: Arm
+    errors: Float[ndarray, " p"]
+    """In the order of `error_names(arm, ALL_KINDS)`; m and rad."""
+
+    def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
+        """base_from_gripper (n,4,4) as the controller computes it."""
+        return forward_kinematics(self.arm, joints)
+
+    def true(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
+        """base_from_gripper (n,4,4) of the bent arm."""
+        return bent_kinematics(self.arm, joints, self.errors, ALL_KINDS)
+
+    def named_errors(self) -> dict[str, float]:
+        """The errors that are not zero, by name (m, rad)."""
+        names = error_names(self.arm, ALL_KINDS)
+        return {name: float(value) for name, value in zip(names, self.errors, strict=True) if value}
+
+
+def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
+    """The arm with random errors of the given sizes."""
+    std = error_std(arm, sizes, ALL_KINDS)
+    return BentArm(arm, std * rng.normal(size=len(std)))
+
+
+def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
+    """A plausible gripper_from_camera (4,4) that looks where the gripper points."""
+    turn = np.cross([0.0, 0.0, 1.0], arm.forward)
+    angle = np.arctan2(np.linalg.norm(turn), arm.forward[2])
+    axis = turn / max(float(np.linalg.norm(turn)), 1e-12)
+    return transform(rotation_exp(angle * axis), np.zeros(3)) @ random_hand_eye(rng)
+
+
+def view_size(arm: Arm) -> float:
+    """Size of the arm, 1 for a UR5e."""
+    return (arm.reach - float(np.linalg.norm(arm.last_from_gripper[:3, 3]))) / WRIST_OF_VIEWS
+
+
+def table_center(arm: Arm) -> Float[ndarray, "3"]:
+    """The middle of a table that suits the arm (m): where its rest posture points, or farther ahead."""
+    at_rest = forward_kinematics(arm, arm.rest[None])[0]
+    ahead = at_rest[:3, :3] @ arm.forward
+    meets = at_rest[:3, 3] - ahead * at_rest[2, 3] / ahead[2]
+    ahead_m = max(TARGET_X * view_size(arm), float(np.hypot(*meets[:2])))
+    return np.array([ahead_m, 0.0, -LOWER_TABLE * max(1 - view_size(arm), 0.0)])
+
+
+def views(
+    arm: Arm,
+    count: int,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+    target_in_base: Float[ndarray, "3"] | None = None,
+) -> Joints:
+    """Joint angles (n,dof) at which the camera looks at a table from varied directions and distances.
+
+    Distances, and the target unless given, scale with the arm's reach. Where the arm cannot reach a view it takes the
+    nearest pose that it can; InputError where too few of these show the target.
+    """
+    size = max(view_size(arm), LEAST_SIZE)
+    target = table_center(arm) if target_in_base is None else target_in_base
+    kept = np.zeros((0, arm.dof))
+    for _ in range(8):
+        wished, aim = _wished(max(count, 12), target, size, gripper_from_camera, rng)
+        start = np.tile(arm.rest, (len(wished), 1))
+        # The first joint faces the target.
+        start[:, 0] += np.arctan2(target[1], target[0])
+        if arm.dof < 6:
+            about_base = rotation_exp(ASIDE * rng.uniform(-1, 1, len(aim))[:, None] * [0.0, 0.0, 1.0])
+            wished = transform(about_base, np.zeros(3)) @ wished
+            aim = (about_base @ aim[..., None])[..., 0]
+            start += START_SPREAD * rng.uniform(-1, 1, start.shape)
+            joints = _looking(arm, wished, aim, gripper_from_camera, start)
+        else:
+            joints = reach_toward(arm, wished @ inverse(gripper_from_camera), start, REACHING_STEPS)
+        camera = forward_kinematics(arm, joints) @ gripper_from_camera
+        kept = np.concatenate([kept, joints[_shows(camera, wished, aim)]])[:count]
+        if len(kept) == count:
+            return kept
+    raise InputError(
+        f"a {arm.name} shows a table at x = {target[0]:.2f} m, y = {target[1]:.2f} m in {len(kept)} of {count} images; "
+        "choose an arm of longer reach"
+    )
+
+
+def _looking(
+    arm: Arm,
+    wished: Float[ndarray, "n 4 4"],
+    aim: Float[ndarray, "n 3"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    start: Joints,
+) -> Joints:
+    """Joint angles near `start` that put each aim on the optical axis at the wished distance, from whatever direction.
+
+    For arms with fewer than six joints, which can take up hardly any given pose.
+    """
+    in_camera = np.zeros_like(aim)
+    in_camera[:, 2] = np.linalg.norm(aim - wished[:, :3, 3], axis=1)
+    joints = np.clip(start, *arm.limits.T)
+    for _ in range(LOOKING_STEPS):
+        gripper, jacobian = kinematic_jacobian(arm, joints)
+        camera = gripper @ gripper_from_camera
+        to_camera = np.swapaxes(camera[:, :3, :3], 1, 2)
+        error = in_camera - (to_camera @ (aim - camera[:, :3, 3])[..., None])[..., 0]
+        moved = jacobian[:, :3] - skew(aim - gripper[:, :3, 3]) @ jacobian[:, 3:]
+        step = -np.linalg.pinv(to_camera @ moved, rcond=1e-3) @ error[..., None]
+        joints = np.clip(joints + np.clip(step[..., 0], -0.3, 0.3), *arm.limits.T)
+    return joints
+
+
+def _wished(
+    count: int,
+    target: Float[ndarray, "3"],
+    size: float,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n 3"]]:
+    """base_from_camera of the pattern `varied` at the arm's size, and where each optical axis meets the table."""
+    views = gripper_poses("varied", count, np.zeros(3), gripper_from_camera, rng) @ gripper_from_camera
+    aim = views[:, :3, 3] - views[:, :3, 2] * (views[:, 2, 3] / views[:, 2, 2])[:, None]
+    return transform(views[:, :3, :3], size * views[:, :3, 3] + target), size * aim + target
+
+
+def _shows(
+    camera: Float[ndarray, "n 4 4"], wished: Float[ndarray, "n 4 4"], aim: Float[ndarray, "n 3"]
+) -> np.ndarray:
+    to_aim = aim - camera[:, :3, 3]
+    distance = np.linalg.norm(to_aim, axis=1)
+    ratio = distance / np.linalg.norm(aim - wished[:, :3, 3], axis=1)
+    ahead = (to_aim * camera[:, :3, 2]).sum(1) / distance
+    return (
+        (ahead > np.cos(IN_VIEW))
+        & (-to_aim[:, 2] > np.sin(LOWEST_VIEW) * distance)
+        & (ratio > NEAREST)
+        & (ratio < FARTHEST)
+    )
+
+
+def patterned(
+    arm: Arm,
+    pattern: Pattern,
+    count: int,
+    target_in_base: Float[ndarray, "3"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+) -> Joints:
+    """Joint angles (n,dof) of a pattern of views about a target; InputError where the arm does not reach them all.
+
+    The pattern `varied` is fitted to the arm (`views`); the others, of which each hides something, must be exact.
+    """
+    if pattern == "varied":
+        return views(arm, count, gripper_from_camera, rng, target_in_base)
+    posture = inverse_kinematics(
+        arm, gripper_poses(pattern, count, target_in_base, gripper_from_camera, rng), np.eye(4)
+    )
+    if not posture.fits:
+        raise InputError(
+            f"--pattern {pattern}: a {arm.name} does not reach all of its views (up to "
+            f"{1e3 * posture.missed_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
+        )
+    return posture.joints
+
+
+def effective_hand_eye_about(
+    bent: BentArm,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    rng: np.random.Generator,
+    target_in_base: Float[ndarray, "3"] | None = None,
+) -> Float[ndarray, "4 4"]:
+    """The effective gripper_from_camera (4,4) of a bent arm over `views` other than the capture's about the target."""
+    joints = views(bent.arm, EFFECTIVE_POSES, gripper_from_camera, rng, target_in_base)
+    cameras = bent.true(joints) @ gripper_from_camera
+    return effective_hand_eye(bent.reported(joints), cameras, gripper_from_camera)
+
+
+def effective_hand_eye(
+    reported: Float[ndarray, "n 4 4"],
+    base_from_camera: Float[ndarray, "n 4 4"],
+    gripper_from_camera: Float[ndarray, "4 4"],
+) -> Float[ndarray, "4 4"]:
+    """gripper_from_camera (4,4) that with a free base best predicts exact cameras from reported poses, scale known.
+
+    Weighted least squares (1 mm and 2 mrad count alike), started from the physical transform.
+    """
+    start = gripper_from_camera, np.eye(4)
+    return fit_known_scale(reported, base_from_camera, start, EFFECTIVE_NOISE).gripper_from_camera
+
+
+@dataclass(frozen=True)
+class BentProblem(HandEyeProblem):
+    """A hand-eye problem of a bent arm; `gripper_from_camera` is the effective one."""
+
+    bent: BentArm
+    joints: Float[ndarray, "n dof"]
+    physical_gripper_from_camera: Float[ndarray, "4 4"]
+
+    @property
+    def base_from_camera(self) -> Float[ndarray, "n 4 4"]:
+        """Where the cameras were."""
+        return self.true_base_from_gripper @ self.physical_gripper_from_camera
+
+
+def bent_problem(
+    arm: Arm,
+    errors: ArmErrors | PresetName,
+    count: int,
+    seed: int,
+    camera_noise: tuple[float, float] = (5e-5, np.radians(0.005)),
+) -> BentProblem:
+    """A random bent arm, hand-eye transform, reconstruction frame and scale, and `count` views of a table.
+
+    `camera_noise` is one sigma (m, rad) per axis of the reconstructed cameras.
+    """
+    errors = PRESETS[errors] if isinstance(errors, str) else errors
+    hand_eye, motion, arms, noise, elsewhere = (np.random.default_rng([seed, k]) for k in range(5))
+    physical = hand_eye_on(arm, hand_eye)
+    bent = bend(arm, errors.sizes, arms)
+    joints = views(arm, count, physical, motion)
+    true = bent.true(joints)
+    effective = effective_hand_eye_about(bent, physical, elsewhere)
+    recon_from_base = transform(rotation_exp(noise.normal(size=3)), noise.normal(size=3))
+    scale = float(np.exp(noise.uniform(-2, 2)))
+    cameras = disturbed(recon_from_base @ true @ physical, camera_noise, noise)
+    return BentProblem(
+        disturbed(bent.reported(joints), errors.white, noise),
+        scale_translation(cameras, 1 / scale),
+        effective,
+        scale,
+        true,
+        bent,
+        joints,
+        physical,
+    )

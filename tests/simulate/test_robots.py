@@ -1,0 +1,199 @@
+"""Bent arms: what they report, where they are, and the hand-eye transform that is asked for."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
+from jcr.handeye.arms import ROBOT_NAMES, arm_named
+from jcr.handeye.known_scale import fit_known_scale
+from jcr.handeye.robots import ErrorSizes, error_names, error_std, forward_kinematics
+from jcr.records import Intrinsics
+from jcr.simulate.capture import SimulateOptions, simulate, with_lens_error
+from jcr.simulate.robots import (
+    ALL_KINDS,
+    PRESETS,
+    ArmErrors,
+    BentArm,
+    bend,
+    bent_problem,
+    effective_hand_eye_about,
+    hand_eye_on,
+    patterned,
+    table_center,
+    views,
+)
+from jcr.simulate.truth import read_truth, true_depth, true_labels
+
+
+def only(arm, name: str, value: float) -> BentArm:
+    names = error_names(arm, ALL_KINDS)
+    errors = np.zeros(len(names))
+    errors[names.index(name)] = value
+    return BentArm(arm, errors)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_every_arm_sees_its_table_from_varied_sides(name):
+    arm, rng = arm_named(name), np.random.default_rng(5)
+    gripper_from_camera = hand_eye_on(arm, rng)
+    joints = views(arm, 30, gripper_from_camera, rng)
+    assert joints.shape == (30, arm.dof)
+    assert (joints >= arm.limits[:, 0]).all() and (joints <= arm.limits[:, 1]).all()
+    cameras = forward_kinematics(arm, joints) @ gripper_from_camera
+    target = table_center(arm)
+    if arm.dof == 6 or arm.dof == 7:
+        to_target = target - cameras[:, :3, 3]
+        angle = np.arccos((to_target * cameras[:, :3, 2]).sum(1) / np.linalg.norm(to_target, axis=1))
+        assert np.degrees(angle).max() < 25
+    assert (cameras[:, 2, 3] > target[2] + 0.08).all() and (cameras[:, 2, 2] < -0.4).all()
+    # Relative rotations about all axes: what a hand-eye calibration lives on.
+    turns = rotation_log(cameras[:1, :3, :3].swapaxes(1, 2) @ cameras[1:, :3, :3])
+    assert np.linalg.svd(turns, compute_uv=False)[2] / np.sqrt(len(turns)) > np.radians(5)
+
+
+def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
+    arm, rng = arm_named("ur5e"), np.random.default_rng(0)
+    physical = hand_eye_on(arm, rng)
+    about_z = transform(rotation_exp(np.array([0.0, 0.0, 0.01])), np.zeros(3))
+    # The last joint turns the flange about its z: to the user the camera sits turned. The first turns the base.
+    last = effective_hand_eye_about(only(arm, "joint 6", 0.01), physical, rng)
+    np.testing.assert_allclose(last, about_z @ physical, atol=1e-9)
+    first = effective_hand_eye_about(only(arm, "joint 1", 0.01), physical, rng)
+    np.testing.assert_allclose(first, physical, atol=1e-9)
+    elbow = effective_hand_eye_about(only(arm, "joint 3", 0.01), physical, rng)
+    assert rotation_angle(elbow[:3, :3] @ physical[:3, :3].T) > 1e-3
+
+
+def test_effective_hand_eye_predicts_the_camera_better_than_the_physical_one():
+    noise = (1e-3, 2e-3)
+    better = []
+    for seed in range(6):
+        problem = bent_problem(arm_named("panda"), "poor", 8, seed, (0.0, 0.0))
+        joints = views(problem.bent.arm, 60, problem.physical_gripper_from_camera, np.random.default_rng(99))
+        reported = problem.bent.reported(joints)
+        cameras = problem.bent.true(joints) @ problem.physical_gripper_from_camera
+        costs = []
+        for x in (problem.gripper_from_camera, problem.physical_gripper_from_camera):
+            # The base that suits each; then what is left.
+            base = fit_known_scale(cameras, reported @ x, (np.eye(4), np.eye(4)), noise).base_from_recon
+            gap = inverse(base @ reported @ x) @ cameras
+            turned = rotation_angle(gap[:, :3, :3])
+            costs.append(((gap[:, :3, 3] / 1e-3) ** 2).sum() + ((turned / 2e-3) ** 2).sum())
+        better.append(costs[0] <= costs[1] * 1.001)
+    assert all(better)
+
+
+def test_a_problem_reports_nominal_poses_of_a_bent_arm():
+    arm = arm_named("ur5e")
+    began = time.process_time()
+    problem = bent_problem(arm, "typical", 12, 3, (0.0, 0.0))
+    # Seconds of one core, about 0.02: a table of results makes thousands.
+    assert time.process_time() - began < 0.2
+    again = bent_problem(arm, "typical", 12, 3, (0.0, 0.0))
+    np.testing.assert_array_equal(problem.recon_from_camera, again.recon_from_camera)
+    off = inverse(forward_kinematics(arm, problem.joints)) @ problem.base_from_gripper
+    assert np.abs(off[:, :3, 3]).max() < 5 * PRESETS["typical"].white[0]
+    bent = inverse(problem.base_from_gripper) @ problem.true_base_from_gripper
+    assert 3e-4 < np.linalg.norm(bent[:, :3, 3], axis=1).mean() < 6e-3
+    # The cameras are the true ones, in another frame and unit.
+    motion = inverse(problem.base_from_camera[:1]) @ problem.base_from_camera[1:]
+    seen = inverse(problem.recon_from_camera[:1]) @ problem.recon_from_camera[1:]
+    np.testing.assert_allclose(problem.scale * seen[:, :3, 3], motion[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(seen[:, :3, :3], motion[:, :3, :3], atol=1e-12)
+
+
+def test_without_systematic_errors_the_effective_transform_is_the_physical_one():
+    problem = bent_problem(arm_named("xarm7"), "white", 30, 0)
+    assert not problem.bent.errors.any()
+    np.testing.assert_allclose(problem.gripper_from_camera, problem.physical_gripper_from_camera, atol=1e-9)
+    off = inverse(problem.true_base_from_gripper) @ problem.base_from_gripper
+    std = np.sqrt((off[:, :3, 3] ** 2).mean()), np.sqrt((rotation_log(off[:, :3, :3]) ** 2).mean())
+    # The sigma of 90 numbers is known to 8 %.
+    np.testing.assert_allclose(std, PRESETS["white"].white, rtol=0.3)
+
+
+def test_errors_have_the_sizes_asked_for():
+    arm, rng = arm_named("ur5e"), np.random.default_rng(0)
+    sizes = ErrorSizes(joint_offset=1e-3, link=3e-4, sag=2e-3, gear=5e-4)
+    draws = np.stack([bend(arm, sizes, rng).errors for _ in range(1000)])
+    np.testing.assert_allclose(draws.std(0), error_std(arm, sizes, ALL_KINDS), rtol=0.12)
+    named = bend(arm, ErrorSizes(joint_offset=1e-3), rng).named_errors()
+    assert list(named) == [f"joint {k}" for k in range(1, 7)]
+    assert bent_problem(arm, ArmErrors(), 3, 0, (0.0, 0.0)).bent.named_errors() == {}
+
+
+def test_a_pattern_out_of_reach_is_refused():
+    arm, rng = arm_named("so101"), np.random.default_rng(0)
+    with pytest.raises(InputError, match="--pattern orbit: a so101 does not reach all of its views"):
+        patterned(arm, "orbit", 6, table_center(arm), hand_eye_on(arm, rng), rng)
+    large = arm_named("ur10e")
+    physical = hand_eye_on(large, rng)
+    joints = patterned(large, "orbit", 6, np.array([0.6, 0.0, 0.0]), physical, rng)
+    centres = (forward_kinematics(large, joints) @ physical)[:, :3, 3]
+    np.testing.assert_allclose(np.linalg.norm(centres - [0.6, 0, 0], axis=1), 0.5, atol=1e-5)
+
+
+def test_given_intrinsics_are_drawn_around_the_true_ones():
+    camera, rng = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480), np.random.default_rng(0)
+    drawn = [with_lens_error(camera, 0.5, rng) for _ in range(2000)]
+    numbers = np.array([[one.fx, one.fy, one.cx, one.cy] for one in drawn])
+    np.testing.assert_array_equal(numbers[:, 0], numbers[:, 1])
+    np.testing.assert_allclose(numbers[:, [0, 2, 3]].std(0), [3.0, 3.2, 3.2], rtol=0.07)
+    assert with_lens_error(camera, 0.0, rng) == camera
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("opengl")
+def test_a_capture_of_a_bent_arm(tmp_path):
+    options = SimulateOptions(
+        images=4,
+        seed=3,
+        robot="z1",
+        joint_offsets=0.3,
+        link_errors=1.0,
+        sag=0.2,
+        gear_errors=0.1,
+        lens_error=0.5,
+    )
+    folder = simulate(tmp_path / "bent", options)
+    capture, truth = jcr.read_capture(folder), read_truth(folder)
+    reference = json.loads((folder / "reference.json").read_text())
+    robot = json.loads((folder / "truth" / "robot.json").read_text())
+    arm = arm_named("z1")
+    assert capture.robot == robot["robot"] == "z1" and capture.joints is not None
+    np.testing.assert_allclose(forward_kinematics(arm, capture.joints), capture.base_from_gripper, atol=1e-9)
+    assert {"joint 3", "link 2 tilt 1", "joint 4 sag", "joint 5 gear sine"} <= robot["errors"].keys()
+    # The pictures are taken from where the bent arm is: the table's depth lies on the table.
+    physical = np.array(reference["physical_gripper_from_camera"])
+    np.testing.assert_allclose(truth.base_from_camera, truth.base_from_gripper @ physical, atol=1e-12)
+    off = np.linalg.norm((truth.base_from_gripper - capture.base_from_gripper)[:, :3, 3], axis=1)
+    assert 2e-4 < off.mean() < 0.02
+    x, y = np.meshgrid(np.arange(640), np.arange(480))
+    camera = truth.intrinsics
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(x.shape)], -1)
+    points = apply(truth.base_from_camera[0], true_depth(truth, 0)[..., None] * rays)
+    table = points[true_labels(truth, 0) == 1]
+    assert len(table) > 1000
+    np.testing.assert_allclose(table[:, 2], truth.table_height, atol=2e-4)
+    # What is asked for is neither where the camera is bolted, nor the true lens.
+    effective = np.array(reference["gripper_from_camera"])
+    assert 1e-5 < np.abs(effective - physical).max() < 0.05
+    assert capture.intrinsics is not None and capture.intrinsics.fx != camera.fx
+    assert abs(capture.intrinsics.fx / camera.fx - 1) < 0.02 and capture.intrinsics.cx != camera.cx
+
+
+def test_options_of_a_robot_that_mean_nothing_are_refused(tmp_path):
+    for options, message in (
+        (SimulateOptions(joint_offsets=0.1), "--joint-offsets 0.1: errors of an arm; name it with --robot"),
+        (SimulateOptions(robot="ur5e", link_errors=-1.0), "sigmas; give 0 or more"),
+        (SimulateOptions(lens_error=-1.0), "sigmas; give 0 or more"),
+        (SimulateOptions(lens_error=0.5, unknown_intrinsics=True), "no intrinsics are given"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
