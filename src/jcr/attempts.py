@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.stage import CalibrateOptions, calibrate, missed_m
 from jcr.errors import InputError, NotTrustedError
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, candidates, reconstruct
@@ -26,8 +26,7 @@ class Attempt:
     @property
     def missed_m(self) -> float:
         """Error on images left out; infinite where there were too few to leave one out."""
-        held_out = self.held_out
-        return float("inf") if held_out is None else held_out.missed_m
+        return missed_m(self.held_out)
 
     def told(self) -> str:
         """The back end, and its error on images left out."""

@@ -13,7 +13,7 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from jcr.calibration.projection import parameters, project, project_derivatives
-from jcr.geometry import apply, fit_similarity, inverse, rotation_exp, rotation_log, transform
+from jcr.geometry import apply, fit_similarity, inverse, retract, step_between
 from jcr.handeye.noise import noise_share, robot_noise, widened
 from jcr.records import Intrinsics, Tracks
 
@@ -56,7 +56,7 @@ class Adjusted:
     """As `adjust` was told it."""
     sigma_px: float
     robot_residual: Float[ndarray, "m 6"]
-    """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
+    """Steps from the reported to the adjusted gripper poses (m, rad), base axes."""
     robot_hat: Float[ndarray, "m 6 6"]
     """Posterior covariance of those in units of the noise."""
     problem: "_Problem"
@@ -216,12 +216,6 @@ def _view(bundle: Bundle, problem: _Problem) -> _View:
     return _View(in_gripper, in_camera, project(in_camera, bundle.camera) - problem.x_px)
 
 
-def _robot_residual(bundle: Bundle, reported: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 6"]:
-    adjusted = bundle.base_from_gripper
-    turned = rotation_log(np.swapaxes(reported[:, :3, :3], 1, 2) @ adjusted[:, :3, :3])
-    return np.concatenate([adjusted[:, :3, 3] - reported[:, :3, 3], turned], axis=1)
-
-
 def _sigma_px(view: _View, problem: _Problem) -> float:
     """Noise of an image coordinate, from the median point none of whose observations is far off."""
     square = (view.residual**2).sum(1)
@@ -245,7 +239,9 @@ def _cost(
     robot: tuple[float, float],
 ) -> float:
     seen = float(weights @ (view.residual**2).sum(1))
-    told = float(((_robot_residual(bundle, problem.reported) / np.repeat(robot, 3)) ** 2).sum())
+    told = float(
+        ((step_between(problem.reported, bundle.base_from_gripper) / np.repeat(robot, 3)) ** 2).sum()
+    )
     return seen + told + float(((_lens_step(bundle, problem) / problem.lens_std) ** 2).sum())
 
 
@@ -269,7 +265,7 @@ def _normal_equations(
     residual = view.residual * root[:, None]
     by_gripper_axes = (by_point * root[:, None, None]) @ bundle.gripper_from_camera[:3, :3].T
     by_base_axes = np.empty_like(by_gripper_axes)
-    # X moves by (dt, ω), R_X ← exp(ω) R_X; a gripper by (dn in base axes, ρ), R_G ← R_G exp(ρ).
+    # X and the grippers move by steps of geometry.retract, in gripper and in base axes.
     common = np.empty((len(root), 2, shared))
     common[:, :, 0:3] = -by_gripper_axes
     common[:, :, 3:6] = np.cross(
@@ -277,17 +273,18 @@ def _normal_equations(
     )
     common[:, :, 6:] = (by_lens @ problem.lens) * root[:, None, None]
     own = np.empty((len(root), 2, 6))
-    own[:, :, 3:] = np.cross(by_gripper_axes, view.in_gripper[:, None])
 
     hessian, right = np.zeros((size, size)), np.zeros(size)
     for i, rows in enumerate(problem.rows_of_image):
-        by_base_axes[rows] = by_gripper_axes[rows] @ bundle.base_from_gripper[i, :3, :3].T
+        from_base = bundle.base_from_gripper[i, :3, :3].T
+        by_base_axes[rows] = by_gripper_axes[rows] @ from_base
         own[rows, :, :3] = -by_base_axes[rows]
+        own[rows, :, 3:] = np.cross(by_base_axes[rows], (view.in_gripper[rows] @ from_base)[:, None])
         block = np.concatenate([common[rows], own[rows]], axis=2).reshape(-1, shared + 6)
         columns = np.r_[0:shared, shared + 6 * i : shared + 6 * i + 6]
         hessian[np.ix_(columns, columns)] += block.T @ block
         right[columns] -= block.T @ residual[rows].ravel()
-    told = _robot_residual(bundle, problem.reported)
+    told = step_between(problem.reported, bundle.base_from_gripper)
     precision = np.repeat(np.asarray(robot) ** -2.0, 3)
     diagonal = np.arange(size)
     hessian[diagonal[shared:], diagonal[shared:]] += np.tile(precision, m)
@@ -330,11 +327,9 @@ def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
     for first, count, v, w, g in normal.point_steps:
         points[first : first + count] += np.linalg.solve(v, -(g + w @ step)[..., None])[..., 0]
     c = problem.lens.shape[1]
-    x, gripper = bundle.gripper_from_camera, bundle.base_from_gripper
-    own = step[6 + c :].reshape(-1, 6)
     return Bundle(
-        transform(rotation_exp(step[3:6]) @ x[:3, :3], x[:3, 3] + step[:3]),
-        transform(gripper[:, :3, :3] @ rotation_exp(own[:, 3:]), gripper[:, :3, 3] + own[:, :3]),
+        retract(bundle.gripper_from_camera, step[:6]),
+        retract(bundle.base_from_gripper, step[6 + c :].reshape(-1, 6)),
         points,
         bundle.camera + problem.lens @ step[6 : 6 + c],
     )
@@ -348,7 +343,7 @@ def _robot_noise(
     given: tuple[float, float] | None,
 ) -> tuple[float, float]:
     """Restricted maximum likelihood of the robot's noise, one step."""
-    told = _robot_residual(bundle, problem.reported)
+    told = step_between(problem.reported, bundle.base_from_gripper)
     m = len(told)
     spread = np.diag(covariance)[-6 * m :].reshape(m, 6)
     squares = float((told[:, :3] ** 2).sum()), float((told[:, 3:] ** 2).sum())
@@ -412,7 +407,7 @@ def _summary(
         robot,
         given,
         sigma_px,
-        _robot_residual(bundle, problem.reported),
+        step_between(problem.reported, bundle.base_from_gripper),
         hat / sigma[:, None] / sigma[None],
         problem,
         iterations,

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.calibration.bundle import LENS_STD, Adjusted, adjust, free_lens
 from jcr.calibration.projection import CAMERA_PARAMETERS, parameters
-from jcr.geometry import rotation_log
+from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
@@ -59,10 +59,8 @@ def lens_doubt(
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
-    x, before = freed.bundle.gripper_from_camera, hand_eye.gripper_from_camera
     shift = np.r_[
-        x[:3, 3] - before[:3, 3],
-        rotation_log(x[:3, :3] @ before[:3, :3].T),
+        step_between(hand_eye.gripper_from_camera, freed.bundle.gripper_from_camera),
         np.log(freed.scale / hand_eye.scale),
     ]
     return LensDoubt(

@@ -20,7 +20,7 @@ from numpy import ndarray
 from jcr.camera import distort, pinhole_inside, undistort_image, usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import adjoint, apply, inverse
+from jcr.geometry import apply, inverse, step_axes
 from jcr.progress import Progress, silent
 from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.direct.coarse_to_fine import Stage, aligned, free_directions, tied_directions
@@ -107,7 +107,7 @@ def reconstruct(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
             "take pictures that overlap more, of a scene that does not move or shine"
         )
-    covariance = twist_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
+    covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
     points = points.where(points.agreed)
     lens = replace(lens, fx=lens.fx * cameras.zoom, fy=lens.fy * cameras.zoom)
     tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
@@ -165,10 +165,10 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics) -> dict
     return {height: make_level(stack, grid, height) for height in heights}
 
 
-def twist_covariance(
+def camera_covariance(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> Float[ndarray, "r r"]:
-    """Covariance (6n,6n) of the cameras' twists in the first camera's axes, as records.CameraEvidence has it.
+    """Covariance (6n,6n) of the cameras' steps in the first camera's axes, as records.CameraEvidence has it.
 
     Residuals of one region of the scene err together, in all images that look there. How far the gradients of regions
     scatter about zero is measured, and the inverse normal matrix scaled to it on average (a sandwich estimate that has
@@ -184,10 +184,10 @@ def twist_covariance(
     first_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
     n = len(first_from_camera)
     to_first = np.zeros((6 * n, 6 * n))
-    for k, block in enumerate(adjoint(first_from_camera)):
+    for k, block in enumerate(step_axes(first_from_camera[:, :3, :3])):
         to_first[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
-    twists = to_first @ directions[:-1]
-    return spread * twists @ inverse_normal @ twists.T
+    steps = to_first @ directions[:-1]
+    return spread * steps @ inverse_normal @ steps.T
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, lens: Intrinsics) -> Tracks:
