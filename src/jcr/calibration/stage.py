@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import Adjusted, adjust, lens_of, median_reprojection
+from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
 from jcr.errors import InputError, NotTrustedError
@@ -262,7 +262,7 @@ def _refined(
         robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
         residual_translation=delta_t,
         residual_rotation=delta_r,
-        intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),
+        intrinsics=adjusted.bundle.camera,
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
     )

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.optimize import least_squares
 
-from jcr.camera import WITHIN_FOLD, fold_distance_px
+from jcr.camera import WITHIN_FOLD, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, rotation_log, transform
@@ -143,8 +143,8 @@ def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
     found = []
     for k in range(count):
         turn, shift = cv2.solvePnPRefineLM(x, x_px, *camera, rotations[k], translations[k])
-        missed = cv2.projectPoints(x, turn, shift, *camera)[0].reshape(-1, 2) - x_px
         pose = transform(rotation_exp(turn.ravel()), shift.ravel())
+        missed = project(lens, apply(pose, x)) - x_px
         found.append(Pose(pose, float(np.sqrt((missed**2).sum(1).mean()))))
     found.sort(key=lambda pose: pose.rms_px)
     if not found or found[0].rms_px > WORST_PX:

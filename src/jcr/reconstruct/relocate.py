@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import resized, undistort
+from jcr.camera import NORMALIZED, by_point, project, resized, unproject
 from jcr.geometry import across_lines, inverse, retract, rotation_exp, skew, transform
 from jcr.records import Intrinsics, Reconstruction
 
@@ -76,7 +76,7 @@ def _features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> _Features:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return _Features(undistort(resized(lens, *size), np.array([point.pt for point in points])), root)
+    return _Features(unproject(resized(lens, *size), np.array([point.pt for point in points]))[:, :2], root)
 
 
 def _located(
@@ -143,7 +143,7 @@ def _triangulated(
         point = np.linalg.solve(normal, right[..., None])[..., 0]
         in_camera = np.einsum("cji,cj->ci", rotation, point[feature] - center)
         ahead = in_camera[:, 2] > 1e-6
-        miss = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] - seen
+        miss = project(NORMALIZED, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0])) - seen
         kept = ahead & (np.linalg.norm(miss, axis=1) < gate)
         squared = (in_camera**2).sum(1)
         weight = 1 / np.maximum(squared, 1e-2 * np.median(squared)) if len(squared) else weight
@@ -170,11 +170,8 @@ def _refined(
     for _ in range(15):
         rotation, arm = recon_from_camera[:3, :3], points - recon_from_camera[:3, 3]
         x = arm @ rotation
-        miss = x[:, :2] / x[:, 2:] - rays
-        by_point = np.zeros((len(x), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / x[:, 2]
-        by_point[:, :, 2] = -x[:, :2] / x[:, 2:] ** 2
-        turned = by_point @ rotation.T
+        miss = project(NORMALIZED, x) - rays
+        turned = by_point(NORMALIZED, x) @ rotation.T
         told = np.linalg.inv(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2))
         squared = np.einsum("ki,kij,kj->k", miss, told, miss)
         sigma = max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
