@@ -20,8 +20,8 @@ from jcr.capture.extras import extra
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
-from jcr.geometry import rotation_between_deg, transform
-from jcr.records import ARM, Capture
+from jcr.geometry import ARM, rotation_between_deg, transform
+from jcr.records import Capture
 from jcr.simulate.problem import disturbed
 
 CAPTURE = Path("examples/tabletop")

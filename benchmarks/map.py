@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from jcr.camera import rays
+from jcr.camera import project, rays
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
@@ -391,9 +391,10 @@ def _seen(truth: Truth, x_in_base: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]
     """Which free places lie before what a camera's pixel shows."""
     seen, camera = np.zeros(len(x_in_base), bool), truth.intrinsics
     for k, camera_from_base in enumerate(inverse(truth.base_from_camera)):
-        x, y, z = apply(camera_from_base, x_in_base).T
+        x_in_camera = apply(camera_from_base, x_in_base)
+        z = x_in_camera[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            column, row = np.round(camera.fx * x / z + camera.cx), np.round(camera.fy * y / z + camera.cy)
+            column, row = np.round(project(camera, x_in_camera)).T
         ahead = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depth = true_depth(truth, k)[row[ahead].astype(int), column[ahead].astype(int)]
         seen[np.flatnonzero(ahead)[z[ahead] < depth]] = True

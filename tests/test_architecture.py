@@ -9,24 +9,26 @@ SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"errors"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},
-    {"information"},
+    {"camera"},
+    {"handeye"},
     {"capture"},
     {"reconstruct"},
-    {"calibrate"},
+    {"calibration"},
     {"represent", "segment"},
     {"export"},
-    {"simulate", "results"},
-    {"train"},
-    {"report"},
-    {"auto", "check", "live"},
+    {"simulate"},
+    {"attempts", "check", "live"},
+    {"run_folder"},
+    {"results"},
+    {"mapping", "report"},
     {"pipeline"},
     {"batch", "verify"},
-    {"bench", "view"},
+    {"view"},
     {"cli"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-TORCH_ROOMS = {"reconstruct", "represent", "segment", "bench", "train"}
+TORCH_ROOMS = {"reconstruct", "represent", "segment"}
 
 
 def imports(file: Path) -> list[str]:

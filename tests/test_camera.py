@@ -1,19 +1,30 @@
-"""The lens: distortion against OpenCV, its inverse, where it folds over, the half pixels of resampling."""
+"""The camera: distortion against OpenCV, its inverse and derivatives, folds, the half pixels of resampling."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes
 
 from jcr.camera import (
-    distort,
+    NORMALIZED,
+    PARAMETERS,
+    by_parameters,
+    by_point,
+    cropped,
     fold_distance_px,
+    parameters,
     pinhole_inside,
+    project,
     rays,
     resized,
-    undistort,
     undistort_image,
+    unproject,
+    with_parameters,
+    zoomed,
 )
 from jcr.records import Intrinsics
 
@@ -23,20 +34,118 @@ PINCUSHION = Intrinsics(500.0, 500.0, 310.0, 245.0, 640, 480, (0.15, 0.05, -0.00
 FOLDING = Intrinsics(898.3, 901.1, 649.4, 362.5, 1280, 720, (0.0119, 0.7232, 0.00036, -0.00038, -2.4673))
 """A published calibration of a real camera: points near the corners had no weight in it."""
 
+repeatable = settings(derandomize=True, deadline=None, max_examples=40)
+
+
+def between(low: float, high: float):
+    """Numbers of a camera."""
+    return st.floats(low, high, allow_subnormal=False)
+
+
+@st.composite
+def cameras(draw) -> Intrinsics:
+    """Cameras whose distortion, if any, is too weak to fold over at the radii (up to 0.9) in their images."""
+    width, height = draw(st.integers(64, 2000)), draw(st.integers(48, 1500))
+    focal = draw(between(0.8, 2.0)) * max(width, height)
+    cx, cy = ((side - 1) / 2 + draw(between(-0.05, 0.05)) * side for side in (width, height))
+    k1, k2, k3 = draw(between(-0.1, 0.3)), draw(between(0, 0.1)), draw(between(0, 0.02))
+    p1, p2 = draw(between(-2e-3, 2e-3)), draw(between(-2e-3, 2e-3))
+    distortion = draw(st.sampled_from([(0.0,) * 5, (k1, k2, p1, p2, k3)]))
+    return Intrinsics(focal, focal * draw(between(0.9, 1.1)), cx, cy, width, height, distortion)
+
+
+def pixels(draw, camera: Intrinsics) -> np.ndarray:
+    """A batch of pixels of any shape, anywhere in the image."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = draw(array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4))
+    return rng.uniform([-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5], (*shape, 2))
+
+
+@repeatable
+@given(st.data(), cameras(), between(0.05, 20))
+def test_projection_undoes_unprojection_at_every_depth(data, camera, depth):
+    x_px = pixels(data.draw, camera)
+    ray = unproject(camera, x_px)
+    assert ray.shape == (*x_px.shape[:-1], 3) and (ray[..., 2] == 1).all()
+    np.testing.assert_allclose(project(camera, depth * ray), x_px, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(unproject(camera, project(camera, depth * ray)), ray, rtol=0, atol=1e-10)
+
+
+@repeatable
+@given(st.data(), cameras())
+def test_derivatives_are_those_of_differences(data, camera):
+    x = unproject(camera, pixels(data.draw, camera)) * data.draw(between(0.2, 3.0))
+    analytic, step = by_point(camera, x), 1e-6
+    for k in range(3):
+        ahead, behind = (project(camera, x + sign * step * np.eye(3)[k]) for sign in (1, -1))
+        np.testing.assert_allclose(
+            analytic[..., k], (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-4 * camera.fx
+        )
+    analytic, at = by_parameters(camera, x), parameters(camera)
+    for k in range(len(PARAMETERS)):
+        size = step * max(abs(at[k]), 1.0)
+        ahead, behind = (
+            project(with_parameters(camera, at + sign * size * np.eye(9)[k]), x) for sign in (1, -1)
+        )
+        np.testing.assert_allclose(
+            analytic[..., k], (ahead - behind) / (2 * size), rtol=1e-6, atol=1e-6 * camera.fx
+        )
+    assert with_parameters(camera, at) == camera
+
+
+@repeatable
+@given(st.data(), cameras(), st.integers(1, 3000), st.integers(1, 3000), between(0.1, 5))
+def test_resized_cropped_and_zoomed_images_show_the_same_point(data, camera, width, height, factor):
+    x = unproject(camera, pixels(data.draw, camera))
+    x_px = project(camera, x)
+    ratio = np.array([width, height]) / [camera.width, camera.height]
+    small = resized(camera, width, height)
+    np.testing.assert_allclose(project(small, x), (x_px + 0.5) * ratio - 0.5, rtol=0, atol=1e-7 * width)
+    np.testing.assert_allclose(
+        parameters(resized(small, camera.width, camera.height)), parameters(camera), rtol=1e-12, atol=1e-9
+    )
+    left, top = width - 1500, height - 1500
+    cut = cropped(camera, left, top, 320, 240)
+    np.testing.assert_allclose(project(cut, x), x_px - [left, top], rtol=0, atol=1e-8)
+    assert (cut.width, cut.height) == (320, 240)
+    centre = [camera.cx, camera.cy]
+    np.testing.assert_allclose(
+        project(zoomed(camera, factor), x) - centre, factor * (x_px - centre), atol=1e-7
+    )
+
+
+@settings(repeatable, max_examples=15)
+@given(cameras())
+def test_a_distortion_folds_where_its_slope_vanishes(camera):
+    folding = replace(camera, distortion=(-0.5, 0.0, 0.0, 0.0, 0.0))
+    fold = fold_distance_px(folding)
+    # r(1 - r²/2) is largest at r² = 2/3; the smaller focal length meets it first.
+    expected = min(camera.fx, camera.fy) * (2 / 3) ** 1.5
+    corners = np.array([[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)])
+    farthest = np.linalg.norm(corners - [camera.cx, camera.cy], axis=1).max()
+    assert fold is None if farthest < expected else fold is None or fold > 0.99 * expected
+    assert fold is not None or farthest < max(camera.fx, camera.fy) * (2 / 3) ** 1.5 + 1
+
+
+def test_float32_stays_float32():
+    x = np.array([[0.1, 0.2, 1.0]], np.float32)
+    assert project(WIDE, x).dtype == by_point(WIDE, x).dtype == by_parameters(WIDE, x).dtype == np.float32
+    np.testing.assert_allclose(project(NORMALIZED, x), x[:, :2])
+
 
 @pytest.mark.parametrize("lens", [WIDE, BARREL, PINCUSHION, FOLDING])
 def test_distortion_is_opencvs(lens: Intrinsics) -> None:
     x = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
     points = np.concatenate([x, np.ones((200, 1))], axis=1)
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))[0]
-    np.testing.assert_allclose(distort(lens, x), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(project(lens, points), expected[:, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("lens", [WIDE, BARREL, PINCUSHION])
 def test_every_pixel_of_the_frame_has_its_ray(lens: Intrinsics) -> None:
     u, v = np.meshgrid(np.linspace(-0.5, lens.width - 0.5, 33), np.linspace(-0.5, lens.height - 0.5, 25))
     x_px = np.stack([u, v], axis=-1)
-    np.testing.assert_allclose(distort(lens, undistort(lens, x_px)), x_px, atol=1e-8)
+    np.testing.assert_allclose(project(lens, unproject(lens, x_px)), x_px, atol=1e-8)
     assert fold_distance_px(lens) is None
 
 
@@ -71,8 +180,7 @@ def test_pinhole_grid_stays_inside_the_frame_and_touches_it(lens: Intrinsics) ->
     assert max(pinhole.width, pinhole.height) == 320
     edges = [-0.5, pinhole.width - 0.5], [-0.5, pinhole.height - 0.5]
     u, v = np.meshgrid(np.linspace(*edges[0], 50), np.linspace(*edges[1], 50))
-    x = np.stack([(u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy], axis=-1)
-    x_px = distort(lens, x)
+    x_px = project(lens, unproject(pinhole, np.stack([u, v], axis=-1)))
     room = np.minimum(x_px + 0.5, [lens.width - 0.5, lens.height - 0.5] - x_px)
     assert room.min() > -0.01
     assert room.min() < 0.5
@@ -90,7 +198,7 @@ def test_resampled_pixels_show_what_their_rays_see(factor: int) -> None:
     image = np.stack([u, v, 255 - u], axis=-1).astype(np.uint8)  # every pixel says where it is
     pinhole = pinhole_inside(lens, 252 // factor)
     seen = undistort_image(image, lens, pinhole).astype(float)
-    expected = distort(lens, rays(pinhole)[..., :2])
+    expected = project(lens, rays(pinhole))
     difference = (seen[..., :2] - expected)[2:-2, 2:-2]
     assert np.abs(difference.mean((0, 1))).max() < 0.05
     assert np.abs(difference).max() < 0.6

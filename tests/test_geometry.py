@@ -1,35 +1,122 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 
 from jcr.errors import InputError
 from jcr.geometry import (
+    ARM,
+    adjoint,
     apply,
     apply_similarity,
     fit_similarity,
     inverse,
+    motion_length,
     nearest_rotation,
+    nearest_to_lines,
     require_rigid,
+    retract,
     rotation_between_deg,
     rotation_exp,
     rotation_log,
+    step_axes,
+    step_between,
     transform,
+    twist_from_step,
 )
 
+repeatable = settings(derandomize=True, deadline=None, max_examples=60)
 unit = st.floats(-1, 1, allow_nan=False)
 angle = st.one_of(
     st.sampled_from([0.0, 1e-12, 1e-7, np.pi - 1e-7, np.pi - 1e-12, np.pi]), st.floats(0, np.pi)
 )
+axis = st.tuples(unit, unit, unit).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
+rotation_vector = st.builds(lambda v, theta: theta * v / np.linalg.norm(v), axis, angle)
+rigid = st.builds(
+    lambda w, t: transform(rotation_exp(w), 3.0 * np.array(t)), rotation_vector, st.tuples(unit, unit, unit)
+)
+batch = array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3)
 
 
-@given(st.tuples(unit, unit, unit).filter(lambda v: np.linalg.norm(v) > 0.1), angle)
-def test_log_inverts_exp_from_zero_to_pi(axis, theta):
-    vector = theta * np.array(axis) / np.linalg.norm(axis)
+def steps(shape: tuple[int, ...], largest: float = 1.7):
+    """Steps (...,6) whose rotations stay below a half turn: √3 · 1.7 < π."""
+    return arrays(np.float64, (*shape, 6), elements=st.floats(-largest, largest, allow_subnormal=False))
+
+
+@repeatable
+@given(rotation_vector)
+def test_log_inverts_exp_from_zero_to_pi(vector):
     rotation = rotation_exp(vector)
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.allclose(rotation_exp(rotation_log(rotation)), rotation, atol=1e-9)
-    assert np.isclose(np.linalg.norm(rotation_log(rotation)), theta, atol=1e-7)
+    assert np.isclose(np.linalg.norm(rotation_log(rotation)), np.linalg.norm(vector), atol=1e-7)
+
+
+@repeatable
+@given(rigid, rigid, rigid)
+def test_rigid_transforms_are_a_group(a, b, c):
+    assert np.allclose((a @ b) @ c, a @ (b @ c), atol=1e-12)
+    assert np.allclose(a @ inverse(a), np.eye(4), atol=1e-12)
+    assert np.allclose(inverse(a @ b), inverse(b) @ inverse(a), atol=1e-12)
+    assert np.allclose(adjoint((a @ b)[None]), adjoint(a[None]) @ adjoint(b[None]), atol=1e-11)
+    assert np.isclose(motion_length(a), motion_length(inverse(a)), rtol=0, atol=1e-6)
+
+
+@repeatable
+@given(rigid, rigid)
+def test_a_step_leads_from_any_transform_to_any_other(start, goal):
+    step = step_between(start, goal)
+    assert np.linalg.norm(step[3:]) < np.pi + 1e-12
+    assert np.allclose(retract(start, step), goal, atol=1e-9)
+    assert np.allclose(step_between(start, start), 0, atol=1e-12)
+    assert np.isclose(
+        motion_length(inverse(start) @ goal), np.linalg.norm(step[:3]) + ARM * np.linalg.norm(step[3:])
+    )
+
+
+@repeatable
+@given(st.data(), batch, rigid)
+def test_retract_is_undone_for_every_shape_of_batch(data, shape, start):
+    step = data.draw(steps(shape))
+    there = retract(np.broadcast_to(start, (*shape, 4, 4)), step)
+    assert there.shape == (*shape, 4, 4)
+    assert np.allclose(there, retract(start, step), atol=0)
+    assert np.allclose(step_between(start, there), step, atol=1e-9)
+
+
+@repeatable
+@given(rigid, steps((), 1e-4), axis)
+def test_a_step_moves_points_as_its_twist_and_its_motion_in_other_axes_do(a_from_b, step, x_in_b):
+    here, there = (apply(pose, x_in_b) for pose in (a_from_b, retract(a_from_b, step)))
+    twist = twist_from_step(a_from_b) @ step
+    assert np.allclose(there - here, twist[:3] + np.cross(twist[3:], here), atol=1e-7)
+    rotation = a_from_b[:3, :3]
+    on_the_right = step_axes(rotation.T) @ step
+    assert np.allclose(adjoint(a_from_b[None])[0] @ on_the_right, twist, atol=1e-12)
+
+
+@repeatable
+@given(rigid, st.data(), st.integers(2, 6))
+def test_the_point_where_lines_meet_is_found(a_from_b, data, count):
+    origin = data.draw(arrays(np.float64, (count, 3), elements=st.floats(-1, 1)))
+    target = np.array([0.3, -0.2, 2.5])
+    towards = target - origin
+    direction = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    spread = np.linalg.svd(direction, compute_uv=False)[1]
+    found = nearest_to_lines(origin, direction)
+    assert np.isfinite(found).all()
+    if spread > 0.1:
+        assert np.allclose(found, target, atol=2e-3)
+    moved = nearest_to_lines(apply(a_from_b, origin), direction @ a_from_b[:3, :3].T)
+    if spread > 0.1:
+        assert np.allclose(moved, apply(a_from_b, found), atol=3e-3)
+
+
+def test_the_point_nearest_to_skew_lines_is_halfway_between_them():
+    origin = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [[5.0, 1.0, 0.0], [0.0, 1.0, 4.0]]])
+    direction = np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), (2, 1, 1))
+    assert np.allclose(nearest_to_lines(origin, direction), [[0.0, 0.0, 0.5], [0.0, 1.0, 2.0]], atol=1e-4)
 
 
 def test_inverse_undoes_a_batch():
@@ -49,6 +136,36 @@ def test_similarity_is_recovered_exactly_and_ignores_zero_weights():
     assert np.allclose(found, a_from_b, atol=1e-9)
     assert found_scale == pytest.approx(scale, abs=1e-9)
     assert np.allclose(apply(found, found_scale * x_in_b[1:]), x_in_a[1:], atol=1e-9)
+
+
+@repeatable
+@given(st.data(), batch)
+def test_similarities_of_a_batch_are_those_one_by_one(data, shape):
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    x_in_a, x_in_b = rng.normal(size=(2, *shape, 7, 3))
+    weights = rng.uniform(size=(*shape, 7))
+    a_from_b, scale = fit_similarity(x_in_a, x_in_b, weights)
+    assert a_from_b.shape == (*shape, 4, 4) and np.shape(scale) == shape
+    for at in np.ndindex(shape):
+        one, own_scale = fit_similarity(x_in_a[at], x_in_b[at], weights[at])
+        assert np.allclose(a_from_b[at], one, atol=1e-12)
+        assert np.asarray(scale)[at] == pytest.approx(own_scale, rel=1e-12)
+
+
+@repeatable
+@given(rigid, rigid, st.floats(0.01, 100))
+def test_a_similarity_of_either_side_is_found_again(a_from_b, moved, factor):
+    x_in_b = np.random.default_rng(2).normal(size=(9, 3))
+    x_in_a = apply_similarity(a_from_b, factor, x_in_b)
+    found, scale = fit_similarity(x_in_a, x_in_b)
+    assert np.allclose(found, a_from_b, atol=1e-9) and scale == pytest.approx(factor, rel=1e-9)
+    there, same = fit_similarity(apply(moved, x_in_a), x_in_b)
+    assert np.allclose(there, moved @ a_from_b, atol=1e-9) and same == pytest.approx(factor, rel=1e-9)
+
+
+def test_points_without_weight_have_no_extent_and_no_infinity():
+    found, scale = fit_similarity(np.ones((4, 3)), np.ones((4, 3)), np.zeros(4))
+    assert scale == 1.0 and np.isfinite(found).all()
 
 
 def test_nearest_rotation_of_a_reflection_is_proper():

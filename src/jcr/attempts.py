@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.stage import CalibrateOptions, calibrate, missed_m
 from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
@@ -96,8 +96,7 @@ class _Tried:
     @property
     def missed_m(self) -> float:
         """Error on images left out; infinite where there were too few to leave one out."""
-        held_out = None if self.hand_eye is None else self.hand_eye.held_out
-        return float("inf") if held_out is None else held_out.missed_m
+        return missed_m(None if self.hand_eye is None else self.hand_eye.held_out)
 
     def told(self) -> str:
         """The back end, and its error on images left out."""

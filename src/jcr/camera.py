@@ -1,7 +1,9 @@
-"""The lens: OpenCV's five-coefficient distortion, whether it has an inverse over the frame, and undistortion.
+"""The one camera model: projection and its derivatives, its inverse, resizing and cropping, undistorted images.
 
-Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5].
-Model and coefficients: OpenCV, "Camera Calibration and 3D Reconstruction".
+OpenCV's pinhole with five distortion coefficients ("Camera Calibration and 3D Reconstruction"). What a distortion does
+to rays stands in `_distorted`, `_slopes` and `_by_coefficients` alone: another model is another branch of these three
+and longer `parameters`, and no caller knows. Pixel (0, 0) is the centre of the top-left pixel, so an image of width w
+spans [-0.5, w - 0.5]. Arrays keep their precision: float32 points give float32 pixels.
 """
 
 from dataclasses import replace
@@ -17,54 +19,121 @@ from jcr.records import Intrinsics
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
+"""Its pixels are x/z, y/z."""
+Coordinate = Float[ndarray, "*batch"] | np.floating
 _WIDEST_TANGENT = 10.0
 """Rays farther than 84° from the optical axis are beyond this model."""
 
 
-def distort(lens: Intrinsics, x_normalized: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 2"]:
-    """Pixels (...,2) of rays (x/z, y/z) (...,2)."""
-    k1, k2, p1, p2, k3 = lens.distortion
-    x, y = x_normalized[..., 0], x_normalized[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            lens.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + lens.cx,
-            lens.fy * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)) + lens.cy,
-        ],
-        axis=-1,
-    )
+def parameters(camera: Intrinsics) -> Float[ndarray, "9"]:
+    """The camera as a vector in the order of PARAMETERS."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
-def undistort(lens: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 2"]:
-    """Rays (x/z, y/z) (...,2) of pixels (...,2): Newton's method, exact where the lens does not fold over."""
-    target = (x_px - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
-    unit = replace(lens, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
-    x = target
-    for _ in range(30):
-        error = distort(unit, x) - target
+def with_parameters(camera: Intrinsics, values: Float[ndarray, "9"]) -> Intrinsics:
+    """A camera of the same image size with `values` in the order of PARAMETERS."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))
+
+
+def is_distorted(camera: Intrinsics) -> bool:
+    """Whether straight lines are not straight in its images."""
+    return any(camera.distortion)
+
+
+def without_distortion(camera: Intrinsics) -> Intrinsics:
+    """The pinhole with the same focal lengths and principal point."""
+    return replace(camera, distortion=NO_DISTORTION)
+
+
+def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
+    """Pixels (...,2) of points (...,3) in front of the camera; of others nothing that means anything."""
+    x, y, z = x_in_camera[..., 0], x_in_camera[..., 1], x_in_camera[..., 2]
+    if is_distorted(camera):
+        x, y = _distorted(camera, x / z, y / z)
+        return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=-1)
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
+
+
+def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
+    """Directions (...,3) with z = 1 of pixels (...,2): by Newton's method, exact where no distortion folds over."""
+    target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    found = target
+    for _ in range(30 if is_distorted(camera) else 0):
+        x, y = found[..., 0], found[..., 1]
+        error = np.stack(_distorted(camera, x, y), axis=-1) - target
         if np.abs(error).max(initial=0.0) < 1e-13:
             break
-        x = x - np.linalg.solve(_jacobian(lens, x), error[..., None])[..., 0]
-    return x
+        by_x, cross, by_y = _slopes(camera, x, y)
+        slopes = np.stack([by_x, cross, cross, by_y], axis=-1).reshape(*x.shape, 2, 2)
+        found = found - np.linalg.solve(slopes, error[..., None])[..., 0]
+    return np.concatenate([found, np.ones_like(found[..., :1])], axis=-1)
 
 
-def _jacobian(lens: Intrinsics, x_normalized: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 2 2"]:
-    """Derivative of the distorted by the undistorted normalised coordinates."""
-    k1, k2, p1, p2, k3 = lens.distortion
-    x, y = x_normalized[..., 0], x_normalized[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-    mixed = slope * x * y + 2 * (p1 * x + p2 * y)
-    out = np.empty((*x.shape, 2, 2))
-    out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    out[..., 0, 1] = out[..., 1, 0] = mixed
+def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2 3"]:
+    """Derivatives of `project` by the point."""
+    depth = x_in_camera[..., 2]
+    x, y = x_in_camera[..., 0] / depth, x_in_camera[..., 1] / depth
+    by_x, cross, by_y = _slopes(camera, x, y)
+    out = np.empty((*x.shape, 2, 3), x.dtype)
+    out[..., 0, 0], out[..., 0, 1] = camera.fx * by_x / depth, camera.fx * cross / depth
+    out[..., 1, 0], out[..., 1, 1] = camera.fy * cross / depth, camera.fy * by_y / depth
+    out[..., 2] = -(out[..., 0] * x[..., None] + out[..., 1] * y[..., None])
     return out
 
 
-@lru_cache(maxsize=64)  # every stage asks for the same lens
+def by_parameters(
+    camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]
+) -> Float[ndarray, "*batch 2 9"]:
+    """Derivatives of `project` by the camera's parameters, in the order of PARAMETERS."""
+    x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
+    out = np.zeros((*x.shape, 2, 9), x.dtype)
+    out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
+    out[..., 0, 2] = out[..., 1, 3] = 1.0
+    by_coefficients = _by_coefficients(camera, x, y)
+    out[..., 0, 4:], out[..., 1, 4:] = camera.fx * by_coefficients[0], camera.fy * by_coefficients[1]
+    return out
+
+
+def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+    """Where rays (x, y, 1) go before focal lengths and principal point."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+    )
+
+
+def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
+    """Derivatives of `_distorted`: of its x by x, of either by the other (they are equal), of its y by y."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    return (
+        radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
+        slope * x * y + 2 * (p1 * x + p2 * y),
+        radial + slope * y * y + 6 * p1 * y + 2 * p2 * x,
+    )
+
+
+def _by_coefficients(
+    camera: Intrinsics, x: Coordinate, y: Coordinate
+) -> tuple[Float[ndarray, "*batch 5"], Float[ndarray, "*batch 5"]]:
+    """Derivatives (...,5) of `_distorted`'s x and y by the coefficients of the camera's distortion."""
+    r2, xy = x * x + y * y, 2 * x * y
+    powers = r2, r2**2, r2**3
+    return (
+        np.stack([x * powers[0], x * powers[1], xy, r2 + 2 * x * x, x * powers[2]], axis=-1),
+        np.stack([y * powers[0], y * powers[1], r2 + 2 * y * y, xy, y * powers[2]], axis=-1),
+    )
+
+
+@lru_cache(maxsize=64)  # every stage asks for the same camera
 def fold_distance_px(lens: Intrinsics) -> float | None:
     """How far from the principal point the distortion folds over inside the frame; None when it never does.
 
@@ -72,14 +141,14 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     before, two rays share one pixel and the pixels beyond have no ray at all.
     """
     edges = np.array([[-0.5, -0.5], [lens.width - 0.5, lens.height - 0.5]])
-    (left, top), (right, bottom) = (edges - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+    (left, top), (right, bottom) = unproject(without_distortion(lens), edges)[:, :2]
     to_corners = np.arctan2([top, top, bottom, bottom], [left, right, left, right])
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
-    radius = np.linspace(0, _WIDEST_TANGENT, 4001)
-    rays = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    slope = _jacobian(lens, rays)
-    folded = slope[..., 0, 0] * slope[..., 1, 1] <= slope[..., 0, 1] * slope[..., 1, 0]
-    x_px = distort(lens, rays)
+    radius = np.linspace(0, _WIDEST_TANGENT, 4001)[:, None]
+    ray = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones((4001, len(angle)))], axis=-1)
+    by_x, cross, by_y = _slopes(lens, ray[..., 0], ray[..., 1])
+    folded = by_x * by_y <= cross * cross
+    x_px = project(lens, ray)
     outside = ((x_px < -0.5) | (x_px > [lens.width - 0.5, lens.height - 0.5])).any(-1)
     # A ray that is still in the frame at the widest angle counts as folded there.
     first_folded, first_outside = (
@@ -103,7 +172,7 @@ def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, 
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
         "calibrate the lens again with points out to the corners, or give zero distortion"
     )
-    return replace(lens, distortion=NO_DISTORTION), (note,)
+    return without_distortion(lens), (note,)
 
 
 def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:
@@ -120,6 +189,16 @@ def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:
     )
 
 
+def cropped(camera: Intrinsics, left: int, top: int, width: int, height: int) -> Intrinsics:
+    """The same camera with `width` x `height` pixels cut out of its image, from column `left` and row `top` on."""
+    return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
+
+
+def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
+    """The same camera with both focal lengths multiplied."""
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
 def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
     """The largest undistorted pinhole grid whose every pixel lies in the frame, its long side as asked.
 
@@ -132,8 +211,8 @@ def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
         corners = np.clip(np.stack([centre - reach, centre + reach]), *corners)
     (u0, v0), (u1, v1) = corners
     u, v = np.linspace(u0, u1, 100), np.linspace(v0, v1, 100)
-    left, right = (undistort(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
-    top, bottom = (undistort(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
+    left, right = (unproject(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
+    top, bottom = (unproject(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
     x0, x1 = float(left.max()), float(right.min())
     y0, y1 = float(top.max()), float(bottom.min())
     scale = long_side_px / max((x1 - x0) * lens.fx, (y1 - y0) * lens.fy)
@@ -145,8 +224,7 @@ def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
 def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
     """Directions with z = 1 of every pixel of an undistorted grid, in the camera frame."""
     u, v = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
-    x, y = (u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
+    return unproject(pinhole, np.stack([u, v], axis=-1).astype(np.float64))
 
 
 def undistort_image(
@@ -155,7 +233,7 @@ def undistort_image(
     """The image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
     factor = max(1, round(lens.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
-    u, v = np.moveaxis(distort(lens, rays(fine)[..., :2]).astype(np.float32), -1, 0)
+    u, v = np.moveaxis(project(lens, rays(fine)).astype(np.float32), -1, 0)
     # In whole grey levels, averages of two by two would all be rounded up from a half.
     resampled = cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     small = cv2.resize(resampled, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)

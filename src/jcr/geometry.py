@@ -2,9 +2,13 @@
 
 `a_from_b` is a (...,4,4) float64 matrix that maps b coordinates to a: `x_in_a = a_from_b · x_in_b`.
 Scale never hides in a 4x4: a similarity is a rigid `a_from_b` and a scale that is applied first.
+
+Steps, errors and covariances of an `a_from_b` are those of `retract`, everywhere: (v, w), both in the axes of a, with
+t ← t + v and R ← exp(w) R. v moves the origin of b whatever w is, which keeps the two parts of different units apart.
 """
 
 import warnings
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +25,12 @@ HUGE = 1e15
 """No length or reconstruction has larger numbers, and sums of their squares stay far from overflow."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of RᵀR − I accepted as rounding; transforms printed with four digits pass."""
+TINY = 1e-300
+"""Keeps 0 / 0 from being asked; no sum of squares of lengths is as small."""
+ARM = 0.3
+"""m. Where a length and an angle (rad) are counted together, the angle counts at this arm: 0.1 mm weighs as 0.02°."""
+PARALLEL = 1e-6
+"""Keeps the point nearest to lines finite where they are parallel, and meet anywhere along them."""
 
 
 def rotation_exp(rotation_vector: Vectors) -> Rotations:
@@ -65,6 +75,45 @@ def inverse(a_from_b: Transforms) -> Transforms:
     return transform(rotation_t, -(rotation_t @ a_from_b[..., :3, 3:])[..., 0])
 
 
+def retract(
+    a_from_b: Float[ndarray, "*#batch 4 4"], step: Float[ndarray, "*#batch 6"]
+) -> Float[ndarray, "... 4 4"]:
+    """Transforms (...,4,4) after steps (...,6) as this module defines them: t + v, exp(w) R."""
+    return transform(
+        rotation_exp(step[..., 3:]) @ a_from_b[..., :3, :3], a_from_b[..., :3, 3] + step[..., :3]
+    )
+
+
+def step_between(
+    a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
+) -> Float[ndarray, "... 6"]:
+    """Steps (...,6) that take `a_from_b` to `target`: the inverse of `retract`, rotations up to a half turn."""
+    turn = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(turn)], axis=-1)
+
+
+def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
+    """Matrices (...,6,6) that take steps from the axes of b to those of a, by the rotations of `a_from_b`.
+
+    A motion on the right, T ← T·exp(ξ), is the step `step_axes(R) @ ξ` to first order.
+    """
+    out = np.zeros((*rotation.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    return out
+
+
+def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
+    """Matrices (...,6,6) that take steps to twists (v', w) about the origin of a, which move every point x by v' + w×x.
+
+    In twists bodies that move together move alike, so that only differences of twists show in what they see of each
+    other; v' = v + t×w.
+    """
+    out = np.zeros((*a_from_b.shape[:-2], 6, 6))
+    out[..., range(6), range(6)] = 1.0
+    out[..., :3, 3:] = skew(a_from_b[..., :3, 3])
+    return out
+
+
 def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
     """Matrices that take twists (v, ω) in b axes to a axes."""
     out = np.zeros((len(a_from_b), 6, 6))
@@ -100,16 +149,46 @@ def nearest_rotation(matrix: Rotations) -> Rotations:
 
 
 def fit_similarity(
-    x_in_a: Float[ndarray, "n 3"], x_in_b: Float[ndarray, "n 3"], weights: Float[ndarray, " n"] | None = None
-) -> tuple[Float[ndarray, "4 4"], float]:
-    """Least-squares `a_from_b` (4,4) and scale with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991)."""
-    w = np.full(len(x_in_a), 1.0 / len(x_in_a)) if weights is None else weights / weights.sum()
-    mean_a, mean_b = w @ x_in_a, w @ x_in_b
-    a, b = x_in_a - mean_a, x_in_b - mean_b
-    cross = (a * w[:, None]).T @ b
+    x_in_a: Float[ndarray, "*#batch n 3"],
+    x_in_b: Float[ndarray, "*#batch n 3"],
+    weights: Float[ndarray, "*#batch n"] | None = None,
+) -> tuple[Float[ndarray, "... 4 4"], Any]:
+    """Least-squares `a_from_b` (...,4,4) and scales (...) with x_in_a ≈ R·(scale·x_in_b) + t (Umeyama 1991).
+
+    Without a batch the scale is a float. Points of no weight or of no extent give scale 1.
+    """
+    w = np.ones(x_in_a.shape[:-1]) if weights is None else weights
+    w = w / np.maximum(w.sum(-1, keepdims=True), TINY)
+    mean_a, mean_b = (w[..., None, :] @ x for x in (x_in_a, x_in_b))
+    b = x_in_b - mean_b
+    cross = np.swapaxes((x_in_a - mean_a) * w[..., None], -1, -2) @ b
     rotation = nearest_rotation(cross)
-    scale = float(np.trace(rotation.T @ cross) / (w @ (b * b).sum(-1)))
-    return transform(rotation, mean_a - scale * rotation @ mean_b), scale
+    moment = np.einsum("...ij,...ij->...", rotation, cross)
+    scale = np.maximum(moment, TINY) / np.maximum((w * (b * b).sum(-1)).sum(-1), TINY)
+    turned = (rotation @ np.swapaxes(mean_b, -1, -2))[..., 0]
+    return transform(rotation, mean_a[..., 0, :] - scale[..., None] * turned), scale
+
+
+def across_lines(direction: Vectors) -> Rotations:
+    """Projectors (...,3,3) onto the plane at right angles to unit directions (...,3): I − d dᵀ.
+
+    They are what lines tell of the point nearest to them: Σ (I − d dᵀ) x = Σ (I − d dᵀ) o, with o on each line.
+    """
+    return np.eye(3) - direction[..., :, None] * direction[..., None, :]
+
+
+def nearest_to_lines(
+    origin: Float[ndarray, "*#batch n 3"], direction: Float[ndarray, "*#batch n 3"]
+) -> Float[ndarray, "... 3"]:
+    """The points (...,3) nearest to n lines each, given by a point and a unit direction (...,n,3)."""
+    across = across_lines(direction)
+    normal = across.sum(-3) + PARALLEL * np.eye(3)
+    return np.linalg.solve(normal, (across @ origin[..., None]).sum(-3))[..., 0]
+
+
+def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
+    """How far motions (...,4,4) go (m): the way of the origin, and the angle at ARM."""
+    return np.linalg.norm(motion[..., :3, 3], axis=-1) + ARM * rotation_angle(motion[..., :3, :3])
 
 
 def rotation_between_deg(

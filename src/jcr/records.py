@@ -104,8 +104,8 @@ class CameraEvidence:
 
     recon_from_camera: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"]
-    """Of the cameras' twists (v, ω) in recon axes, T ← [exp(ω) R, exp(ω) c + v], camera by camera; r = 6m. The
-    recon frame is that of one of the cameras, which is therefore exact."""
+    """Of steps of the cameras (geometry.retract, recon axes), camera by camera; r = 6m. The recon frame is that of one
+    of the cameras, which is therefore exact."""
 
 
 @dataclass(frozen=True)
@@ -183,12 +183,6 @@ class NextPose:
     turned_rad: float
 
 
-REACH = 0.45
-"""m. A joint's error shows in the gripper's position as in its orientation (rad) times the reach behind it."""
-ARM = 0.3
-"""m. At which errors of orientation (rad) are added to errors of position: 0.1 mm weighs as 0.02°."""
-
-
 @dataclass(frozen=True)
 class RobotNoise:
     """One-sigma noise of the gripper poses per axis."""
@@ -209,14 +203,9 @@ class HeldOut:
     reprojection_px: float | None
     how: str
 
-    @property
-    def missed_m(self) -> float:
-        """Both errors as one length, by which calibrations can be compared."""
-        return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))
-
 
 COVARIANCE_ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "log_scale")
-"""Error of the translation in gripper axes; rotation error vector about gripper axes (R_true = exp(r)·R);
+"""The step (geometry.retract) that takes gripper_from_camera to the true one, in gripper axes: R_true = exp(r)·R;
 relative scale error (scale_true = exp(s)·scale)."""
 
 

@@ -13,7 +13,7 @@ from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.stage import CalibrateOptions, calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import rotation_log
+from jcr.geometry import step_between
 from jcr.handeye.fit import PoseFit, fit_poses
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -207,8 +207,7 @@ def _by_recalibration(
             f"cannot tell: a new calibration from these images failed ({hand_eye.warnings[0]})"
         )
     before = np.array(calibration.gripper_from_camera)
-    now = hand_eye.gripper_from_camera
-    offset = np.r_[now[:3, 3] - before[:3, 3], rotation_log(now[:3, :3] @ before[:3, :3].T)]
+    offset = step_between(before, hand_eye.gripper_from_camera)
     covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     return Verification(

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import jcr
-from jcr.camera import distort, undistort
+from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.cli.export import FORMATS
@@ -202,7 +202,7 @@ def test_camera_info_is_what_image_proc_reads():
     seen, _ = cv2.projectPoints(
         x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")
     )
-    np.testing.assert_allclose(seen[0, 0], distort(lens, x[0, :2]), atol=1e-9)
+    np.testing.assert_allclose(seen[0, 0], project(lens, x[0]), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü"])
@@ -241,7 +241,7 @@ def views(tmp_path: Path) -> PosedImages:
     x_px = []
     for base_from_camera in poses:
         x = apply(inverse(base_from_camera), points)
-        x_px.append(distort(LENS, x[:, :2] / x[:, 2:]))
+        x_px.append(project(LENS, x))
     x_px = np.concatenate(x_px)
     inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
     assert inside.sum() > 100
@@ -306,7 +306,7 @@ def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
         seen = cv2.projectPoints(x, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
         x_px = views.tracks.x_px[mine]
         if undistorted:
-            rays = undistort(LENS, x_px)
+            rays = unproject(LENS, x_px)[:, :2]
             x_px = rays @ np.diag([content["fl_x"], content["fl_y"]]) + [content["cx"], content["cy"]] - 0.5
         # There the first pixel's centre is at (0.5, 0.5).
         np.testing.assert_allclose(seen, x_px + 0.5, atol=1e-6)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.geometry import inverse, rotation_exp, step_axes, step_between, transform
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.inverse_kinematics import inverse_kinematics, required_posture
 from jcr.handeye.mounting import mounted_arm
@@ -234,10 +234,8 @@ def test_error_jacobian_is_the_derivative_of_the_bent_arm(name):
         error = np.zeros(len(names))
         error[k] = step
         ends = [bent_kinematics(arm, joints, sign * error, ALL) for sign in (1, -1)]
-        position = (ends[0] - ends[1])[:, :3, 3]
-        # R_true = R_reported · exp(δ), as in equation.residuals.
-        turn = [rotation_log(np.swapaxes(reported[:, :3, :3], 1, 2) @ end[:, :3, :3]) for end in ends]
-        numeric = np.concatenate([position, turn[0] - turn[1]], axis=1) / (2 * step)
+        there, back = (step_between(reported, end) for end in ends)
+        numeric = (there - back) / (2 * step)
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=2e-9, err_msg=names[k])
 
 
@@ -246,10 +244,7 @@ def test_link_errors_with_joint_offsets_are_complete():
     arm = arm_named("ur5e")
     joints = postures(arm, 40, spread=1.0)
     _, gripper = joint_frames(arm, joints)
-    rotation = gripper[:, :3, :3]
-    # The gripper's constant: translation and rotation in its own axes.
-    constant = np.zeros((40, 6, 6))
-    constant[:, :3, :3], constant[:, 3:, 3:] = rotation, np.eye(3)
+    constant = step_axes(gripper[:, :3, :3])
     known = np.concatenate([error_jacobian(arm, joints), constant], axis=2).reshape(240, -1)
     for link in range(1, arm.dof):
         for axis in range(6):
@@ -259,9 +254,7 @@ def test_link_errors_with_joint_offsets_are_complete():
             frames = arm.parent_from_joint.copy()
             frames[link] = frames[link] @ moved
             bent = forward_kinematics(type(arm)(**{**vars(arm), "parent_from_joint": frames}), joints)
-            shift = bent[:, :3, 3] - gripper[:, :3, 3]
-            turn = rotation_log(np.swapaxes(rotation, 1, 2) @ bent[:, :3, :3])
-            effect = np.concatenate([shift, turn], axis=1).ravel() / 1e-6
+            effect = step_between(gripper, bent).ravel() / 1e-6
             left = effect - known @ np.linalg.lstsq(known, effect, rcond=1e-10)[0]
             assert np.abs(left).max() < 1e-5
 

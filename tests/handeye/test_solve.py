@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2, f
 
 import jcr
-from jcr.geometry import adjoint, inverse, rotation_between_deg, rotation_exp, scale_translation, transform
+from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.equation import residuals, residuals_by_camera
 from jcr.handeye.fit import Cues, fit_poses
@@ -173,22 +173,25 @@ def test_a_covariance_is_widened_by_what_hangs_on_the_noise_and_how_little_is_kn
     assert np.allclose(both, covariance * 7 * f.ppf(0.99, 7, 2 * nu) / chi2.ppf(0.99, 7), rtol=1e-6)
 
 
-def test_residuals_by_camera_match_finite_differences():
+def test_the_equations_jacobians_match_finite_differences():
     problem = hand_eye_problem(np.random.default_rng(10), 4, robot_noise=NOISE)
-    camera = problem.recon_from_camera
-    x = problem.gripper_from_camera
-    base_from_recon = (
-        problem.true_base_from_gripper[0] @ x @ inverse(scale_translation(camera[0], problem.scale))
-    )
-    of_all = (x, problem.scale, base_from_recon)
-    by_camera = residuals_by_camera(*of_all, camera) @ adjoint(camera)
-    for k, motion in enumerate(1e-6 * np.eye(6)):
-        ahead, behind = (
-            residuals(*of_all, problem.base_from_gripper, camera @ transform(rotation_exp(m[3:]), m[:3]))[0]
-            for m in (motion, -motion)
-        )
-        # The logarithm's derivative is one but for the size of the residuals.
-        assert np.allclose(by_camera[:, :, k], (ahead - behind) / 2e-6, atol=5e-3)
+    camera, gripper = problem.recon_from_camera, problem.base_from_gripper
+    x, scale = problem.gripper_from_camera, problem.scale
+    z = problem.true_base_from_gripper[0] @ x @ inverse(scale_translation(camera[0], scale))
+
+    def by_unknowns(step):
+        unknowns = retract(x, step[:6]), scale * np.exp(step[6]), retract(z, step[7:])
+        return residuals(*unknowns, gripper, camera)[0]
+
+    def by_cameras(step):
+        return residuals(x, scale, z, gripper, retract(camera, step))[0]
+
+    jacobian, of_camera = residuals(x, scale, z, gripper, camera)[1], residuals_by_camera(x, scale, z, camera)
+    for analytic, function in ((jacobian, by_unknowns), (of_camera, by_cameras)):
+        for k, step in enumerate(1e-6 * np.eye(analytic.shape[2])):
+            numeric = (function(step) - function(-step)) / 2e-6
+            # The logarithm's derivative is one but for the size of the residuals.
+            assert np.allclose(analytic[:, :, k], numeric, atol=5e-3)
 
 
 def test_covariance_matches_a_jackknife_over_images():

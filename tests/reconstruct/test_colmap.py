@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import distort
+from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
@@ -64,7 +64,7 @@ def _reprojection_errors(result: Reconstruction) -> Float[ndarray, "k 2"]:
     camera_from_recon = inverse(result.recon_from_camera)[tracks.image]
     x = np.einsum("kij,kj->ki", camera_from_recon[:, :3, :3], tracks.points_in_recon[tracks.point])
     x += camera_from_recon[:, :3, 3]
-    return distort(result.intrinsics, x[:, :2] / x[:, 2:]) - tracks.x_px
+    return project(result.intrinsics, x) - tracks.x_px
 
 
 def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) -> None:
@@ -139,9 +139,9 @@ def test_unknown_lens_is_found(capture: Capture) -> None:
     assert capture.intrinsics is not None
     result = reconstruct(replace(_first(capture, 5), intrinsics=None), SMALL)
     assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
-    corner = np.array([[0.4, 0.3]])
+    corner = np.array([[0.4, 0.3, 1.0]])
     np.testing.assert_allclose(
-        distort(result.intrinsics, corner), distort(capture.intrinsics, corner), atol=3
+        project(result.intrinsics, corner), project(capture.intrinsics, corner), atol=3
     )
     assert _center_errors(capture, result).max() < 1e-3
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.real import run as run_real
 from jcr.calibration.stage import calibrate
-from jcr.camera import undistort
+from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
@@ -66,8 +66,7 @@ FINE = 2
 def directions() -> np.ndarray:
     """Viewing rays of the fine samples, z = 1."""
     v, u = np.indices((FINE * LENS.height, FINE * LENS.width))
-    ray = undistort(LENS, (np.stack([u, v], -1).reshape(-1, 2) + 0.5) / FINE - 0.5)
-    return np.column_stack([ray, np.ones(len(ray))])
+    return unproject(LENS, (np.stack([u, v], -1).reshape(-1, 2) + 0.5) / FINE - 0.5)
 
 
 def photographed(sheet: np.ndarray, base_from_camera: np.ndarray, seed: int) -> np.ndarray:

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.projection import parameters, project, project_derivatives
-from jcr.geometry import apply, fit_similarity, inverse, rotation_exp, rotation_log, transform
+from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project, with_parameters
+from jcr.geometry import apply, fit_similarity, inverse, retract, step_between
 from jcr.handeye.noise import noise_share, robot_noise, widened
 from jcr.records import Intrinsics, Tracks
 
@@ -37,8 +37,7 @@ class Bundle:
     base_from_gripper: Float[ndarray, "m 4 4"]
     """Where the images say the gripper was, against the robot's word."""
     points_in_base: Float[ndarray, "p 3"]
-    camera: Float[ndarray, "9"]
-    """In the order of projection.CAMERA_PARAMETERS."""
+    camera: Intrinsics
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Adjusted:
     """As `adjust` was told it."""
     sigma_px: float
     robot_residual: Float[ndarray, "m 6"]
-    """Adjusted minus reported gripper pose: position in base axes (m), rotation in gripper axes (rad)."""
+    """Steps from the reported to the adjusted gripper poses (m, rad), base axes."""
     robot_hat: Float[ndarray, "m 6 6"]
     """Posterior covariance of those in units of the noise."""
     problem: "_Problem"
@@ -72,7 +71,7 @@ class _Problem:
     point: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
     lens: Float[ndarray, "9 c"]
-    """Free lens parameters: camera = start + lens · c."""
+    """Free parameters of the camera, which is start + lens · c in the order of camera.PARAMETERS."""
     lens_start: Float[ndarray, "9"]
     lens_std: Float[ndarray, " c"]
     rows_of_image: list[Int[ndarray, "..."]]
@@ -137,7 +136,7 @@ def adjust(
         x,
         z @ recon_scaled @ inverse(x),
         apply(z, scale * tracks.points_in_recon[kept].astype(np.float64)),
-        parameters(intrinsics),
+        intrinsics,
     )
     robot = noise or (1e-3, np.radians(0.2))
     view = _view(bundle, problem)
@@ -171,9 +170,13 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
 def _free_lens(intrinsics: Intrinsics, refine: bool) -> tuple[Float[ndarray, "9 c"], Float[ndarray, " c"]]:
     if not refine:
         return np.zeros((9, 0)), np.zeros(0)
-    lens = np.zeros((9, 5))
-    lens[0, 0], lens[1, 0] = intrinsics.fx, intrinsics.fy  # relative change of one focal length
-    lens[2, 1], lens[3, 2], lens[4, 3], lens[5, 4] = intrinsics.width, intrinsics.width, 1.0, 1.0
+    width = intrinsics.width
+    # One focal length moves by a share of itself.
+    moves = {"fx": (0, intrinsics.fx), "fy": (0, intrinsics.fy), "cx": (1, width), "cy": (2, width)}
+    moves |= {"k1": (3, 1.0), "k2": (4, 1.0)}
+    lens = np.zeros((len(PARAMETERS), 5))
+    for name, (column, unit) in moves.items():
+        lens[PARAMETERS.index(name), column] = unit
     return lens, np.array([0.5, LENS_STD["cx"], LENS_STD["cy"], LENS_STD["k1"], LENS_STD["k2"]])
 
 
@@ -213,13 +216,7 @@ def _view(bundle: Bundle, problem: _Problem) -> _View:
         points = bundle.points_in_base[problem.point[rows]]
         in_gripper[rows] = (points - gripper[i, :3, 3]) @ gripper[i, :3, :3]
     in_camera = (in_gripper - x_offset) @ x_rotation
-    return _View(in_gripper, in_camera, project(in_camera, bundle.camera) - problem.x_px)
-
-
-def _robot_residual(bundle: Bundle, reported: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 6"]:
-    adjusted = bundle.base_from_gripper
-    turned = rotation_log(np.swapaxes(reported[:, :3, :3], 1, 2) @ adjusted[:, :3, :3])
-    return np.concatenate([adjusted[:, :3, 3] - reported[:, :3, 3], turned], axis=1)
+    return _View(in_gripper, in_camera, project(bundle.camera, in_camera) - problem.x_px)
 
 
 def _sigma_px(view: _View, problem: _Problem) -> float:
@@ -245,13 +242,15 @@ def _cost(
     robot: tuple[float, float],
 ) -> float:
     seen = float(weights @ (view.residual**2).sum(1))
-    told = float(((_robot_residual(bundle, problem.reported) / np.repeat(robot, 3)) ** 2).sum())
+    told = float(
+        ((step_between(problem.reported, bundle.base_from_gripper) / np.repeat(robot, 3)) ** 2).sum()
+    )
     return seen + told + float(((_lens_step(bundle, problem) / problem.lens_std) ** 2).sum())
 
 
 def _lens_step(bundle: Bundle, problem: _Problem) -> Float[ndarray, " c"]:
     """How far the free lens parameters have moved from where they began."""
-    return np.linalg.pinv(problem.lens) @ (bundle.camera - problem.lens_start)
+    return np.linalg.pinv(problem.lens) @ (parameters(bundle.camera) - problem.lens_start)
 
 
 def _normal_equations(
@@ -264,30 +263,33 @@ def _normal_equations(
 ) -> _Normal:
     m, c = len(bundle.base_from_gripper), problem.lens.shape[1]
     shared, size = 6 + c, 6 + c + 6 * m
-    by_point, by_lens = project_derivatives(view.in_camera, bundle.camera)
     root = np.sqrt(weights)
     residual = view.residual * root[:, None]
-    by_gripper_axes = (by_point * root[:, None, None]) @ bundle.gripper_from_camera[:3, :3].T
+    x_rotation = bundle.gripper_from_camera[:3, :3]
+    by_gripper_axes = (by_point(bundle.camera, view.in_camera) * root[:, None, None]) @ x_rotation.T
     by_base_axes = np.empty_like(by_gripper_axes)
-    # X moves by (dt, ω), R_X ← exp(ω) R_X; a gripper by (dn in base axes, ρ), R_G ← R_G exp(ρ).
+    # X and the grippers move by steps of geometry.retract, in gripper and in base axes.
     common = np.empty((len(root), 2, shared))
     common[:, :, 0:3] = -by_gripper_axes
     common[:, :, 3:6] = np.cross(
         by_gripper_axes, (view.in_gripper - bundle.gripper_from_camera[:3, 3])[:, None]
     )
-    common[:, :, 6:] = (by_lens @ problem.lens) * root[:, None, None]
+    if c:
+        by_lens = by_parameters(bundle.camera, view.in_camera) @ problem.lens
+        common[:, :, 6:] = by_lens * root[:, None, None]
     own = np.empty((len(root), 2, 6))
-    own[:, :, 3:] = np.cross(by_gripper_axes, view.in_gripper[:, None])
 
     hessian, right = np.zeros((size, size)), np.zeros(size)
     for i, rows in enumerate(problem.rows_of_image):
-        by_base_axes[rows] = by_gripper_axes[rows] @ bundle.base_from_gripper[i, :3, :3].T
+        from_base = bundle.base_from_gripper[i, :3, :3].T
+        by_base_axes[rows] = by_gripper_axes[rows] @ from_base
         own[rows, :, :3] = -by_base_axes[rows]
+        own[rows, :, 3:] = np.cross(by_base_axes[rows], (view.in_gripper[rows] @ from_base)[:, None])
         block = np.concatenate([common[rows], own[rows]], axis=2).reshape(-1, shared + 6)
         columns = np.r_[0:shared, shared + 6 * i : shared + 6 * i + 6]
         hessian[np.ix_(columns, columns)] += block.T @ block
         right[columns] -= block.T @ residual[rows].ravel()
-    told = _robot_residual(bundle, problem.reported)
+    told = step_between(problem.reported, bundle.base_from_gripper)
     precision = np.repeat(np.asarray(robot) ** -2.0, 3)
     diagonal = np.arange(size)
     hessian[diagonal[shared:], diagonal[shared:]] += np.tile(precision, m)
@@ -330,13 +332,11 @@ def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
     for first, count, v, w, g in normal.point_steps:
         points[first : first + count] += np.linalg.solve(v, -(g + w @ step)[..., None])[..., 0]
     c = problem.lens.shape[1]
-    x, gripper = bundle.gripper_from_camera, bundle.base_from_gripper
-    own = step[6 + c :].reshape(-1, 6)
     return Bundle(
-        transform(rotation_exp(step[3:6]) @ x[:3, :3], x[:3, 3] + step[:3]),
-        transform(gripper[:, :3, :3] @ rotation_exp(own[:, 3:]), gripper[:, :3, 3] + own[:, :3]),
+        retract(bundle.gripper_from_camera, step[:6]),
+        retract(bundle.base_from_gripper, step[6 + c :].reshape(-1, 6)),
         points,
-        bundle.camera + problem.lens @ step[6 : 6 + c],
+        with_parameters(bundle.camera, parameters(bundle.camera) + problem.lens @ step[6 : 6 + c]),
     )
 
 
@@ -348,7 +348,7 @@ def _robot_noise(
     given: tuple[float, float] | None,
 ) -> tuple[float, float]:
     """Restricted maximum likelihood of the robot's noise, one step."""
-    told = _robot_residual(bundle, problem.reported)
+    told = step_between(problem.reported, bundle.base_from_gripper)
     m = len(told)
     spread = np.diag(covariance)[-6 * m :].reshape(m, 6)
     squares = float((told[:, :3] ** 2).sum()), float((told[:, 3:] ** 2).sum())
@@ -412,7 +412,7 @@ def _summary(
         robot,
         given,
         sigma_px,
-        _robot_residual(bundle, problem.reported),
+        step_between(problem.reported, bundle.base_from_gripper),
         hat / sigma[:, None] / sigma[None],
         problem,
         iterations,
@@ -433,7 +433,7 @@ def free_lens(
 ) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
     """The camera one Gauss-Newton step on, with its lens free and before it at `intrinsics`, and the covariance.
 
-    In the order of projection.CAMERA_PARAMETERS; the covariance is widened for an estimated noise. None where there
+    In the order of camera.PARAMETERS; the covariance is widened for an estimated noise. None where there
     are too few observations to free a lens.
     """
     problem, bundle = adjusted.problem, adjusted.bundle
@@ -448,7 +448,7 @@ def free_lens(
     step = covariance[free] @ normal.right
     gain, told = _passed_on(covariance, adjusted.noise, len(problem.reported))
     share = noise_share(gain[free], told, adjusted.noise, adjusted.given_noise)
-    return bundle.camera + lens @ step, lens @ widened(covariance[free, free], share) @ lens.T
+    return parameters(bundle.camera) + lens @ step, lens @ widened(covariance[free, free], share) @ lens.T
 
 
 def median_reprojection(
@@ -462,9 +462,3 @@ def median_reprojection(
     return np.array(
         [np.median(length[rows]) if len(rows) else np.nan for rows in adjusted.problem.rows_of_image]
     )
-
-
-def lens_of(camera: Float[ndarray, "9"], intrinsics: Intrinsics) -> Intrinsics:
-    """The adjusted camera as intrinsics of the same image size."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(v) for v in camera)
-    return replace(intrinsics, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))

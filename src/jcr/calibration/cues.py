@@ -1,10 +1,10 @@
 """What a user can measure with a ruler to replace what the motions do not show."""
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.camera import project, unproject
 from jcr.errors import InputError
 from jcr.geometry import rotation_angle
 from jcr.handeye.fit import Poses
@@ -52,10 +52,8 @@ def length_cue(
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
         raise InputError(f"--known-length: {image} is not among the registered images; choose another")
-    lens, grid = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
-    rays = cv2.undistortPoints(ends_px[:, None], lens.matrix, np.array(lens.distortion))[:, 0]
-    column = np.round(rays[:, 0] * grid.fx + grid.cx).astype(int)
-    row = np.round(rays[:, 1] * grid.fy + grid.cy).astype(int)
+    x_px = project(reconstruction.pointmap_intrinsics, unproject(reconstruction.intrinsics, ends_px))
+    column, row = np.round(x_px).astype(int).T
     height, width = reconstruction.confidence.shape[1:]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     if not inside.all() or not (reconstruction.confidence[rows[0], row, column] > 0).all():

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 from scipy.stats import chi2, f, hmean, ncf, ncx2
 
-from jcr.geometry import adjoint, rotation_exp, rotation_log, transform
+from jcr.geometry import retract, step_between
 from jcr.handeye.equation import (
     BASE_ROTATION,
     BASE_TRANSLATION,
@@ -44,7 +44,7 @@ class Drift:
     """How far the camera seems to have moved on the gripper since the calibration."""
 
     offset: Float[ndarray, "6"]
-    """Translation (m) and rotation vector (rad) in gripper axes: X_now = (exp(ω)·R, t + dt)."""
+    """The step from the calibrated gripper_from_camera to the one now (m, rad), gripper axes."""
     covariance: Float[ndarray, "6 6"]
     p_value: float
     """Of a drift like this or larger where nothing has moved."""
@@ -63,7 +63,7 @@ def drift(
     camera_covariance: Float[ndarray, "n 6 6"],
     alpha: float,
 ) -> Drift:
-    """The drift that new images show; `camera_covariance` is of motions in camera axes, on the right."""
+    """The drift that new images show; `camera_covariance` is of steps of the cameras, recon axes."""
     camera, camera_misfit = _moved_by(
         calibrated, base_from_gripper, recon_from_camera, camera_covariance, (TRANSLATION, ROTATION)
     )
@@ -113,7 +113,7 @@ def _moved_by(
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns[0] == TRANSLATION
     spread, from_old = np.linalg.inv(calibrated.hessian), calibrated.noise_share
-    start = (x if of_x else z).copy()
+    start = x if of_x else z
     n = 6 * len(base_from_gripper)
     own = np.tile(np.repeat(np.diag(np.square(calibrated.noise)), 3, axis=1), len(base_from_gripper))
     own = own[:, None] * np.eye(n)
@@ -121,7 +121,7 @@ def _moved_by(
     for _ in range(10):
         residual, jacobian = residuals(x, scale, z, base_from_gripper, recon_from_camera)
         residual = residual.ravel()
-        by_camera = residuals_by_camera(x, scale, z, recon_from_camera) @ adjoint(recon_from_camera)
+        by_camera = residuals_by_camera(x, scale, z, recon_from_camera)
         of_camera = by_camera @ camera_covariance @ np.swapaxes(by_camera, 1, 2)
         stacked = jacobian.reshape(n, 13)
         v = stacked @ spread @ stacked.T + own.sum(0) + block_diag(*of_camera)
@@ -134,11 +134,8 @@ def _moved_by(
         of_noise = gain @ (stacked @ from_old.by_log_variance @ stacked.T + own) @ gain.T
         share = NoiseShare(of_noise, from_old.log_variance_covariance)
         nu = float(hmean(directions(np.linalg.inv(normal), share)[1]))
-        moved = x if of_x else z
-        moved = transform(rotation_exp(step[3:]) @ moved[:3, :3], moved[:3, 3] + step[:3])
-        x, z = (moved, z) if of_x else (x, moved)
+        x, z = (retract(x, step), z) if of_x else (x, retract(z, step))
         if float(step @ normal @ step) < 1e-10:
             break
-    now = x if of_x else z
-    offset = np.r_[now[:3, 3] - start[:3, 3], rotation_log(now[:3, :3] @ start[:3, :3].T)]
+    offset = step_between(start, x if of_x else z)
     return (offset, np.linalg.inv(normal), nu), max(misfit, 0.0)

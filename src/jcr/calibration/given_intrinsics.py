@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.bundle import LENS_STD, Adjusted, adjust, free_lens
-from jcr.calibration.projection import CAMERA_PARAMETERS, parameters
-from jcr.geometry import rotation_log
+from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
+from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
@@ -26,7 +26,7 @@ OFF = 0.01
 OFF_CENTRE = LENS_STD["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
-CX, CY, K1, K2 = (CAMERA_PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
+CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,8 @@ def lens_doubt(
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
-    x, before = freed.bundle.gripper_from_camera, hand_eye.gripper_from_camera
     shift = np.r_[
-        x[:3, 3] - before[:3, 3],
-        rotation_log(x[:3, :3] @ before[:3, :3].T),
+        step_between(hand_eye.gripper_from_camera, freed.bundle.gripper_from_camera),
         np.log(freed.scale / hand_eye.scale),
     ]
     return LensDoubt(
@@ -85,14 +83,15 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float
         off.append(
             f"a focal length of {camera[0]:.0f} ± {significant(std[0])} px where {held.fx:.0f} is given"
         )
-    used_radius = np.linalg.norm((tracks.x_px - [held.cx, held.cy]) / [held.fx, held.fy], axis=1)
+    used_radius = np.linalg.norm(unproject(without_distortion(held), tracks.x_px)[:, :2], axis=1)
     radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
-    powers = np.stack([radius**2, radius**4])
-    bent = by[[K1, K2]] @ powers
-    bent_std = np.sqrt(np.einsum("kr,kl,lr->r", powers, covariance[np.ix_([K1, K2], [K1, K2])], powers))
-    most = int(np.abs(bent * radius).argmax())
-    if abs(bent[most]) > max(sure * bent_std[most], share * OFF):
-        px, px_std = held.fx * radius[most] * np.array([abs(bent[most]), bent_std[most]])
+    ray = np.stack([radius, 0 * radius, np.ones(9)], axis=1)
+    bends = by_parameters(held, ray)[:, 0, [K1, K2]]
+    bent_px = bends @ by[[K1, K2]]
+    bent_std_px = np.sqrt(np.einsum("rk,kl,rl->r", bends, covariance[np.ix_([K1, K2], [K1, K2])], bends))
+    most = int(np.abs(bent_px).argmax())
+    px, px_std = abs(bent_px[most]), bent_std_px[most]
+    if px > max(sure * px_std, share * OFF * held.fx * radius[most]):
         off.append(f"a distortion up to {px:.1f} ± {significant(px_std)} px from the one used")
     centre_std = std[[CX, CY]]
     if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * held.width)).any():

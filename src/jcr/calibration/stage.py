@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import Adjusted, adjust, lens_of, median_reprojection
+from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
 from jcr.calibration.words import scale_in_words
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import inverse, rotation_angle, rotation_exp, scale_translation, transform
+from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.fit import Cues, deleted_residuals
@@ -176,9 +176,14 @@ def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
     """Whether images left out are missed by less; not, where too few images tell."""
-    if one is None or other is None:
-        return False
-    return one.missed_m < other.missed_m
+    return other is not None and missed_m(one) < missed_m(other)
+
+
+def missed_m(held_out: HeldOut | None) -> float:
+    """Both errors on images left out as one length (m), by which calibrations can be compared; infinite without."""
+    if held_out is None:
+        return float("inf")
+    return float(np.hypot(1e-3 * held_out.translation_mm, ARM * np.radians(held_out.rotation_deg)))
 
 
 def _scale_checked(hand_eye: HandEye) -> HandEye:
@@ -281,28 +286,24 @@ def _refined(
     # Rejected poses are measured against where their cameras say they were.
     predicted = adjusted.base_from_recon @ scale_translation(camera, adjusted.scale) @ inverse(x)
     predicted[used] = adjusted.bundle.base_from_gripper
-    turn = np.swapaxes(gripper[:, :3, :3], 1, 2) @ predicted[:, :3, :3]
+    metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
     reprojection = np.full(len(used), np.nan)
     reprojection[used] = median_reprojection(adjusted)
     delta_t, delta_r = paper_residuals(gripper, camera, x, adjusted.scale, used)
-    before = hand_eye.gripper_from_camera
-    refinement = Refinement(
-        hand_eye,
-        float(np.linalg.norm(x[:3, 3] - before[:3, 3])),
-        float(rotation_angle(before[:3, :3].T @ x[:3, :3])),
-    )
+    moved = step_between(hand_eye.gripper_from_camera, x)
+    refinement = Refinement(hand_eye, float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])))
     return replace(
         hand_eye,
         gripper_from_camera=x,
         scale=adjusted.scale,
         base_from_recon=adjusted.base_from_recon,
         covariance=adjusted.covariance,
-        translation_residual_m=np.linalg.norm(predicted[:, :3, 3] - gripper[:, :3, 3], axis=1),
-        rotation_residual_rad=rotation_angle(turn),
+        translation_residual_m=metres,
+        rotation_residual_rad=radians,
         robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
         residual_translation=delta_t,
         residual_rotation=delta_r,
-        intrinsics=lens_of(adjusted.bundle.camera, reconstruction.intrinsics),
+        intrinsics=adjusted.bundle.camera,
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
         refinement=refinement,
@@ -317,9 +318,7 @@ def _held_out(adjusted: Adjusted) -> HeldOut | None:
     sigma = np.repeat(adjusted.noise, 3)
     missed = deleted_residuals(adjusted.robot_residual / sigma, adjusted.robot_hat) * sigma
     metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
-    gripper = adjusted.bundle.base_from_gripper
-    told = transform(gripper[:, :3, :3] @ rotation_exp(-missed[:, 3:]), gripper[:, :3, 3] - missed[:, :3])
-    pixels = median_reprojection(adjusted, told)
+    pixels = median_reprojection(adjusted, retract(adjusted.bundle.base_from_gripper, -missed))
     return HeldOut(
         1e3 * float(metres),
         float(np.degrees(radians)),

@@ -9,9 +9,8 @@ from numpy import ndarray
 from jcr.capture.checks import MIN_FRAMES
 from jcr.capture.images import BLURRED
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_angle
+from jcr.geometry import inverse, motion_length
 from jcr.handeye.equation import ASSUMED_NOISE, most_informative, pose_information
-from jcr.records import ARM
 
 STILL = 0.005
 """m/s, turning counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""
@@ -92,7 +91,7 @@ def _different(base_from_gripper: Poses, rows: Int[ndarray, " r"]) -> Rows:
     kept = rows[:0]
     for row in rows:
         motion = inverse(base_from_gripper[kept]) @ base_from_gripper[row]
-        far = np.linalg.norm(motion[:, :3, 3], axis=1) + ARM * rotation_angle(motion[:, :3, :3])
+        far = motion_length(motion)
         if (far > SAME_VIEW).all():
             kept = np.append(kept, row)
     return kept

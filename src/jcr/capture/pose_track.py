@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.geometry import inverse, rotation_angle, transform
-from jcr.records import ARM
+from jcr.geometry import inverse, motion_length, transform
 
 Stamps = Int[ndarray, " n"]
 PosesAt = Callable[[Stamps], tuple[Float[ndarray, "n 4 4"], Int[ndarray, " n"]]]
@@ -63,5 +62,4 @@ def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
     """How fast the frame moves (m/s), turning counted at ARM; ends of the recording count one side."""
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     motion = inverse(start[0]) @ end[0]
-    way = np.linalg.norm(motion[:, :3, 3], axis=1) + ARM * rotation_angle(motion[:, :3, :3])
-    return way / (2e-9 * SPEED_OVER_NS)
+    return np.asarray(motion_length(motion)) / (2e-9 * SPEED_OVER_NS)

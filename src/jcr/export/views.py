@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import distort, pinhole_inside, undistort, undistort_image
+from jcr.camera import pinhole_inside, project, undistort_image, unproject
 from jcr.capture.images import read_image
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
@@ -139,7 +139,7 @@ def _colmap_model(views: PosedImages, names: list[str], lens: Intrinsics) -> pyc
 def _undistorted_px(
     x_px: Float[ndarray, "k 2"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Float[ndarray, "k 2"]:
-    return distort(pinhole, undistort(lens, x_px))
+    return project(pinhole, unproject(lens, x_px))
 
 
 def _place_images(

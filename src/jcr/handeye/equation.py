@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_log, skew
+from jcr.geometry import inverse, skew, step_between
 
 Poses = Float[ndarray, "n 4 4"]
 TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
@@ -18,7 +18,8 @@ TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
     slice(7, 10),
     slice(10, 13),
 )
-"""Columns of the 13 unknowns; the first seven are records.COVARIANCE_ORDER."""
+"""Columns of the 13 unknowns, steps of geometry.retract of X and of base_from_recon with the log of the scale between;
+the first seven are records.COVARIANCE_ORDER."""
 
 PRIOR_STD = np.array([1.0] * 3 + [np.pi] * 3 + [5.0])
 """So weak that it only keeps what the motions cannot see finite: 1 m, π rad, a factor e⁵."""
@@ -44,14 +45,9 @@ def residuals(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 13"]]:
-    """Residuals of position (base axes) and orientation (gripper axes) and their Jacobian.
-
-    Perturbations: R_X ← exp(ω) R_X, t_X + dt, λ·exp(s), R_Z ← exp(ζ) R_Z, t_Z + dz.
-    """
+    """Steps from the reported gripper poses to the predicted ones (base axes), and their Jacobian."""
     predicted = predict(x, scale, z, recon_from_camera)
     rotation = predicted[:, :3, :3]
-    turned = rotation_log(np.swapaxes(base_from_gripper[:, :3, :3], 1, 2) @ rotation)
-    residual = np.concatenate([predicted[:, :3, 3] - base_from_gripper[:, :3, 3], turned], axis=1)
     arm = scale * recon_from_camera[:, :3, 3] @ z[:3, :3].T
     j = np.zeros((len(predicted), 6, 13))
     j[:, :3, TRANSLATION] = -rotation
@@ -59,22 +55,21 @@ def residuals(
     j[:, :3, 6] = arm
     j[:, :3, BASE_TRANSLATION] = np.eye(3)
     j[:, :3, BASE_ROTATION] = -skew(arm - rotation @ x[:3, 3])
-    j[:, 3:, ROTATION] = -np.eye(3)
-    j[:, 3:, BASE_ROTATION] = np.swapaxes(rotation, 1, 2)
-    return residual, j
+    j[:, 3:, ROTATION] = -rotation
+    j[:, 3:, BASE_ROTATION] = np.eye(3)
+    return step_between(base_from_gripper, predicted), j
 
 
 def residuals_by_camera(
     x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
 ) -> Float[ndarray, "n 6 6"]:
-    """Derivative of `residuals` by the twist (v, ω) of each camera, T ← [exp(ω) R, exp(ω) c + v]."""
+    """Derivative of `residuals` by a step of each camera."""
     base_from_recon = z[:3, :3]
-    predicted = predict(x, scale, z, recon_from_camera)[:, :3, :3]
     lever = recon_from_camera[:, :3, :3] @ x[:3, :3].T @ x[:3, 3]
-    j = np.zeros((len(predicted), 6, 6))
+    j = np.zeros((len(lever), 6, 6))
     j[:, :3, :3] = scale * base_from_recon
-    j[:, :3, 3:] = -base_from_recon @ skew(scale * recon_from_camera[:, :3, 3] - lever)
-    j[:, 3:, 3:] = np.swapaxes(predicted, 1, 2) @ base_from_recon
+    j[:, :3, 3:] = base_from_recon @ skew(lever)
+    j[:, 3:, 3:] = base_from_recon
     return j
 
 

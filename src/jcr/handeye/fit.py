@@ -16,17 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_exp, transform
-from jcr.handeye.equation import (
-    BASE_ROTATION,
-    BASE_TRANSLATION,
-    PRIOR_STD,
-    ROTATION,
-    TRANSLATION,
-    Poses,
-    residuals,
-    residuals_by_camera,
-)
+from jcr.geometry import retract
+from jcr.handeye.equation import PRIOR_STD, TRANSLATION, Poses, residuals, residuals_by_camera
 from jcr.handeye.noise import NoiseShare, noise_share, robot_noise, widened
 
 
@@ -50,7 +41,7 @@ class PoseFit:
     translation_residual: Float[ndarray, "n 3"]
     """Predicted minus reported gripper position (m), base axes; of every pose, used or not."""
     rotation_residual: Float[ndarray, "n 3"]
-    """Rotation vector from reported to predicted gripper (rad), gripper axes."""
+    """Rotation vector from reported to predicted gripper (rad), base axes."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) per axis, given or estimated."""
     noise_estimated: bool
@@ -61,7 +52,7 @@ class PoseFit:
     noise_share: NoiseShare
     """In the inverse of `hessian`."""
     missed: Float[ndarray, "n 6"]
-    """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
+    """By how much a fit without it misses each pose: translation (m) and rotation (rad), base axes."""
     missed_covariance: Float[ndarray, "n 6 6"]
     """What to expect of that, the pose's own noise included."""
 
@@ -91,8 +82,7 @@ def fit_poses(
     """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon) on the `used` poses.
 
     `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the
-    twists (v, ω) of the cameras in recon axes, T ← [exp(ω) R, exp(ω) c + v]; None where the cameras are exact
-    beside the robot.
+    cameras, as records.CameraEvidence has it; None where they are exact beside the robot.
     """
     unknowns, cues = start, cues or Cues()
     robot, dof = noise or (5e-4, np.radians(0.1)), (np.inf, np.inf)
@@ -251,8 +241,4 @@ def _prior(
 def _moved(
     x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], step: Float[ndarray, "13"]
 ) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
-    return (
-        transform(rotation_exp(step[ROTATION]) @ x[:3, :3], x[:3, 3] + step[TRANSLATION]),
-        float(scale * np.exp(step[6])),
-        transform(rotation_exp(step[BASE_ROTATION]) @ z[:3, :3], z[:3, 3] + step[BASE_TRANSLATION]),
-    )
+    return retract(x, step[:6]), float(scale * np.exp(step[6])), retract(z, step[7:])

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_angle, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import ARM, inverse, rotation_angle, rotation_exp, rotation_log, skew, transform
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian, unwrapped
-from jcr.records import ARM
 
 STARTS = 12
 STEPS = 30

@@ -11,11 +11,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_exp, transform
+from jcr.geometry import ARM, inverse, rotation_exp, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, with_tool
-from jcr.records import ARM
 
 NOISE = (1e-3, 1e-3 / ARM)
 """m, rad: differences of equal weight."""

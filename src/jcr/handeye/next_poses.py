@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_angle, rotation_exp, transform
 from jcr.handeye.equation import ASSUMED_NOISE, Poses, expected_std, most_informative, pose_information
 from jcr.records import NextPose
 
@@ -45,9 +45,7 @@ def _candidates(
     """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
     camera = base_from_gripper @ x
     axis, center = camera[:, :3, 2], camera[:, :3, 3]
-    # What was looked at: the point nearest to all optical axes.
-    across = np.eye(3) - axis[:, :, None] * axis[:, None]
-    scene = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, center), rcond=1e-3)[0]
+    scene = nearest_to_lines(center, axis)  # what was looked at
     distance = np.linalg.norm(center - scene, axis=1)
     # Parallel axes meet nowhere; the scene is then taken half a metre ahead.
     if not 0.1 < np.median(distance) < 2.0:
@@ -89,7 +87,6 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
 
 def _described(pose: Float[ndarray, "4 4"], std: Float[ndarray, "7"], existing: Poses) -> NextPose:
     motion = inverse(existing) @ pose
-    moved = np.linalg.norm(motion[:, :3, 3], axis=1)
-    turned = np.linalg.norm(rotation_log(motion[:, :3, :3]), axis=1)
-    like = int((moved + 0.3 * turned).argmin())
-    return NextPose(pose, std, like, float(moved[like]), float(turned[like]))
+    like = int(np.argmin(motion_length(motion)))
+    moved, turned = np.linalg.norm(motion[like, :3, 3]), rotation_angle(motion[like, :3, :3])
+    return NextPose(pose, std, like, float(moved), float(turned))

@@ -2,7 +2,7 @@
 
 The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
 the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
-well as it can; rotations count by an arm of 0.3 m, scale by the spread of the camera centres. It is about 0.4
+well as it can; rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4
 for general motion, and the sine of the deviation for a nearly degenerate one.
 """
 
@@ -10,12 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import skew
+from jcr.geometry import ARM, skew
 from jcr.handeye.fit import Cues, Poses
 from jcr.records import Excitation, Observability
 
-ARM = 0.3
-"""Metres per radian."""
 MIN_SPREAD = 0.1
 """Metres; camera centres closer together than this say little of scale."""
 WEAK = 0.06

@@ -27,8 +27,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_exp, skew, transform
-from jcr.records import ARM
+from jcr.geometry import ARM, rotation_exp, skew, transform
 
 Joints = Float[ndarray, "n dof"]
 Kind = Literal["joint", "link", "sag", "gear"]
@@ -157,8 +156,8 @@ def error_std(arm: Arm, sizes: ErrorSizes, kinds: Sequence[Kind] = KINDS) -> Flo
 def error_jacobian(arm: Arm, joints: Joints, kinds: Sequence[Kind] = KINDS) -> Float[ndarray, "n 6 p"]:
     """Derivative of the gripper's true pose by the arm's errors, at errors zero.
 
-    Rows as in `equation.residuals`: position (m) in base axes, rotation vector (rad) in gripper axes, so that
-    R_true = R_reported · exp(δ). Errors φ add `error_jacobian · φ` to those residuals.
+    Rows are those of `equation.residuals`, steps of geometry.retract from the reported pose (m, rad; base axes), to
+    which errors φ add `error_jacobian · φ`.
     """
     frames, gripper = joint_frames(arm, joints)
     about = _about(frames, gripper, arm.axes)
@@ -178,7 +177,6 @@ def error_jacobian(arm: Arm, joints: Joints, kinds: Sequence[Kind] = KINDS) -> F
         waves = np.stack([np.sin(joints), np.cos(joints)], -1)
         blocks["gear"] = waves[..., None] * about[:, :, None]
     columns = np.concatenate([blocks[kind].reshape(len(joints), -1, 6) for kind in kinds], axis=1)
-    columns[..., 3:] = columns[..., 3:] @ gripper[:, :3, :3]
     return np.swapaxes(columns, 1, 2)
 
 

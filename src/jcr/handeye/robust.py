@@ -13,11 +13,10 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.stats import f as f_distribution
 
-from jcr.geometry import nearest_rotation, rotation_angle
+from jcr.geometry import ARM, nearest_rotation, rotation_angle
 from jcr.handeye.closed_form import closed_form, motions, sine_axis
 from jcr.handeye.equation import predict
 from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
-from jcr.records import ARM
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.camera import undistort_image
+from jcr.camera import project, undistort_image
 from jcr.capture.images import read_image
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, scale_translation
@@ -141,9 +141,10 @@ def _pixels(
     camera_from_recon: Float[ndarray, "4 4"], x_in_recon: Float[ndarray, "n 3"], pinhole: Intrinsics
 ) -> tuple[ndarray, ndarray, ndarray, Bool[ndarray, " n"]]:
     """Nearest pixel u, v (n,), depth (n,), and whether it lies in the image (else the pixel is 0, 0)."""
-    x, y, z = apply(camera_from_recon, x_in_recon).T
+    x_in_camera = apply(camera_from_recon, x_in_recon)
+    z = x_in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = np.round(pinhole.fx * x / z + pinhole.cx), np.round(pinhole.fy * y / z + pinhole.cy)
+        u, v = np.round(project(pinhole, x_in_camera)).T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < pinhole.width) & (v < pinhole.height)
     return np.where(inside, u, 0).astype(int), np.where(inside, v, 0).astype(int), z, inside
 

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.optimize import least_squares
 
-from jcr.camera import WITHIN_FOLD, fold_distance_px
+from jcr.camera import WITHIN_FOLD, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
-from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, rotation_log, transform
+from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, rotation_log, transform
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
 from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
@@ -31,7 +31,7 @@ AMBIGUOUS = 1.5
 """A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
 LENS_IMAGES = 4
 """Fewest images of a board that determine a lens."""
-REACH = 0.4
+RISE = 0.4
 """Share of a camera's distance to the board that things beside it may rise towards the camera."""
 
 
@@ -143,8 +143,8 @@ def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
     found = []
     for k in range(count):
         turn, shift = cv2.solvePnPRefineLM(x, x_px, *camera, rotations[k], translations[k])
-        missed = cv2.projectPoints(x, turn, shift, *camera)[0].reshape(-1, 2) - x_px
         pose = transform(rotation_exp(turn.ravel()), shift.ravel())
+        missed = project(lens, apply(pose, x)) - x_px
         found.append(Pose(pose, float(np.sqrt((missed**2).sum(1).mean()))))
     found.sort(key=lambda pose: pose.rms_px)
     if not found or found[0].rms_px > WORST_PX:
@@ -201,9 +201,8 @@ def _refined(
     camera = lens.matrix, np.array(lens.distortion)
 
     def posed(unknowns: Float[ndarray, " u"]) -> tuple[ndarray, dict[int, ndarray]]:
-        step = unknowns.reshape(-1, 6)
         start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers[1:]])])
-        moved = transform(start[:, :3, :3] @ rotation_exp(step[:, 3:]), start[:, :3, 3] + step[:, :3])
+        moved = retract(start, unknowns.reshape(-1, 6))
         placed = {body: moved[row] for body, row in moving.items()}
         return moved[: len(cameras)], {numbers[0]: bodies[numbers[0]]} | placed
 
@@ -242,7 +241,7 @@ def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Track
     """The points, and the same ones as near to the cameras as things beside the board may come."""
     on_board = tracks.points_in_recon
     middle = recon_from_camera[:, :3, 3].mean(0)
-    raised = on_board + REACH * (middle - on_board)
+    raised = on_board + RISE * (middle - on_board)
     return replace(
         tracks,
         image=np.tile(tracks.image, 2),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
-from jcr.camera import NO_DISTORTION, usable_lens
+from jcr.camera import is_distorted, usable_lens
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
@@ -140,7 +140,7 @@ def _images(
     if seen is not None:
         pinhole = grid.original_intrinsics(seen)
         lens = lens or pinhole
-    elif lens is not None and lens.distortion != NO_DISTORTION:
+    elif lens is not None and is_distorted(lens):
         lens = pinhole = None
         notes += (
             f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
@@ -148,7 +148,7 @@ def _images(
         )
     else:
         pinhole = lens
-    if grid.original_size != capture.image_size and (lens is None or lens.distortion == NO_DISTORTION):
+    if grid.original_size != capture.image_size and (lens is None or not is_distorted(lens)):
         raise InputError(
             f"{source}: made from images of {'x'.join(map(str, grid.original_size))}, the capture's are "
             f"{'x'.join(map(str, capture.image_size))}; predict from this capture's images"

@@ -13,7 +13,17 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import NO_DISTORTION, distort, pinhole_inside, undistort_image, usable_lens
+from jcr.camera import (
+    cropped,
+    is_distorted,
+    pinhole_inside,
+    project,
+    resized,
+    undistort_image,
+    unproject,
+    usable_lens,
+    without_distortion,
+)
 from jcr.capture.images import read_image
 from jcr.records import Capture, Intrinsics
 
@@ -47,17 +57,15 @@ class ImageGrid:
 
     def grid_intrinsics(self, original: Intrinsics) -> Intrinsics:
         """The pinhole of the grid, given the pinhole of the original image (its distortion is dropped)."""
-        cx, cy = self.grid_from_original(np.array([original.cx, original.cy]))
-        sx, sy = self.scale
-        width, height = self.size
-        return Intrinsics(original.fx * sx, original.fy * sy, float(cx), float(cy), width, height)
+        return cropped(
+            resized(without_distortion(original), *self.resized_size), *self.crop_corner, *self.size
+        )
 
     def original_intrinsics(self, grid: Intrinsics) -> Intrinsics:
         """The pinhole of the original image, given that of the grid."""
-        cx, cy = self.original_from_grid(np.array([grid.cx, grid.cy]))
-        sx, sy = self.scale
-        width, height = self.original_size
-        return Intrinsics(grid.fx / sx, grid.fy / sy, float(cx), float(cy), width, height)
+        left, top = self.crop_corner
+        whole = cropped(without_distortion(grid), -left, -top, *self.resized_size)
+        return resized(whole, *self.original_size)
 
 
 def image_grid(
@@ -104,10 +112,9 @@ class PreparedImages:
     def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
         """Pixels (...,2) of the network's grid in the capture's images, distorted as the lens made them."""
         undistorted_px = self.grid.original_from_grid(x_px)
-        if self.pinhole is None or self.lens is None or self.lens.distortion == NO_DISTORTION:
+        if self.pinhole is None or self.lens is None or not is_distorted(self.lens):
             return undistorted_px
-        k = self.pinhole
-        return distort(self.lens, (undistorted_px - [k.cx, k.cy]) / [k.fx, k.fy])
+        return project(self.lens, unproject(self.pinhole, undistorted_px))
 
 
 def prepare_images(
@@ -119,7 +126,7 @@ def prepare_images(
     """
     lens, notes = usable_lens(capture.intrinsics)
     pinhole = lens
-    if lens is not None and lens.distortion != NO_DISTORTION:
+    if lens is not None and is_distorted(lens):
         pinhole = pinhole_inside(lens, max(lens.width, lens.height))
     grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
     return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, notes)
@@ -136,7 +143,7 @@ def read_colors(
     colors = np.empty((len(capture), height, width, 3), np.uint8)
     for row, name in enumerate(capture.images):
         image = read_image(capture.folder / name)
-        if lens is not None and pinhole is not None and lens.distortion != NO_DISTORTION:
+        if lens is not None and pinhole is not None and is_distorted(lens):
             image = undistort_image(image, lens, pinhole)
         colors[row] = resize_and_crop(image, grid)
     return colors

@@ -12,7 +12,7 @@ from jcr.errors import InputError
 from jcr.files import written_whole
 from jcr.records import CameraEvidence, Intrinsics, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/2"
+FORMAT = "jcr.reconstruction/3"
 """Changes with what the file holds."""
 
 

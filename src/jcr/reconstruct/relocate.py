@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import resized, undistort
-from jcr.geometry import inverse, rotation_exp, skew, transform
+from jcr.camera import NORMALIZED, by_point, project, resized, unproject
+from jcr.geometry import across_lines, inverse, retract, rotation_exp, skew, transform
 from jcr.records import Intrinsics, Reconstruction
 
 WORKING_SIZE_PX = 1600
@@ -43,7 +43,7 @@ class Located:
 
     recon_from_camera: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "6 6"]
-    """Of a motion (translation in recon units, rotation vector) in camera axes applied on the right."""
+    """Of a step of the camera (geometry.retract; recon units, rad)."""
     points: int
     sigma_px: float
     """Noise of its image coordinates."""
@@ -76,7 +76,7 @@ def _features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> _Features:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return _Features(undistort(resized(lens, *size), np.array([point.pt for point in points])), root)
+    return _Features(unproject(resized(lens, *size), np.array([point.pt for point in points]))[:, :2], root)
 
 
 def _located(
@@ -98,7 +98,7 @@ def _located(
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < MIN_POINTS:
         return 0 if inliers is None else len(inliers)
-    start = transform(rotation_exp(turn[:, 0]), shift[:, 0])
+    start = inverse(transform(rotation_exp(turn[:, 0]), shift[:, 0]))
     agree = np.asarray(inliers, int)[:, 0]
     return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
 
@@ -130,7 +130,7 @@ def _triangulated(
     rotation, center = recon_from_camera[row, :3, :3], recon_from_camera[row, :3, 3]
     direction = np.einsum("cij,cj->ci", rotation, np.c_[seen, np.ones(len(seen))])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None]
+    across = across_lines(direction)
     point, kept, weight = np.zeros((n, 3)), np.ones(len(row), bool), np.ones(len(row))
     normal = np.zeros((n, 3, 3))
     for _ in range(3):  # later without those that missed, and by how far each camera was
@@ -143,7 +143,7 @@ def _triangulated(
         point = np.linalg.solve(normal, right[..., None])[..., 0]
         in_camera = np.einsum("cji,cj->ci", rotation, point[feature] - center)
         ahead = in_camera[:, 2] > 1e-6
-        miss = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] - seen
+        miss = project(NORMALIZED, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0])) - seen
         kept = ahead & (np.linalg.norm(miss, axis=1) < gate)
         squared = (in_camera**2).sum(1)
         weight = 1 / np.maximum(squared, 1e-2 * np.median(squared)) if len(squared) else weight
@@ -159,7 +159,7 @@ def _refined(
     points: Float[ndarray, "k 3"],
     spread: Float[ndarray, "k 3 3"],
     rays: Float[ndarray, "k 2"],
-    camera_from_recon: Float[ndarray, "4 4"],
+    recon_from_camera: Float[ndarray, "4 4"],
     focal_px: float,
 ) -> Located:
     """Gauss-Newton on the reprojection error under a Cauchy loss, and the covariance that it leaves.
@@ -168,21 +168,18 @@ def _refined(
     """
     sigma, hessian = 1.0 / focal_px, np.eye(6)
     for _ in range(15):
-        rotation = camera_from_recon[:3, :3]
-        x = points @ rotation.T + camera_from_recon[:3, 3]
-        miss = x[:, :2] / x[:, 2:] - rays
-        by_point = np.zeros((len(x), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / x[:, 2]
-        by_point[:, :, 2] = -x[:, :2] / x[:, 2:] ** 2
-        turned = by_point @ rotation
+        rotation, arm = recon_from_camera[:3, :3], points - recon_from_camera[:3, 3]
+        x = arm @ rotation
+        miss = project(NORMALIZED, x) - rays
+        turned = by_point(NORMALIZED, x) @ rotation.T
         told = np.linalg.inv(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2))
         squared = np.einsum("ki,kij,kj->k", miss, told, miss)
         sigma = max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
         told = told / (sigma**2 * (1 + squared / (LOSS_SCALE * sigma) ** 2))[:, None, None]
-        jacobian = by_point @ np.concatenate([np.broadcast_to(np.eye(3), (len(x), 3, 3)), -skew(x)], axis=2)
+        jacobian = np.concatenate([-turned, turned @ skew(arm)], axis=2)
         hessian = np.einsum("kai,kab,kbj->ij", jacobian, told, jacobian)
         step = -np.linalg.solve(hessian, np.einsum("kai,kab,kb->i", jacobian, told, miss))
-        camera_from_recon = transform(rotation_exp(step[3:]), step[:3]) @ camera_from_recon
+        recon_from_camera = retract(recon_from_camera, step)
         if float(step @ hessian @ step) < 1e-8:
             break
-    return Located(inverse(camera_from_recon), np.linalg.inv(hessian), len(points), sigma * focal_px)
+    return Located(recon_from_camera, np.linalg.inv(hessian), len(points), sigma * focal_px)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from PIL import Image
 
+from jcr.camera import project, unproject, without_distortion
 from jcr.geometry import apply
 from jcr.records import Intrinsics
 from jcr.report.map_samples import Slice
@@ -128,8 +129,8 @@ def rendered_points(
     zoom = width / lens.width
     height = round(zoom * lens.height)
     depth = np.maximum(points_in_camera[:, 2], 1e-3)
-    column = np.floor(zoom * (lens.fx * points_in_camera[:, 0] / depth + lens.cx + 0.5)).astype(int)
-    row = np.floor(zoom * (lens.fy * points_in_camera[:, 1] / depth + lens.cy + 0.5)).astype(int)
+    ahead = np.column_stack([points_in_camera[:, :2], depth])
+    column, row = np.floor(zoom * (project(without_distortion(lens), ahead) + 0.5)).astype(int).T
     shown = (depth > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
     rgba = np.zeros((height, width, 4), np.uint8)
     if not shown.any():
@@ -163,9 +164,8 @@ def picture_url(pixels: UInt8[ndarray, "h w *c"], kind: str) -> str:
 
 def pyramid(lens: Intrinsics, depth: float) -> Float[ndarray, "5 3"]:
     """Centre and image corners of a camera, in its own frame, with the image plane at `depth`."""
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [lens.width, lens.height]
-    rays = (corners - [lens.cx + 0.5, lens.cy + 0.5]) / [lens.fx, lens.fy]
-    return depth * np.vstack([np.zeros(3), np.column_stack([rays, np.ones(4)])])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [lens.width, lens.height] - 0.5
+    return depth * np.vstack([np.zeros(3), unproject(without_distortion(lens), corners)])
 
 
 def _view_axes(azimuth_deg: float, elevation_deg: float) -> Float[ndarray, "2 3"]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from jcr.calibration.calibration_json import Image
-from jcr.calibration.projection import parameters, project
+from jcr.camera import is_distorted, project, resized, undistort_image, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, Intrinsics
@@ -73,7 +73,7 @@ def images_section(result: RunResult) -> str:
 def _reprojections(result: RunResult) -> dict[int, str]:
     """Per image of the capture a drawing over its picture: some features, and where their 3D points fall."""
     reconstruction, lens = result.reconstruction, result.lens
-    tracks, own_lens = reconstruction.tracks, parameters(reconstruction.intrinsics)
+    tracks, straight = reconstruction.tracks, without_distortion(lens)
     drawings, draw = {}, np.random.default_rng(0)
     for k, row in enumerate(reconstruction.image_index):
         seen = np.flatnonzero(tracks.image == k)
@@ -83,9 +83,8 @@ def _reprojections(result: RunResult) -> dict[int, str]:
         x_in_camera = apply(
             inverse(reconstruction.recon_from_camera[k]), tracks.points_in_recon[tracks.point[seen]]
         )
-        miss = project(x_in_camera, own_lens) - tracks.x_px[seen]
-        distortion = np.array(lens.distortion)
-        at = cv2.undistortPoints(tracks.x_px[seen, None], lens.matrix, distortion, P=lens.matrix)[:, 0] + 0.5
+        miss = project(reconstruction.intrinsics, x_in_camera) - tracks.x_px[seen]
+        at = project(straight, unproject(lens, tracks.x_px[seen])) + 0.5
         ways = "".join(
             f"M{x:.0f} {y:.0f}l{dx:.0f} {dy:.0f}"
             for (x, y), (dx, dy) in zip(at, MAGNIFIED * miss, strict=True)
@@ -102,14 +101,11 @@ def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
 
     def thumbnail(name: str) -> str:
         pixels = read_image(capture.folder / name)
-        zoom = width / pixels.shape[1]
-        pixels = cv2.resize(pixels, (width, round(zoom * pixels.shape[0])), interpolation=cv2.INTER_AREA)
-        if lens is not None and any(lens.distortion):
-            matrix = lens.matrix
-            # Pixel centres are whole numbers: half a pixel must not be scaled away.
-            matrix[:2, 2] = zoom * (matrix[:2, 2] + 0.5) - 0.5
-            matrix[[0, 1], [0, 1]] *= zoom
-            pixels = cv2.undistort(pixels, matrix, np.array(lens.distortion))
+        size = width, round(width / pixels.shape[1] * pixels.shape[0])
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        if lens is not None and is_distorted(lens):
+            small = resized(lens, *size)
+            pixels = undistort_image(pixels, small, without_distortion(small))
         return picture_url(pixels, "JPEG")
 
     with ThreadPoolExecutor(2) as pool:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from jcr.camera import project, rays
 from jcr.errors import InputError
 from jcr.records import Capture, Reconstruction
 
@@ -71,9 +72,7 @@ def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
 def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
     """The label nearest to where each pixel of the pointmap lies in the capture's image."""
     camera, grid = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
-    x_px, y_px = cv2.initUndistortRectifyMap(
-        camera.matrix, np.array(camera.distortion), None, grid.matrix, (grid.width, grid.height), cv2.CV_32FC1
-    )  # pyright: ignore[reportCallIssue, reportArgumentType]
+    x_px, y_px = np.moveaxis(project(camera, rays(grid)).astype(np.float32), -1, 0)
     nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
     return nearest.astype(np.int64)
 

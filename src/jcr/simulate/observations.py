@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jcr.calibration.projection import parameters, project
+from jcr.camera import project
 from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.problem import HandEyeProblem
@@ -18,7 +18,7 @@ def observed(problem: HandEyeProblem, rng: np.random.Generator, points: int, noi
     image, point, pixels = [], [], []
     for i, camera in enumerate(base_from_camera):
         x_in_camera = apply(inverse(camera), x_in_base)
-        x_px = project(x_in_camera, parameters(LENS))
+        x_px = project(LENS, x_in_camera)
         inside = (x_px > 0).all(1) & (x_px < [LENS.width, LENS.height]).all(1)
         seen = np.flatnonzero(inside & (x_in_camera[:, 2] > 0))
         image.append(np.full(len(seen), i))

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_exp, rotation_log, scale_translation, transform
+from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 
 TARGET_IN_BASE = np.array([0.5, 0.0, 0.0])
@@ -71,14 +71,9 @@ def error(
     problem: HandEyeProblem, gripper_from_camera: Float[ndarray, "4 4"], scale: float
 ) -> Float[ndarray, "7"]:
     """True minus found, in records.COVARIANCE_ORDER."""
-    true = problem.gripper_from_camera
-    return np.concatenate(
-        [
-            true[:3, 3] - gripper_from_camera[:3, 3],
-            rotation_log(true[:3, :3] @ gripper_from_camera[:3, :3].T),
-            [np.log(problem.scale / scale)],
-        ]
-    )
+    return np.r_[
+        step_between(gripper_from_camera, problem.gripper_from_camera), np.log(problem.scale / scale)
+    ]
 
 
 def unit_similarity(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
@@ -141,10 +142,7 @@ def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]
     """
     truth = read_truth(folder)
     camera = truth.intrinsics
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays_in_camera = np.stack(
-        [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(x.shape)], -1
-    )
+    rays_in_camera = rays(camera)
     low, high = truth.workspace_in_base
     points, labels = [], []
     for k, base_from_camera in enumerate(truth.base_from_camera):

@@ -10,13 +10,11 @@ from scipy.optimize import least_squares
 
 from jcr.capture.plain_files import read_npy
 from jcr.errors import InputError
-from jcr.geometry import rotation_log
+from jcr.geometry import ARM, step_between
 
 if TYPE_CHECKING:
     import yourdfpy
 
-ARM = 0.3
-"""Metres per radian: what counts alike when a link is brought to a pose."""
 REACHED = 2e-3
 """Metres, an angle by ARM: how near it must come."""
 STARTS = 12
@@ -79,8 +77,7 @@ def solve_joints(
     def miss(values: Float[ndarray, " dof"], goal: Float[ndarray, "4 4"]) -> Float[ndarray, "6"]:
         robot.update_cfg(values)
         reached = robot.get_transform(tip, robot.base_link)
-        turn = rotation_log(goal[:3, :3].T @ reached[:3, :3])
-        return np.concatenate([reached[:3, 3] - goal[:3, 3], ARM * turn])
+        return step_between(goal, reached) * np.repeat([1.0, ARM], 3)
 
     solved, near = [], np.clip(np.zeros(len(low)), low, high)
     for k, goal in enumerate(base_from_tip):

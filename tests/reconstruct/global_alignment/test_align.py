@@ -9,11 +9,11 @@ import pytest
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
+from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_between_deg
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.reconstruct.global_alignment.align import align
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, pinhole_of
-from jcr.reconstruct.global_alignment.gauss_newton import FreeCameras, Problem, gauss_newton, moved
+from jcr.reconstruct.global_alignment.gauss_newton import FreeCameras, Problem, gauss_newton
 from jcr.reconstruct.global_alignment.normal_equations import (
     ImageEquations,
     Layout,
@@ -96,7 +96,7 @@ def test_one_step_from_near_the_truth_is_almost_all_the_way():
     log_unit = -np.log(truth.pair_unit)
     scale_nudge = 2e-3 * rng.normal(size=len(log_unit))
     start = State(
-        recon_from_camera=moved(truth.base_from_camera, nudge),
+        recon_from_camera=retract(truth.base_from_camera, nudge),
         log_focal=np.full(4, np.log(truth.intrinsics.fx) + 2e-3),
         log_pair_scale=log_unit + scale_nudge - scale_nudge.mean(),
         pair_error=np.zeros((12, 6)),

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import null_space
 
-from jcr.geometry import rotation_exp, transform
+from jcr.geometry import nearest_to_lines, retract, step_axes
 from jcr.reconstruct.direct.photometric import Cameras, Level, Points, energy, equations, on_rays, strongest
 
 DEPTHS = 40
@@ -48,11 +48,7 @@ class Found:
 
 def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray, "*batch 3"]:
     """The point nearest to all optical axes."""
-    center, axis = base_from_camera[..., :3, 3], base_from_camera[..., :3, 2]
-    across = np.eye(3) - axis[..., :, None] * axis[..., None, :]
-    # Parallel axes meet anywhere along them.
-    normal = across.sum(-3) + 1e-6 * np.eye(3)
-    return np.linalg.solve(normal, (across @ center[..., None]).sum(-3))[..., 0]
+    return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
 def judged(level: Level, cameras: Cameras, stage: Stage) -> Found:
@@ -135,8 +131,8 @@ def descended(
 
 def moved(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
     """Cameras after twists (v, ω) in camera axes, one for all or one for each, and a step of the log focal length."""
-    twist = step[:-1].reshape(-1, 6)
-    motion = transform(rotation_exp(twist[:, 3:]), twist[:, :3])
+    pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(
-        cameras.base_from_camera @ motion, cameras.zoom * float(np.exp(np.clip(step[-1], -0.1, 0.1)))
+        retract(pose, (step_axes(pose[:, :3, :3]) @ twist)[..., 0]),
+        cameras.zoom * float(np.exp(np.clip(step[-1], -0.1, 0.1))),
     )

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import distort, pinhole_inside, undistort_image, usable_lens
+from jcr.camera import pinhole_inside, project, undistort_image, unproject, usable_lens, zoomed
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import adjoint, apply, inverse
+from jcr.geometry import apply, inverse, step_axes
 from jcr.progress import Progress, silent
 from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.direct.coarse_to_fine import Stage, aligned, free_directions, tied_directions
@@ -31,8 +31,8 @@ from jcr.reconstruct.direct.photometric import (
     equations,
     exposures,
     in_base,
+    in_view,
     make_level,
-    project,
     squared_misfit,
 )
 from jcr.reconstruct.direct.search import SIZES, search
@@ -103,9 +103,9 @@ def reconstruct(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
             "take pictures that overlap more, of a scene that does not move or shine"
         )
-    covariance = twist_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
+    covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
     points = points.where(points.agreed)
-    lens = replace(lens, fx=lens.fx * cameras.zoom, fy=lens.fy * cameras.zoom)
+    lens = zoomed(lens, cameras.zoom)
     tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
     recon_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
     sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes)
@@ -134,7 +134,7 @@ def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int
     while True:
         cameras, _ = aligned(level, cameras, FREED[0], tied_directions(lens_held))
         alone, points = aligned(level, cameras, FREED[0], free_directions(cameras, lens_held))
-        _, u, v, seen = project(level, alone, points)
+        _, u, v, seen = in_view(level, alone, points)
         shows = seen & (squared_misfit(level, points, u, v) < FREED[0].sigma ** 2)
         share = shows.sum(1) / np.maximum(seen.sum(1), 1)
         fits = share > LEAST_SHARE * np.median(share)
@@ -161,10 +161,10 @@ def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics) -> dict
     return {height: make_level(stack, grid, height) for height in heights}
 
 
-def twist_covariance(
+def camera_covariance(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> Float[ndarray, "r r"]:
-    """Covariance (6n,6n) of the cameras' twists in the first camera's axes, as records.CameraEvidence has it.
+    """Covariance (6n,6n) of the cameras' steps in the first camera's axes, as records.CameraEvidence has it.
 
     Residuals of one region of the scene err together, in all images that look there. How far the gradients of regions
     scatter about zero is measured, and the inverse normal matrix scaled to it on average (a sandwich estimate that has
@@ -180,23 +180,22 @@ def twist_covariance(
     first_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
     n = len(first_from_camera)
     to_first = np.zeros((6 * n, 6 * n))
-    for k, block in enumerate(adjoint(first_from_camera)):
+    for k, block in enumerate(step_axes(first_from_camera[:, :3, :3])):
         to_first[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
-    twists = to_first @ directions[:-1]
-    return spread * twists @ inverse_normal @ twists.T
+    steps = to_first @ directions[:-1]
+    return spread * steps @ inverse_normal @ steps.T
 
 
 def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, lens: Intrinsics) -> Tracks:
     """The points, where their host sees them and where the others do that show their colour."""
-    _, u, v, seen = project(level, cameras, points)
+    _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
     image, point = np.nonzero(shown)
     host = np.arange(len(points.host))
     x_grid = np.concatenate([points.x_px, np.column_stack([u[shown], v[shown]])])
-    focal = np.array([level.grid.fx, level.grid.fy]) * cameras.zoom
     return Tracks(
         image=np.concatenate([points.host, image]),
-        x_px=distort(lens, (x_grid - [level.grid.cx, level.grid.cy]) / focal),
+        x_px=project(lens, unproject(zoomed(level.grid, cameras.zoom), x_grid)),
         point=np.concatenate([host, point]),
         points_in_recon=apply(inverse(cameras.base_from_camera[0]), in_base(level, cameras, points)),
         from_pointmaps=True,

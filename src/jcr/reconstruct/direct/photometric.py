@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
-from jcr.camera import resized
+from jcr.camera import project, resized, unproject, zoomed
 from jcr.geometry import inverse, skew
 from jcr.records import Intrinsics
 
@@ -163,7 +163,7 @@ def on_rays(
 
 def _cost(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " k"]:
     """Mean cost of the views that agree best; 1 where fewer than two look there."""
-    _, u, v, seen = project(level, cameras, points)
+    _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     misfit = np.sort(np.where(seen, misfit / (misfit + np.float32(sigma**2)), 2.0), axis=0)
     count = seen.sum(0)
@@ -185,9 +185,7 @@ def _squared(difference: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k"]:
 
 def in_host(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
     """The points in the camera frame of their hosts."""
-    focal = np.array([level.grid.fx, level.grid.fy]) * cameras.zoom
-    x = (points.x_px - [level.grid.cx, level.grid.cy]) / focal
-    return points.depth[:, None] * np.column_stack([x, np.ones(len(x))])
+    return points.depth[:, None] * unproject(zoomed(level.grid, cameras.zoom), points.x_px)
 
 
 def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k 3"]:
@@ -196,20 +194,25 @@ def in_base(level: Level, cameras: Cameras, points: Points) -> Float[ndarray, "k
     return np.einsum("kij,kj->ki", pose[:, :3, :3], in_host(level, cameras, points)) + pose[:, :3, 3]
 
 
-def project(
+def in_view(
     level: Level, cameras: Cameras, points: Points
 ) -> tuple[Float32[ndarray, "n k 3"], Float32[ndarray, "n k"], Float32[ndarray, "n k"], Bool[ndarray, "n k"]]:
     """Points in every camera's frame, their pixels u and v, and whether they are in view; their host does not count."""
     camera_from_base = inverse(cameras.base_from_camera).astype(np.float32)
     x = in_base(level, cameras, points).astype(np.float32) @ camera_from_base[:, :3, :3].swapaxes(1, 2)
     x += camera_from_base[:, None, :3, 3]
-    z = np.maximum(x[..., 2], np.float32(NEAREST))
-    u = np.float32(level.grid.fx * cameras.zoom) * x[..., 0] / z + np.float32(level.grid.cx)
-    v = np.float32(level.grid.fy * cameras.zoom) * x[..., 1] / z + np.float32(level.grid.cy)
+    u, v = np.moveaxis(project(zoomed(level.grid, cameras.zoom), _ahead(x)), -1, 0)
     seen = (x[..., 2] > NEAREST) & (u >= 0) & (u <= level.grid.width - 1)
     seen &= (v >= 0) & (v <= level.grid.height - 1)
     seen[points.host, np.arange(len(points.host))] = False
     return x, u, v, seen
+
+
+def _ahead(x_in_camera: Float32[ndarray, "n k 3"]) -> Float32[ndarray, "n k 3"]:
+    """The points, none nearer to the camera's plane than NEAREST."""
+    ahead = x_in_camera.copy()
+    np.maximum(ahead[..., 2], np.float32(NEAREST), out=ahead[..., 2])
+    return ahead
 
 
 def _sample(
@@ -223,7 +226,7 @@ def _sample(
 
 def exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
     """How bright each image is beside the others (their geometric mean is 1), from points that they share."""
-    _, u, v, seen = project(level, cameras, points)
+    _, u, v, seen = in_view(level, cameras, points)
     shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
     dark = 10 * _FAINT
     used = seen & points.agreed & (shown > dark) & (own > dark)
@@ -242,7 +245,7 @@ def exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> F
 
 def energy(level: Level, cameras: Cameras, points: Points, sigma: float) -> float:
     """Mean robust misfit, 0 to 1, of the views of points agreed on."""
-    _, u, v, seen = project(level, cameras, points)
+    _, u, v, seen = in_view(level, cameras, points)
     misfit = squared_misfit(level, points, u, v)
     weight = seen & points.agreed
     return float((weight * misfit / (misfit + np.float32(sigma**2))).sum() / max(weight.sum(), 1))
@@ -291,7 +294,7 @@ def _linearised(
     for start in range(0, len(points.host), _CHUNK):
         rows = slice(start, start + _CHUNK)
         some = points.where(rows)
-        x, u, v, seen = project(level, cameras, some)
+        x, u, v, seen = in_view(level, cameras, some)
         residual, by_u, by_v = (_sample(of, level, u, v) for of in (level.color, level.by_u, level.by_v))
         residual = residual - some.color
         # Geman and McClure's weight.
@@ -308,6 +311,8 @@ def _linearised(
             ..., 0
         ]
         moves[..., 13] = (other_from_host @ x_in_host[..., None])[..., 0]
+        # camera.by_point of a pinhole, times `moves`: 0.27 instead of 0.47 ms for 500 points in 15 images, without its
+        # zeros and the many small products.
         z = np.maximum(x[..., 2:], np.float32(NEAREST))
         shift_u = (moves[..., 0, :] - x[..., :1] / z * moves[..., 2, :]) / z
         shift_v = (moves[..., 1, :] - x[..., 1:2] / z * moves[..., 2, :]) / z

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.camera import rays
 from jcr.errors import InputError
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
+from jcr.records import Intrinsics
 
 LEAST_PIXELS = 50
 """Several for each coarse cell that tells how far residuals go together."""
@@ -80,10 +82,7 @@ class Alignment:
         for k, (recon_from_camera, (fx, fy)) in enumerate(
             zip(self.recon_from_camera, self.focal_px, strict=True)
         ):
-            ray = np.empty((height, width, 3), np.float32)
-            ray[..., 0] = (np.arange(width) - cx) / fx
-            ray[..., 1] = (np.arange(height)[:, None] - cy) / fy
-            ray[..., 2] = 1.0
+            ray = rays(Intrinsics(fx, fy, cx, cy, width, height)).astype(np.float32)
             points[k] = (ray * self.depth[k, ..., None]) @ recon_from_camera[:3, :3].T.astype(np.float32)
             points[k] += recon_from_camera[:3, 3].astype(np.float32)
         return points

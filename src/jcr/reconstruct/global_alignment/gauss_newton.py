@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from jcr.errors import NotTrustedError
-from jcr.geometry import adjoint, inverse, rotation_exp, transform
+from jcr.geometry import adjoint, inverse, retract, twist_from_step
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.reconstruct.global_alignment.depths import fused_depth
@@ -74,7 +74,7 @@ class Cameras(Protocol):
         ...
 
     def covariance(self) -> Float[ndarray, "r r"]:
-        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        """Of the cameras' steps, r = 6n, from the equations of the last one."""
         ...
 
 
@@ -95,24 +95,15 @@ class FreeCameras:
         self.normal = held[6:, 6:]
         step = np.zeros(layout.size)
         step[6:] = -np.linalg.solve(self.normal, gradient[6:])
-        self.recon_from_camera = moved(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
+        self.recon_from_camera = retract(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
         return step
 
     def covariance(self) -> Float[ndarray, "r r"]:
-        """Of the cameras' twists, r = 6n, from the equations of the last step; the first camera's is 0."""
+        """Of the cameras' steps, r = 6n, from the equations of the last one; the first camera's is 0."""
         size = 6 * len(self.recon_from_camera)
         out = np.zeros((size, size))
         out[6:, 6:] = np.linalg.inv(self.normal)[: size - 6, : size - 6]
         return out
-
-
-def moved(
-    recon_from_camera: Float[ndarray, "n 4 4"], twist: Float[ndarray, "n 6"]
-) -> Float[ndarray, "n 4 4"]:
-    """Transforms after the twists (v, ω) that `Layout` defines."""
-    turn = rotation_exp(twist[:, 3:])
-    center = (turn @ recon_from_camera[:, :3, 3:])[..., 0] + twist[:, :3]
-    return transform(turn @ recon_from_camera[:, :3, :3], center)
 
 
 @dataclass(frozen=True)
@@ -193,7 +184,6 @@ def gauss_newton(
     The weights, and the spread of the pairs' errors, are measured anew in each iteration. Raises
     NotTrustedError where the pointmaps do not determine the unknowns.
     """
-    selections = [_selection(o, layout) for o in images]
     focals = [layout.focal(k) for k in range(layout.images)]
     iteration = 0
     while True:
@@ -213,6 +203,8 @@ def gauss_newton(
         except np.linalg.LinAlgError:
             raise NotTrustedError(NOTHING) from None
 
+        to_twist = twist_from_step(state.recon_from_camera)
+        selections = [_selection(o, layout, to_twist) for o in images]
         hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
         for selection, own in zip(selections, reduced, strict=True):
             hessian += selection.T @ (selection.T @ own.hessian).T
@@ -333,15 +325,15 @@ def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"], settled
     return tuple(notes)
 
 
-def _selection(o: ImageObservations, layout: Layout) -> csr_array:
+def _selection(o: ImageObservations, layout: Layout, to_twist: Float[ndarray, "n 6 6"]) -> csr_array:
     """Matrix that takes a step of all unknowns to the local ones of an image's equations."""
     n, maps = o.second_count, len(o.pair)
-    twists, scales = np.arange(6 * n).reshape(n, 6), 6 * n + np.arange(maps)
-    own = np.broadcast_to(6 * o.image + np.arange(6), (n, 6))
-    observers = 6 * o.observer[:n, None] + np.arange(6)
-    rows = [twists.ravel(), twists.ravel(), scales]
-    columns = [own.ravel(), observers.ravel(), layout.scales[o.pair]]
-    signs = [np.ones(6 * n), -np.ones(6 * n), np.ones(maps)]
+    twists, scales = np.arange(6 * n).reshape(n, 6, 1), 6 * n + np.arange(maps)
+    blocks, block = (n, 6, 6), np.arange(6)
+    own, observers = 6 * o.image + block, 6 * o.observers[:, None, None] + block
+    rows = [np.broadcast_to(twists, blocks).ravel()] * 2 + [scales]
+    columns = [np.broadcast_to(of, blocks).ravel() for of in (own, observers)] + [layout.scales[o.pair]]
+    signs = [np.tile(to_twist[o.image].ravel(), n), -to_twist[o.observers].ravel(), np.ones(maps)]
     if (focal := layout.focal(o.image)) is not None:
         rows.append(np.array([6 * n + maps]))
         columns.append(np.array([focal]))

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, nearest_rotation, transform
+from jcr.geometry import fit_similarity, inverse
 from jcr.reconstruct.global_alignment.alignment import Pinhole
 from jcr.reconstruct.global_alignment.observations import ImageObservations
 from jcr.reconstruct.global_alignment.pointmap_residuals import State
@@ -123,46 +123,28 @@ def _similarities(
             continue
         x = np.concatenate([o.pixel_offset / f, np.ones_like(o.pixel_offset[:1])]) * z
         scale = np.exp(o.log_range[:n] - unit[o.pair[:n], None])
-        y = o.direction[:n] * scale[:, None]
+        y = np.swapaxes(o.direction[:n] * scale[:, None], 1, 2)
         weight = o.weight[:n].astype(np.float64)
-        fit = _fit_similarities(y, x, weight)
+        fit = fit_similarity(y, x.T, weight)
         for _ in range(5):
             relative = _miss(y, x, *fit) / scale
             middle = np.median(relative, axis=1, keepdims=True)
-            fit = _fit_similarities(y, x, weight / (1.0 + (relative / (2.0 * middle + 1e-9)) ** 2) ** 2)
-        rotation, ratio, translation = fit
-        first_from_second[o.pair[:n]] = transform(rotation, translation)
-        log_ratio[o.pair[:n]] = np.log(ratio)
+            fit = fit_similarity(y, x.T, weight / (1.0 + (relative / (2.0 * middle + 1e-9)) ** 2) ** 2)
+        first_from_second[o.pair[:n]] = fit[0]
+        log_ratio[o.pair[:n]] = np.log(fit[1])
         residual[o.pair[:n]] = np.median(_miss(y, x, *fit) / scale, axis=1)
     return PairSimilarities(first_from_second, log_ratio, residual)
 
 
-def _fit_similarities(
-    y: Float[ndarray, "k 3 m"], x: Float[ndarray, "3 m"], weight: Float[ndarray, "k m"]
-) -> tuple[Float[ndarray, "k 3 3"], Float[ndarray, " k"], Float[ndarray, "k 3"]]:
-    """Rotations, ratios and translations with y ≈ R · (ratio · x) + t in weighted least squares."""
-    w = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-    mean_y, mean_x = np.einsum("km,kcm->kc", w, y), w @ x.T
-    centred = x - mean_x[:, :, None]
-    cross = ((y - mean_y[:, :, None]) * w[:, None]) @ centred.transpose(0, 2, 1)
-    rotation = nearest_rotation(cross)
-    spread = np.maximum(np.einsum("km,kcm,kcm->k", w, centred, centred), 1e-12)
-    # Points that fit nothing can ask for a mirror image or for no size; a pair's unit is positive.
-    floor = 1e-3 * np.linalg.norm(cross, axis=(1, 2)) + 1e-12
-    ratio = np.maximum(np.einsum("kij,kij->k", rotation, cross), floor) / spread
-    return rotation, ratio, mean_y - ratio[:, None] * np.einsum("kij,kj->ki", rotation, mean_x)
-
-
 def _miss(
-    y: Float[ndarray, "k 3 m"],
+    y: Float[ndarray, "k m 3"],
     x: Float[ndarray, "3 m"],
-    rotation: Float[ndarray, "k 3 3"],
+    y_from_x: Float[ndarray, "k 4 4"],
     ratio: Float[ndarray, " k"],
-    translation: Float[ndarray, "k 3"],
 ) -> Float[ndarray, "k m"]:
     """Distance of y from the transformed x."""
-    gap = y - ratio[:, None, None] * (rotation @ x) - translation[:, :, None]
-    return np.sqrt(np.einsum("kcm,kcm->km", gap, gap))
+    moved = ratio[:, None, None] * (y_from_x[:, :3, :3] @ x) + y_from_x[:, :3, 3:]
+    return np.linalg.norm(np.swapaxes(y, 1, 2) - moved, axis=1)
 
 
 def _contradiction(edges: Int[ndarray, "e 2"], pairs: PairSimilarities, images: int) -> Float[ndarray, " e"]:

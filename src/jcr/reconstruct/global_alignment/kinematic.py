@@ -13,7 +13,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import adjoint, inverse, nearest_rotation, rotation_log, scale_translation, skew, transform
+from jcr.geometry import (
+    inverse,
+    nearest_rotation,
+    retract,
+    rotation_log,
+    scale_translation,
+    skew,
+    step_axes,
+    transform,
+)
+from jcr.handeye.noise import REACH
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import (
     Alignment,
@@ -29,14 +39,12 @@ from jcr.reconstruct.global_alignment.gauss_newton import (
     Solution,
     dense_alignment,
     gauss_newton,
-    moved,
     solve_free,
 )
 from jcr.reconstruct.global_alignment.normal_equations import Layout
 from jcr.reconstruct.global_alignment.observations import weight_is_log
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.global_alignment.pointmap_residuals import State
-from jcr.records import REACH
 
 VAGUE = 10.0
 """One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
@@ -105,17 +113,19 @@ class HandEyeCameras:
     ) -> Float[ndarray, " p"]:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns.
 
-        Unknowns in turn: a twist of gripper_from_camera and one of each gripper pose, both in gripper axes,
-        then what `layout` has beside cameras. Either twist moves camera i by Ad(base_from_gripper[i]) of it.
+        Unknowns in turn: a step of gripper_from_camera and one of each gripper pose, both in gripper axes, then what
+        `layout` has beside cameras. A turn of the gripper carries the camera along, one of the camera on it does not.
         """
         images = layout.images
         rest = layout.size - 6 * images
-        to_base = adjoint(self.base_from_gripper)
+        to_base = step_axes(self.base_from_gripper[:, :3, :3])
+        carried = np.eye(6)
+        carried[:3, 3:] = -skew(self.gripper_from_camera[:3, 3])
         jacobian = np.zeros((layout.size, 6 + layout.size))
         for k in range(images):
             rows = slice(6 * k, 6 * k + 6)
             jacobian[rows, :6] = to_base[k]
-            jacobian[rows, 6 + 6 * k : 12 + 6 * k] = to_base[k]
+            jacobian[rows, 6 + 6 * k : 12 + 6 * k] = to_base[k] @ carried
         jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
         prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
         pull = np.concatenate([np.zeros(6), (self.information * self.deviation()).ravel(), np.zeros(rest)])
@@ -125,9 +135,9 @@ class HandEyeCameras:
         self.jacobian = jacobian[: 6 * images, free]
         full = np.zeros(6 + layout.size)
         full[free] = -np.linalg.solve(self.normal, (jacobian.T @ gradient + pull)[free])
-        self.gripper_from_camera = moved(self.gripper_from_camera[None], full[None, :6])[0]
-        correction = moved(np.tile(np.eye(4), (images, 1, 1)), full[6 : 6 + 6 * images].reshape(-1, 6))
-        self.base_from_gripper = self.base_from_gripper @ correction
+        self.gripper_from_camera = retract(self.gripper_from_camera, full[:6])
+        correction = to_base @ full[6 : 6 + 6 * images].reshape(-1, 6, 1)
+        self.base_from_gripper = retract(self.base_from_gripper, correction[..., 0])
         if self.estimated:
             variance = np.linalg.inv(self.normal).diagonal()[6 : 6 + 6 * images].reshape(-1, 6)
             self.spread = self._estimated_spread(variance)
@@ -141,14 +151,13 @@ class HandEyeCameras:
         return arm * max(np.sqrt(squared / max(determined, 0.05)), LEAST_NOISE)
 
     def covariance(self) -> Float[ndarray, "r r"]:
-        """Of the cameras' twists, r = 6n, from the equations of the last step."""
+        """Of the cameras' steps, r = 6n, from the equations of the last one."""
         return self.jacobian @ np.linalg.solve(self.normal, self.jacobian.T)
 
     def hand_eye_covariance(self, pairs: int) -> Float[ndarray, "7 7"]:
         """Of gripper_from_camera and the mean log pair scale, in the order of COVARIANCE_ORDER."""
         functional = np.zeros((7, len(self.normal)))
         functional[:6, :6] = np.eye(6)
-        functional[:3, 3:6] = -skew(self.gripper_from_camera[:3, 3])
         functional[6, -pairs:] = 1.0 / pairs
         return functional @ np.linalg.solve(self.normal, functional.T)
 

@@ -18,11 +18,7 @@ from jcr.reconstruct.global_alignment.pointmap_residuals import Noise, Residuals
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the unknowns stand in the reduced system: twists of the cameras, log focals, log pair scales.
-
-    A twist (v, ω) in recon axes moves a camera by T ← [exp(ω) R, exp(ω) c + v]; points of an image move with
-    its camera, so that only the difference of the twists of image and observer shows in a pointmap.
-    """
+    """Where the unknowns stand in the reduced system: steps of the cameras, log focals, log pair scales."""
 
     images: int
     pairs: int
@@ -63,7 +59,11 @@ def depth_equations(
 
 @dataclass(frozen=True)
 class ImageEquations:
-    """Gauss-Newton equations of one image: local unknowns are relative twists, its pair scales, its focal."""
+    """Gauss-Newton equations of one image: local unknowns are relative twists, its pair scales, its focal.
+
+    Twists are those of geometry.twist_from_step: points of an image move with its camera, so that only the difference
+    of the twists of image and observer shows in a pointmap.
+    """
 
     hessian: Float[ndarray, "c c"]
     gradient: Float[ndarray, " c"]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_exp, transform
+from jcr.geometry import retract, step_axes
 from jcr.reconstruct.global_alignment.observations import CELL_SIDE, ImageObservations
 
 ROBUST_WIDTH = 3.0
@@ -74,7 +74,8 @@ def residuals(observations: ImageObservations, state: State, log_depth: Float[nd
     o = observations
     camera = state.recon_from_camera[o.image]
     error = np.where(o.second[:, None], state.pair_error[o.pair], 0.0)
-    observer = state.recon_from_camera[o.observer] @ transform(rotation_exp(error[:, 3:]), error[:, :3])
+    observer = state.recon_from_camera[o.observer]
+    observer = retract(observer, (step_axes(observer[:, :3, :3]) @ error[..., None])[..., 0])
 
     depth = np.exp(log_depth).astype(np.float32)
     ray = np.ones((3, len(depth)), np.float32)

@@ -99,16 +99,12 @@ def _kinematic_if_better(
 
 
 def predicted_error(recon_from_camera: Float[ndarray, "n 4 4"], covariance: Float[ndarray, "r r"]) -> float:
-    """Root mean square error of the camera centres after the best similarity, from the twists' covariance."""
+    """Root mean square error of the camera centres after the best similarity, from the covariance of their steps."""
     center = recon_from_camera[:, :3, 3]
     count = len(center)
-    by_turn = -skew(center)
+    of_centers = covariance.reshape(count, 6, count, 6)[:, :3, :, :3].reshape(3 * count, 3 * count)
     unit = np.tile(np.eye(3), (count, 1, 1))
-    moves = np.zeros((3 * count, 6 * count))
-    for k in range(count):
-        moves[3 * k : 3 * k + 3, 6 * k : 6 * k + 6] = np.concatenate([unit[k], by_turn[k]], axis=1)
-    of_centers = moves @ covariance @ moves.T
-    gauge = np.concatenate([unit, by_turn, center[:, :, None]], axis=2).reshape(3 * count, 7)
+    gauge = np.concatenate([unit, -skew(center), center[:, :, None]], axis=2).reshape(3 * count, 7)
     basis = np.linalg.qr(gauge)[0]
     left = np.trace(of_centers) - np.trace(basis.T @ of_centers @ basis)
     return float(np.sqrt(max(left, 0.0) / count))
