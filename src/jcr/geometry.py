@@ -128,11 +128,11 @@ def apply(a_from_b: Float[ndarray, "4 4"], x_in_b: Vectors) -> Vectors:
     return x_in_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
-def scale_translation(a_from_b: Transforms, scale: float) -> Transforms:
-    """S_λ: the transform with its translation multiplied by `scale`, its rotation untouched."""
-    out = a_from_b.astype(np.float64, copy=True)
-    out[..., :3, 3] *= scale
-    return out
+def scale_translation(
+    a_from_b: Float[ndarray, "*#batch 4 4"], scale: Float[ndarray, "*#batch"] | np.floating | float
+) -> Float[ndarray, "... 4 4"]:
+    """S_λ: the transforms with their translations multiplied by scales (...), their rotations untouched."""
+    return transform(a_from_b[..., :3, :3], np.asarray(scale)[..., None] * a_from_b[..., :3, 3])
 
 
 def apply_similarity(a_from_b: Float[ndarray, "4 4"], scale: float, x_in_b: Vectors) -> Vectors:

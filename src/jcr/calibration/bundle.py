@@ -2,7 +2,8 @@
 
 The robot's poses are measurements with the robot's own noise, so metric scale comes from the robot and the
 camera's sub-millimetre geometry from the images. Points are eliminated by the Schur complement and the rest
-is a small dense system, solved by Levenberg-Marquardt; rotations move by their exponential and stay in SO(3).
+is a small dense system, solved by Levenberg-Marquardt: least_squares.py without that elimination would hold a matrix
+of thousands of points. Between solutions the robot's and the images' noise are estimated.
 """
 
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from scipy.stats import chi2
 from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, step_between
 from jcr.handeye.noise import noise_share, robot_noise, widened
+from jcr.least_squares import loss_weight
 from jcr.records import Intrinsics, Tracks
 
 POINTS_AT_ONCE = 4096
@@ -231,7 +233,7 @@ def _sigma_px(view: _View, problem: _Problem) -> float:
 def _weights(view: _View, sigma_px: float) -> Float[ndarray, " k"]:
     """Inverse variances under a Cauchy loss; points behind the camera count nothing."""
     squared = (view.residual**2).sum(1) / sigma_px**2
-    return (view.in_camera[:, 2] > 1e-6) / (sigma_px**2 * (1 + squared / LOSS_SCALE**2))
+    return (view.in_camera[:, 2] > 1e-6) * loss_weight("cauchy", squared / LOSS_SCALE**2) / sigma_px**2
 
 
 def _cost(

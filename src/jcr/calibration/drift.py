@@ -109,7 +109,10 @@ def _moved_by(
     columns: tuple[slice, slice],
 ) -> tuple[tuple[Float[ndarray, "6"], Float[ndarray, "6 6"], float], float]:
     """Generalised least squares for a motion of X or of base_from_recon: the motion, its covariance and the degrees
-    of freedom behind that, and the misfit."""
+    of freedom behind that, and the misfit.
+
+    The covariance of the residuals changes with the unknowns, which least_squares.py does not know.
+    """
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns[0] == TRANSLATION
     spread, from_old = np.linalg.inv(calibrated.hessian), calibrated.noise_share

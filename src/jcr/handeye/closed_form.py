@@ -1,8 +1,9 @@
-"""Hand-eye calibration with unknown scale in closed form, over all pairs of images at once.
+"""Hand-eye calibration with unknown scale in closed form, over all pairs of images at once, for many problems at once.
 
 For every image `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`. Summing the squared
 differences of this equation over all pairs of images is the same as summing over images with
-`base_from_recon` free, so all n(n-1)/2 motions are used at the cost of n.
+`base_from_recon` free, so all n(n-1)/2 motions are used at the cost of n. No rotation's logarithm is taken, so
+that half turns are like any other.
 """
 
 import numpy as np
@@ -11,28 +12,54 @@ from numpy import ndarray
 
 from jcr.geometry import Rotations, inverse, nearest_rotation, transform
 
-Weights = Float[ndarray, " n"]
-Rotation3 = Float[ndarray, "3 3"]
+Poses = Float[ndarray, "*#batch n 4 4"]
+Weights = Float[ndarray, "*#batch n"]
+ROUNDS = 5
+"""Of polishing the rotations; a likelihood fit finishes the work."""
+NEAR_HALF_TURN = -0.73
+"""Trace of a rotation by 150°, beyond which the sine of the angle says little of the axis."""
+RELATIVE_CUT = 1e-10
+"""Of the largest singular value: what is smaller is rounding, and of a direction unseen."""
 
 
 def closed_form(
-    base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"], weights: Weights
-) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
-    """Closed-form `gripper_from_camera`, scale and `base_from_recon`.
+    base_from_gripper: Poses, recon_from_camera: Poses, weights: Weights | None = None, rounds: int = ROUNDS
+) -> tuple[Float[ndarray, "... 4 4"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 4 4"]]:
+    """Closed-form `gripper_from_camera` (...,4,4), scale (...) and `base_from_recon` (...,4,4).
 
     Rotation first, then translation and scale by one linear least squares (the paper's scale recovery
-    problem, eq. 6, whose grid search over λ it makes needless).
+    problem, eq. 6, whose grid search over λ it makes needless); of motions that leave them open, the smallest
+    translation. The scale comes out 0 or less where the motions do not show it.
     """
-    rotation, base_rotation = _rotations(base_from_gripper, recon_from_camera, weights)
+    weights = np.ones(base_from_gripper.shape[:-2]) if weights is None else weights
+    rotation, base_rotation = rotations(
+        base_from_gripper[..., :3, :3], recon_from_camera[..., :3, :3], weights, rounds
+    )
     translation, scale, base_translation = _translations(
         base_from_gripper, recon_from_camera, base_rotation, weights
     )
     return transform(rotation, translation), scale, transform(base_rotation, base_translation)
 
 
-def motions(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n 4 4"]:
+def initial_estimate(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    weights: Float[ndarray, " n"] | None = None,
+) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
+    """`closed_form` with a scale that a reconstruction can have: where motions do not show it, that of their extents."""
+    x, scale, z = closed_form(base_from_gripper, recon_from_camera, weights)
+    if scale <= 0:
+        w = np.ones(len(base_from_gripper)) if weights is None else weights
+        way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
+        extent, seen = (np.linalg.norm(_centred(of, w)) for of in (way, center))
+        # Of a camera that only turns every scale is as good.
+        scale = extent / seen if seen > RELATIVE_CUT * np.linalg.norm(center) else 1.0
+    return x, float(scale) or 1.0, z
+
+
+def motions(a_from_b: Poses) -> Float[ndarray, "... n n 4 4"]:
     """All relative motions: entry (i, j) is a_from_b[i]⁻¹ · a_from_b[j]."""
-    return inverse(a_from_b)[:, None] @ a_from_b[None]
+    return inverse(a_from_b)[..., :, None, :, :] @ a_from_b[..., None, :, :, :]
 
 
 def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
@@ -41,65 +68,95 @@ def sine_axis(rotation: Rotations) -> Float[ndarray, "*batch 3"]:
     return np.stack([antisymmetric[..., 2, 1], antisymmetric[..., 0, 2], antisymmetric[..., 1, 0]], axis=-1)
 
 
-def _rotations(
-    base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"], weights: Weights
-) -> tuple[Rotation3, Rotation3]:
-    """R_X and the rotation of base_from_recon.
+def rotations(
+    gripper: Float[ndarray, "*#batch n 3 3"],
+    camera: Float[ndarray, "*#batch n 3 3"],
+    weights: Weights,
+    rounds: int = ROUNDS,
+) -> tuple[Rotations, Rotations]:
+    """R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
 
-    R_G · R_X = R_Z · R_C is linear in both; the leading singular pair of Σ w R_C ⊗ R_G solves it (Shah 2013)
-    without a logarithm, hence without trouble at 0 or π. It is ambiguous where the motions are half turns
-    alone, so Park-Martin's sum over pairs (1994) competes, on sine-weighted axes instead of logarithms.
+    Park and Martin's sum over pairs (1994), on sine-weighted axes instead of logarithms. Where a motion is near a half
+    turn, and its sine small, another solution competes: the equation is linear in R_X and R_Z, and the leading singular
+    pair of Σ w R_C ⊗ R_G solves it (Shah 2013); alone it is ambiguous where all motions are half turns.
     """
-    gripper, camera = base_from_gripper[:, :3, :3], recon_from_camera[:, :3, :3]
-    kron = np.einsum("n,nij,nkl->ikjl", weights, gripper, camera).reshape(9, 9)
-    _, _, vt = np.linalg.svd(kron)
-    leading = vt[0].reshape(3, 3)
-    candidates = [nearest_rotation(leading * np.sign(np.linalg.det(leading) or 1.0))]
-
-    pair_weights = weights[:, None] * weights[None]
-    a, b = (
-        sine_axis(motions(base_from_gripper)[..., :3, :3]),
-        sine_axis(motions(recon_from_camera)[..., :3, :3]),
+    batch, n = weights.shape[:-1], weights.shape[-1]
+    gripper, camera, weights = (
+        gripper.reshape(-1, n, 3, 3),
+        camera.reshape(-1, n, 3, 3),
+        weights.reshape(-1, n),
     )
-    candidates.append(nearest_rotation(np.einsum("nm,nmi,nmj->ij", pair_weights, a, b)))
+    a, b = (np.swapaxes(of, -1, -2)[:, :, None] @ of[:, None] for of in (gripper, camera))
+    pairs = (weights[:, :, None] * weights[:, None]).reshape(-1, 1, n * n)
+    of_a, of_b = (sine_axis(of).reshape(-1, n * n, 3) for of in (a, b))
+    rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) * pairs @ of_b)
+    rotation, base, gap = _polished(rotation, gripper, camera, weights, rounds)
 
-    def polish(rotation: Rotation3) -> tuple[float, Rotation3, Rotation3]:
-        # The two best rotations given each other, in turn: monotone; a likelihood fit finishes the work.
-        base = rotation
-        for _ in range(5):
-            base = nearest_rotation(np.einsum("n,nij,nkj->ik", weights, gripper @ rotation, camera))
-            before = rotation
-            rotation = nearest_rotation(np.einsum("n,nji,njk->ik", weights, gripper, base @ camera))
-            if np.abs(rotation - before).max() < 1e-13:
-                break
-        gap = gripper @ rotation - base @ camera
-        return float(weights @ (gap**2).sum((1, 2))), rotation, base
+    near = (np.trace(a, axis1=-2, axis2=-1) < NEAR_HALF_TURN).any((1, 2))
+    if near.any():
+        some = gripper[near], camera[near], weights[near]
+        kron = np.einsum("hn,hnij,hnkl->hikjl", some[2], some[0], some[1]).reshape(-1, 9, 9)
+        leading = np.linalg.svd(kron)[2][:, 0].reshape(-1, 3, 3)
+        sign = np.where(np.linalg.det(leading) < 0, -1.0, 1.0)
+        rival = _polished(nearest_rotation(sign[:, None, None] * leading), *some, rounds)
+        better = rival[2] < gap[near]
+        rows = np.flatnonzero(near)[better]
+        rotation[rows], base[rows] = rival[0][better], rival[1][better]
+    return rotation.reshape(*batch, 3, 3), base.reshape(*batch, 3, 3)
 
-    _, rotation, base_rotation = min((polish(candidate) for candidate in candidates), key=lambda fit: fit[0])
-    return rotation, base_rotation
+
+def _polished(
+    rotation: Float[ndarray, "h 3 3"],
+    gripper: Float[ndarray, "h n 3 3"],
+    camera: Float[ndarray, "h n 3 3"],
+    weights: Float[ndarray, "h n"],
+    rounds: int,
+) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3 3"], Float[ndarray, " h"]]:
+    """R_X and R_Z, each the best given the other, in turn (monotone), and the squared gap that they leave."""
+    from_gripper, from_camera = np.swapaxes(gripper, -1, -2), np.swapaxes(camera, -1, -2)
+    weighed = weights[:, :, None, None] * gripper
+    base = nearest_rotation((weighed @ rotation[:, None] @ from_camera).sum(1))
+    for _ in range(rounds):
+        before = rotation
+        rotation = nearest_rotation(
+            (weights[:, :, None, None] * (from_gripper @ base[:, None] @ camera)).sum(1)
+        )
+        base = nearest_rotation((weighed @ rotation[:, None] @ from_camera).sum(1))
+        if np.abs(rotation - before).max() < 1e-13:
+            break
+    gap = gripper @ rotation[:, None] - base[:, None] @ camera
+    return rotation, base, (weights * (gap**2).sum((-1, -2))).sum(-1)
+
+
+def _centred(x: Float[ndarray, "*#batch n k"], weights: Weights) -> Float[ndarray, "... n k"]:
+    """Without the weighted mean over the images."""
+    w = weights / weights.sum(-1, keepdims=True)
+    return x - w[..., None, :] @ x
 
 
 def _translations(
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    recon_from_camera: Float[ndarray, "n 4 4"],
-    base_rotation: Rotation3,
-    weights: Weights,
-) -> tuple[Float[ndarray, "3"], float, Float[ndarray, "3"]]:
+    base_from_gripper: Poses, recon_from_camera: Poses, base_rotation: Rotations, weights: Weights
+) -> tuple[Float[ndarray, "... 3"], Float[ndarray, "..."] | np.floating, Float[ndarray, "... 3"]]:
     """t_X, λ and t_Z (of base_from_recon) from R_G t_X + t_G = λ R_Z t_C + t_Z, linear in all three.
 
-    The paper prints t_c^e for the camera's translation in its d_i(λ); t_C is meant.
+    t_Z is eliminated: it makes the weighted means equal. The paper prints t_c^e for the camera's translation in its
+    d_i(λ); t_C is meant.
     """
-    n = len(weights)
-    rows = np.zeros((n, 3, 7))
-    rows[:, :, :3] = base_from_gripper[:, :3, :3]
-    rows[:, :, 3] = -(recon_from_camera[:, :3, 3] @ base_rotation.T)
-    rows[:, :, 4:] = -np.eye(3)
-    right = -base_from_gripper[:, :3, 3]
-    root = np.sqrt(weights)[:, None]
-    # Columns of unit length: the cut-off for a null direction must not depend on the reconstruction's unit.
-    length = np.linalg.norm(rows[:, :, 3]) / np.sqrt(n) or 1.0
-    rows[:, :, 3] /= length
-    solution = np.linalg.lstsq(
-        (rows * root[..., None]).reshape(3 * n, 7), (right * root).ravel(), rcond=1e-10
-    )[0]
-    return solution[:3], float(solution[3] / length), solution[4:]
+    center, turns = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
+    turned = center @ np.swapaxes(base_rotation, -1, -2)
+    position = base_from_gripper[..., :3, 3]
+    rows = np.concatenate([turns, -turned[..., None], -position[..., None]], axis=-1)
+    rows = _centred(rows.reshape(*turned.shape[:-1], 15), weights).reshape(rows.shape)
+    # A column of unit size: what is cut as unseen must not depend on the reconstruction's unit. Centres that differ by
+    # rounding alone are one.
+    size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
+    unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
+    rows[..., 3] /= unit[..., None, None]
+    rows = (rows * np.sqrt(weights)[..., None, None]).reshape(*weights.shape[:-1], -1, 5)
+    u, values, vt = np.linalg.svd(rows[..., :4], full_matrices=False)
+    seen = values > RELATIVE_CUT * values[..., :1]
+    inverted = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    solution = np.swapaxes(vt, -1, -2) @ (inverted[..., None] * (np.swapaxes(u, -1, -2) @ rows[..., 4:]))
+    translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
+    gap = (turns @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * turned
+    return translation, scale, np.einsum("...n,...ni->...i", weights, gap) / weights.sum(-1)[..., None]

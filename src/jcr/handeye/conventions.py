@@ -13,9 +13,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import fit_similarity, inverse, rotation_exp, skew, transform
+from jcr.geometry import fit_similarity, inverse, retract, rotation_exp, skew, transform
 from jcr.handeye.fit import Poses
 from jcr.handeye.solve import solve_hand_eye
+from jcr.least_squares import minimise
 
 SOLVED = 24
 """At most so many readings are solved in full, the most congruent ones."""
@@ -251,6 +252,10 @@ def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses)
             )
 
 
+Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "3"]]
+"""base_from_recon, the scale, and the gripper's place in the camera in recon units times the scale."""
+
+
 def _rotation_from_positions(
     position: Float[ndarray, "n 3"], recon_from_camera: Poses
 ) -> Float[ndarray, "3 3"] | None:
@@ -260,21 +265,24 @@ def _rotation_from_positions(
     of the gripper enters.
     """
     camera, center = recon_from_camera[:, :3, :3], recon_from_camera[:, :3, 3]
-    base_from_recon, scale = fit_similarity(position, center)
-    rotation, offset, w = base_from_recon[:3, :3], base_from_recon[:3, 3], np.zeros(3)
-    miss = np.full_like(position, np.inf)
-    for _ in range(30):
+
+    def linearised(unknowns: Unknowns) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 10"]]:
+        base_from_recon, scale, w = unknowns
+        rotation = base_from_recon[:3, :3]
         arm = (scale * center - camera @ w) @ rotation.T
-        miss = position - arm - offset
         rows = np.zeros((len(position), 3, 10))
-        rows[:, :, :3] = -skew(arm)
-        rows[:, :, 3] = center @ rotation.T * scale
-        rows[:, :, 4:7] = -rotation @ camera
-        rows[:, :, 7:] = np.eye(3)
-        step = np.linalg.lstsq(rows.reshape(-1, 10), miss.ravel(), rcond=1e-9)[0]
-        step *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
-        rotation = rotation_exp(step[:3]) @ rotation
-        scale, w, offset = scale * np.exp(step[3]), w + step[4:7], offset + step[7:]
+        rows[:, :, :3] = np.eye(3)
+        rows[:, :, 3:6] = -skew(arm)
+        rows[:, :, 6] = center @ rotation.T * scale
+        rows[:, :, 7:] = -rotation @ camera
+        return arm + base_from_recon[:3, 3] - position, rows
+
+    def moved(unknowns: Unknowns, step: Float[ndarray, "10"]) -> Unknowns:
+        base_from_recon, scale, w = unknowns
+        return retract(base_from_recon, step[:6]), scale * float(np.exp(step[6])), w + step[7:]
+
+    found = minimise(linearised, (*fit_similarity(position, center), np.zeros(3)), moved)
     spread = np.sqrt(((position - position.mean(0)) ** 2).sum(1).mean())
-    left = np.sqrt((miss**2).sum(1).mean())
+    left = np.sqrt(2 * found.cost / len(position))
+    rotation = found.unknowns[0][:3, :3]
     return rotation if left < 0.1 * spread and 3 * len(position) > 12 else None

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, skew, step_between
+from jcr.geometry import inverse, scale_translation, skew, step_between
 
 Poses = Float[ndarray, "n 4 4"]
 TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
@@ -30,12 +30,14 @@ ASSUMED_NOISE = (5e-4, np.radians(0.1))
 
 
 def predict(
-    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], recon_from_camera: Poses
-) -> Poses:
-    """Gripper poses in base (n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹."""
-    scaled = recon_from_camera.copy()
-    scaled[:, :3, 3] *= scale
-    return z @ scaled @ inverse(x)
+    x: Float[ndarray, "*batch 4 4"],
+    scale: Float[ndarray, "*batch"] | np.floating | float,
+    z: Float[ndarray, "*batch 4 4"],
+    recon_from_camera: Poses,
+) -> Float[ndarray, "*batch n 4 4"]:
+    """Gripper poses in base (...,n,4,4): base_from_recon · S_λ(recon_from_camera) · X⁻¹, for one or many (X, λ, Z)."""
+    scaled = scale_translation(recon_from_camera, np.asarray(scale)[..., None])
+    return z[..., None, :, :] @ scaled @ inverse(x)[..., None, :, :]
 
 
 def residuals(

@@ -81,6 +81,9 @@ def fit_poses(
 ) -> PoseFit:
     """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon) on the `used` poses.
 
+    Between two steps the noise is estimated, and with it the residuals' covariance: what falls is no sum of squares that
+    least_squares.py could watch.
+
     `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the
     cameras, as records.CameraEvidence has it; None where they are exact beside the robot.
     """

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import ARM, skew
+from jcr.geometry import ARM, transform
+from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, residuals
 from jcr.handeye.fit import Cues, Poses
 from jcr.records import Excitation, Observability
 
@@ -30,18 +31,15 @@ def excitation(
     offset = np.zeros(3) if gripper_from_camera is None else gripper_from_camera[:3, 3]
     # An offset that was never seen may be anything; the excitation hardly depends on a plausible one.
     offset = offset * min(1.0, ARM / max(float(np.linalg.norm(offset)), 1e-9))
-    rotation = base_from_gripper[:, :3, :3]
-    centers = base_from_gripper[:, :3, 3] + rotation @ offset
-    arm = centers - centers.mean(0)
-    spread = max(float(np.sqrt((arm**2).sum(1).mean())), MIN_SPREAD)
-    j = np.zeros((n, 6, 13))
-    j[:, :3, 0:3] = -rotation
-    j[:, :3, 3:6] = -rotation @ skew(offset) / ARM
-    j[:, :3, 6] = arm / spread
-    j[:, :3, 7:10] = np.eye(3)
-    j[:, :3, 10:] = -skew(arm - rotation @ offset) / ARM
-    j[:, 3:, 3:6] = -np.eye(3)
-    j[:, 3:, 10:] = np.swapaxes(rotation, 1, 2)
+    x = transform(np.eye(3), offset)
+    camera = base_from_gripper @ x
+    base_from_centers = transform(np.eye(3), camera[:, :3, 3].mean(0))
+    camera[:, :3, 3] -= base_from_centers[:3, 3]
+    spread = max(float(np.sqrt((camera[:, :3, 3] ** 2).sum(1).mean())), MIN_SPREAD)
+    _, j = residuals(x, 1.0, base_from_centers, base_from_gripper, camera)
+    unit = np.ones(13)
+    unit[ROTATION], unit[SCALE], unit[BASE_ROTATION] = ARM, spread, ARM
+    j *= np.repeat([1.0, ARM], 3)[:, None] / unit
     hessian = np.einsum("nij,nik->jk", j, j) / n
     seen = hessian[:7, :7] - hessian[:7, 7:] @ np.linalg.pinv(hessian[7:, 7:], rcond=1e-12) @ hessian[7:, :7]
     if cues is not None and cues.scale is not None:

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.stats import f as f_distribution
 
-from jcr.geometry import ARM, nearest_rotation, rotation_angle
-from jcr.handeye.closed_form import closed_form, motions, sine_axis
+from jcr.geometry import ARM, rotation_angle
+from jcr.handeye.closed_form import closed_form, initial_estimate, motions, sine_axis
 from jcr.handeye.equation import predict
 from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
 
@@ -62,10 +62,7 @@ def _fit(
     cues: Cues | None,
     camera_covariance: Float[ndarray, "r r"] | None,
 ) -> PoseFit:
-    start = closed_form(base_from_gripper, recon_from_camera, trusted.astype(float))
-    # A negative or vanishing scale is no reconstruction's; the fit needs a positive one to start from.
-    scale = start[1] if start[1] > 0 else max(abs(start[1]), 1e-6)
-    start = (start[0], scale, start[2])
+    start = initial_estimate(base_from_gripper, recon_from_camera, trusted.astype(float))
     return fit_poses(base_from_gripper, recon_from_camera, start, trusted, noise, cues, camera_covariance)
 
 
@@ -85,22 +82,9 @@ def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[n
     """The subset of images with the least trimmed squared error over all candidate triples."""
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
-    a, b = motions(base_from_gripper), motions(recon_from_camera)
-    triples = _congruent_triples(a, b)
-    x_rotation, x_translation, scale = _solve_triples(a, b, triples)
-
-    # Each candidate predicts every image's motion from its triple's first image.
-    first = triples[:, 0]
-    seen, moved = b[first], a[first]
-    rotation = x_rotation[:, None] @ seen[..., :3, :3] @ np.swapaxes(x_rotation, 1, 2)[:, None]
-    position = (
-        scale[:, None, None] * np.einsum("hij,hnj->hni", x_rotation, seen[..., :3, 3])
-        + x_translation[:, None]
-        - np.einsum("hnij,hj->hni", rotation, x_translation)
-    )
-    error = ((position - moved[..., :3, 3]) ** 2).sum(-1) + ARM**2 * (
-        ((rotation - moved[..., :3, :3]) ** 2).sum((-1, -2)) / 2
-    )
+    triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
+    x, scale, z = closed_form(base_from_gripper[triples], recon_from_camera[triples], rounds=0)
+    error = _squared_error(x, scale, z, base_from_gripper, recon_from_camera)
     error[scale <= 0] = np.inf
     ranked = np.argsort(np.sort(error, axis=1)[:, :keep].sum(1), kind="stable")[:5]
 
@@ -126,15 +110,15 @@ def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[n
 
 
 def _squared_error(
-    x: Float[ndarray, "4 4"],
-    scale: float,
-    z: Float[ndarray, "4 4"],
+    x: Float[ndarray, "*batch 4 4"],
+    scale: Float[ndarray, "*batch"] | np.floating,
+    z: Float[ndarray, "*batch 4 4"],
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-) -> Float[ndarray, " n"]:
+) -> Float[ndarray, "*batch n"]:
     """Squared distance (m²) of every reported gripper pose from its prediction, rotation counted by ARM."""
     gap = predict(x, scale, z, recon_from_camera) - base_from_gripper
-    return (gap[:, :3, 3] ** 2).sum(1) + ARM**2 * (gap[:, :3, :3] ** 2).sum((1, 2)) / 2
+    return (gap[..., :3, 3] ** 2).sum(-1) + ARM**2 * (gap[..., :3, :3] ** 2).sum((-1, -2)) / 2
 
 
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
@@ -150,22 +134,3 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
     typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
     order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]
     return np.stack([i[order], j[order], k[order]], axis=1)
-
-
-def _solve_triples(
-    a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"], triples: Int[ndarray, "h 3"]
-) -> tuple[Float[ndarray, "h 3 3"], Float[ndarray, "h 3"], Float[ndarray, " h"]]:
-    """X and λ of every triple at once: the closed form on three motions."""
-    i, j = triples[:, [0, 0, 1]], triples[:, [1, 2, 2]]
-    a, b = a[i, j], b[i, j]
-    axes = np.einsum("hki,hkj->hij", sine_axis(a[..., :3, :3]), sine_axis(b[..., :3, :3]))
-    rotation = nearest_rotation(axes + 1e-12 * np.eye(3))
-    rows = np.zeros((*i.shape, 3, 4))
-    rows[..., :3] = np.eye(3) - a[..., :3, :3]
-    rows[..., 3] = np.einsum("hij,hkj->hki", rotation, b[..., :3, 3])
-    length = np.sqrt((rows[..., 3] ** 2).mean((1, 2))) + 1e-300
-    rows[..., 3] /= length[:, None, None]
-    normal = np.einsum("hkri,hkrj->hij", rows, rows) + 1e-10 * np.eye(4)
-    right = np.einsum("hkri,hkr->hi", rows, a[..., :3, 3])
-    solution = np.linalg.solve(normal, right[..., None])[..., 0]
-    return rotation, solution[:, :3], solution[:, 3] / length

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.optimize import least_squares
 
-from jcr.camera import WITHIN_FOLD, fold_distance_px, project
+from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
-from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, rotation_log, transform
+from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
+from jcr.least_squares import minimise
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
 from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
@@ -197,28 +197,33 @@ def _refined(
 ) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
     """All cameras and bodies adjusted to all points at once; the first body stays."""
     numbers = list(bodies)
-    moving = {body: len(cameras) + k for k, body in enumerate(numbers[1:])}
-    camera = lens.matrix, np.array(lens.distortion)
+    count, of_body = len(cameras), {body: k for k, body in enumerate(numbers)}
+    start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers])])
+    seen = [(row, count + of_body[s.body], s) for row, shown in enumerate(sightings) for s in shown]
 
-    def posed(unknowns: Float[ndarray, " u"]) -> tuple[ndarray, dict[int, ndarray]]:
-        start = np.concatenate([cameras, np.stack([bodies[body] for body in numbers[1:]])])
-        moved = retract(start, unknowns.reshape(-1, 6))
-        placed = {body: moved[row] for body, row in moving.items()}
-        return moved[: len(cameras)], {numbers[0]: bodies[numbers[0]]} | placed
+    def linearised(poses: Float[ndarray, "p 4 4"]) -> tuple[Float[ndarray, "k 1"], Float[ndarray, "k 1 u"]]:
+        residuals, jacobians = [], []
+        for row, place, s in seen:
+            arm = s.x_in_body @ poses[place, :3, :3].T
+            in_recon = arm + poses[place, :3, 3]
+            from_camera = in_recon - poses[row, :3, 3]
+            x_in_camera = from_camera @ poses[row, :3, :3]
+            turned = by_point(lens, x_in_camera) @ poses[row, :3, :3].T
+            jacobian = np.zeros((len(arm), 2, 6 * len(poses)))
+            jacobian[:, :, 6 * row : 6 * row + 6] = np.concatenate(
+                [-turned, turned @ skew(from_camera)], axis=2
+            )
+            jacobian[:, :, 6 * place : 6 * place + 6] = np.concatenate([turned, -turned @ skew(arm)], axis=2)
+            residuals.append((project(lens, x_in_camera) - s.x_px).reshape(-1, 1))
+            jacobians.append(jacobian.reshape(-1, 1, 6 * len(poses)))
+        held = slice(6 * count, 6 * count + 6)
+        return np.concatenate(residuals), np.delete(np.concatenate(jacobians), held, axis=2)
 
-    def missed(unknowns: Float[ndarray, " u"]) -> Float[ndarray, " r"]:
-        recon_from_camera, recon_from_body = posed(unknowns)
-        residual = []
-        for camera_from_recon, shown in zip(inverse(recon_from_camera), sightings, strict=True):
-            for s in shown:
-                camera_from_body = camera_from_recon @ recon_from_body[s.body]
-                turn = rotation_log(camera_from_body[:3, :3])
-                x_px = cv2.projectPoints(s.x_in_body, turn, camera_from_body[:3, 3], *camera)[0]
-                residual.append((x_px.reshape(-1, 2) - s.x_px).ravel())
-        return np.concatenate(residual)
+    def moved(poses: Float[ndarray, "p 4 4"], step: Float[ndarray, " u"]) -> Float[ndarray, "p 4 4"]:
+        return retract(poses, np.insert(step, 6 * count, np.zeros(6)).reshape(-1, 6))
 
-    unknowns = 6 * (len(cameras) + len(moving))
-    return posed(least_squares(missed, np.zeros(unknowns), loss="soft_l1", x_scale="jac", max_nfev=30).x)
+    poses = minimise(linearised, start, moved, "soft_l1").unknowns
+    return poses[:count], dict(zip(numbers, poses[count:], strict=True))
 
 
 def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[ndarray, "4 4"]]) -> Tracks:

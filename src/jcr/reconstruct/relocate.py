@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from jcr.camera import NORMALIZED, by_point, project, resized, unproject
 from jcr.geometry import across_lines, inverse, retract, rotation_exp, skew, transform
+from jcr.least_squares import minimise
 from jcr.records import Intrinsics, Reconstruction
 
 WORKING_SIZE_PX = 1600
@@ -27,6 +28,8 @@ MIN_POINTS = 30
 """Fewer agree by chance on repeated patterns."""
 LOSS_SCALE = 2.0
 """Cauchy loss, in sigma."""
+MEASUREMENTS = 10
+"""Of the image's noise, at most."""
 
 
 @dataclass(frozen=True)
@@ -162,24 +165,36 @@ def _refined(
     recon_from_camera: Float[ndarray, "4 4"],
     focal_px: float,
 ) -> Located:
-    """Gauss-Newton on the reprojection error under a Cauchy loss, and the covariance that it leaves.
+    """The least reprojection error under a Cauchy loss, and the covariance that it leaves.
 
-    A point is as uncertain as the old rays that met in it; one that few saw counts for little.
+    A point is as uncertain as the old rays that met in it; one that few saw counts for little. That, and the noise of
+    the image, are measured where the camera is, and again where it then comes to be.
     """
-    sigma, hessian = 1.0 / focal_px, np.eye(6)
-    for _ in range(15):
-        rotation, arm = recon_from_camera[:3, :3], points - recon_from_camera[:3, 3]
-        x = arm @ rotation
-        miss = project(NORMALIZED, x) - rays
-        turned = by_point(NORMALIZED, x) @ rotation.T
-        told = np.linalg.inv(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2))
-        squared = np.einsum("ki,kij,kj->k", miss, told, miss)
-        sigma = max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
-        told = told / (sigma**2 * (1 + squared / (LOSS_SCALE * sigma) ** 2))[:, None, None]
-        jacobian = np.concatenate([-turned, turned @ skew(arm)], axis=2)
-        hessian = np.einsum("kai,kab,kbj->ij", jacobian, told, jacobian)
-        step = -np.linalg.solve(hessian, np.einsum("kai,kab,kb->i", jacobian, told, miss))
-        recon_from_camera = retract(recon_from_camera, step)
-        if float(step @ hessian @ step) < 1e-8:
+    sigma, normal = 1.0 / focal_px, np.eye(6)
+    for _ in range(MEASUREMENTS):
+        residual, jacobian = _reprojection(points, rays, recon_from_camera)
+        turned = -jacobian[:, :, :3]
+        whitening = np.linalg.inv(np.linalg.cholesky(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2)))
+        squared = ((whitening @ residual[..., None]) ** 2).sum((1, 2))
+        before, sigma = sigma, max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
+        whitening /= LOSS_SCALE * sigma
+
+        def whitened(pose: Float[ndarray, "4 4"], whitening: ndarray = whitening) -> tuple[ndarray, ndarray]:
+            residual, jacobian = _reprojection(points, rays, pose)
+            return (whitening @ residual[..., None])[..., 0], whitening @ jacobian
+
+        found = minimise(whitened, recon_from_camera, retract, "cauchy")
+        recon_from_camera, normal = found.unknowns, LOSS_SCALE**2 * found.normal
+        if abs(sigma - before) < 1e-6 * sigma:
             break
-    return Located(recon_from_camera, np.linalg.inv(hessian), len(points), sigma * focal_px)
+    return Located(recon_from_camera, np.linalg.inv(normal), len(points), sigma * focal_px)
+
+
+def _reprojection(
+    points: Float[ndarray, "k 3"], rays: Float[ndarray, "k 2"], recon_from_camera: Float[ndarray, "4 4"]
+) -> tuple[Float[ndarray, "k 2"], Float[ndarray, "k 2 6"]]:
+    """By how much the camera misses the rays, and the derivative by its step."""
+    rotation, arm = recon_from_camera[:3, :3], points - recon_from_camera[:3, 3]
+    x = arm @ rotation
+    turned = by_point(NORMALIZED, x) @ rotation.T
+    return project(NORMALIZED, x) - rays, np.concatenate([-turned, turned @ skew(arm)], axis=2)

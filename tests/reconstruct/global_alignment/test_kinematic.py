@@ -8,13 +8,13 @@ import pytest
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, transform
+from jcr.handeye.closed_form import initial_estimate
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import AlignOptions, align
 from jcr.reconstruct.global_alignment.kinematic import (
     KinematicAlignment,
     KinematicOptions,
     align_kinematic,
-    hand_eye_from_motions,
 )
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
@@ -76,7 +76,7 @@ def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
     for seed in range(8):
         truth = robot(4, seed)
         alignment = align(truth.predictions, FEW_PIXELS)
-        guess, scale = hand_eye_from_motions(truth.base_from_gripper, alignment.recon_from_camera)
+        guess, scale, _ = initial_estimate(truth.base_from_gripper, alignment.recon_from_camera)
         found = align_kinematic(
             truth.predictions, truth.base_from_gripper, KinematicOptions((0.0, 0.0), FEW_PIXELS)
         )

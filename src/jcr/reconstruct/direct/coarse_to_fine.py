@@ -105,7 +105,11 @@ def aligned(
 def descended(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """A few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters."""
+    """A few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
+
+    Not least_squares.py: thousands of depths are eliminated, and steps cost so much more than the energy that a
+    thousandth of it is not worth another one.
+    """
     damping, best = 1e-3, energy(level, cameras, points, sigma)
     for _ in range(6):
         system = equations(level, cameras, points, sigma, tied=len(directions) == 7)

@@ -1,6 +1,7 @@
 """Which pairs of images a network is shown."""
 
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Literal
 
@@ -8,15 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import (
-    apply,
-    fit_similarity,
-    inverse,
-    nearest_rotation,
-    rotation_angle,
-    rotation_log,
-    transform,
-)
+from jcr.geometry import apply, fit_similarity, inverse, rotation_angle, transform
+from jcr.handeye.closed_form import rotations
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
 FEW_IMAGES = 12
@@ -96,12 +90,15 @@ def _first_calibration(
     gripper_motion = inverse(base_from_gripper[:-1]) @ base_from_gripper[1:]
     camera_motion = np.stack([view.camera_from_next for view in views])
     rotation_a, rotation_b = gripper_motion[:, :3, :3], camera_motion[:, :3, :3]
-    # Park and Martin 1994: log R_A = R log R_B for every motion.
-    cross = rotation_log(rotation_a).T @ rotation_log(rotation_b)
-    largest, second, _ = np.linalg.svd(cross, compute_uv=False)
-    if largest < 1e-3 or second < 0.02 * largest:
+    # (1 − cos θ) a aᵀ of each rotation by θ about a, half of its squared logarithm where it is small.
+    cosine = (np.trace(rotation_a, axis1=1, axis2=2) - 1) / 2
+    scatter = rotation_a.sum(0) - cosine.sum() * np.eye(3)
+    _, second, largest = np.linalg.eigvalsh((scatter + scatter.T) / 2)
+    if largest < 5e-4 or second < 0.02 * largest:
         return "neighbours turn about less than two axes, so where the camera looks is unknown"
-    rotation = nearest_rotation(cross)
+    # Chained along the neighbours, for any frame of the cameras will do.
+    camera = np.stack(list(accumulate(rotation_b, np.matmul, initial=np.eye(3))))
+    rotation, _ = rotations(base_from_gripper[:, :3, :3], camera, np.ones(len(camera)))
     miss = rotation_angle(np.swapaxes(rotation_a @ rotation, -1, -2) @ rotation @ rotation_b)
     if np.median(miss) > np.radians(10):
         return "the pairs of neighbours do not agree with the robot's rotations"

@@ -15,14 +15,13 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import (
     inverse,
-    nearest_rotation,
     retract,
     rotation_log,
     scale_translation,
     skew,
     step_axes,
-    transform,
 )
+from jcr.handeye.closed_form import initial_estimate
 from jcr.handeye.noise import REACH
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import (
@@ -215,7 +214,7 @@ def solve_kinematic(
     gripper_from_camera: Float[ndarray, "4 4"] | None = None,
 ) -> tuple[Solution, HandEyeCameras]:
     """Kinematic alignment, base frame and metres, from a free one; raises as `gauss_newton` does."""
-    start, scale = hand_eye_from_motions(base_from_gripper, free.state.recon_from_camera)
+    start, scale, _ = initial_estimate(base_from_gripper, free.state.recon_from_camera)
     cameras = HandEyeCameras(
         base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
     )
@@ -251,22 +250,3 @@ def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tup
         f"the pictures contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
         "robot's noise; these poses are wrong, or --robot-noise is too small",
     )
-
-
-def hand_eye_from_motions(
-    base_from_gripper: Float[ndarray, "n 4 4"], recon_from_camera: Float[ndarray, "n 4 4"]
-) -> tuple[Float[ndarray, "4 4"], float]:
-    """gripper_from_camera and scale from all motions: rotation after Park and Martin (1994), then one least
-    squares for translation and scale (the paper's scale recovery problem, without its grid)."""
-    i, j = np.triu_indices(len(base_from_gripper), 1)
-    a = inverse(base_from_gripper[i]) @ base_from_gripper[j]
-    b = inverse(recon_from_camera[i]) @ recon_from_camera[j]
-    rotation = nearest_rotation(rotation_log(a[:, :3, :3]).T @ rotation_log(b[:, :3, :3]))
-    moved_by = b[:, :3, 3] @ rotation.T
-    left = np.concatenate([a[:, :3, :3] - np.eye(3), -moved_by[:, :, None]], axis=2)
-    solution = np.linalg.lstsq(left.reshape(-1, 4), -a[:, :3, 3].ravel(), rcond=1e-10)[0]
-    scale = float(solution[3])
-    if scale <= 0:
-        # Motions that do not show the scale: their lengths at least bound it.
-        scale = float(np.linalg.norm(a[:, :3, 3]) / max(np.linalg.norm(moved_by), 1e-12))
-    return transform(rotation, solution[:3]), scale

@@ -1,0 +1,118 @@
+"""The damped robust Gauss-Newton against SciPy's, on curves, on poses, on what it cannot see."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
+from jcr.least_squares import loss_weight, minimise
+
+TIME = np.linspace(0, 4, 60)
+
+
+def curve(p):
+    """A decaying oscillation, whose parameters are badly scaled and far from linear."""
+    return p[0] * np.exp(-p[1] * TIME) * np.cos(p[2] * TIME) + 100 * p[3]
+
+
+def linearised(observed):
+    def at(p):
+        decayed = np.exp(-p[1] * TIME)
+        wave, slope = np.cos(p[2] * TIME), -np.sin(p[2] * TIME)
+        columns = (
+            decayed * wave,
+            -TIME * p[0] * decayed * wave,
+            TIME * p[0] * decayed * slope,
+            np.full(60, 100.0),
+        )
+        return (curve(p) - observed)[:, None], np.stack(columns, axis=1)[:, None]
+
+    return at
+
+
+def plus(p, step):
+    return p + step
+
+
+@pytest.fixture
+def observed():
+    rng = np.random.default_rng(0)
+    noisy = curve(np.array([3.0, 0.4, 2.5, 0.01])) + 0.1 * rng.normal(size=60)
+    noisy[::9] += 5.0
+    return noisy
+
+
+@pytest.mark.parametrize("loss", ["linear", "soft_l1", "cauchy"])
+def test_the_minimum_is_scipys(loss, observed):
+    start = np.array([2.0, 0.2, 2.2, 0.0])
+    expected = least_squares(
+        lambda p: curve(p) - observed, start, loss=loss, x_scale="jac", xtol=1e-12, ftol=1e-14, gtol=1e-12
+    )
+    found = minimise(linearised(observed), start, plus, loss)
+    assert found.settled
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    np.testing.assert_allclose(found.unknowns, expected.x, rtol=1e-5)
+    if loss == "linear":
+        np.testing.assert_allclose(found.normal, expected.jac.T @ expected.jac, rtol=1e-4, atol=1e-2)
+
+
+def test_steps_that_overshoot_are_damped():
+    """Rosenbrock's valley: the first undamped step makes the cost seventy times as large."""
+
+    def at(p):
+        x, y = p
+        residual = np.array([[10 * (y - x * x)], [1 - x]])
+        return residual, np.array([[[-20 * x, 10.0]], [[-1.0, 0.0]]])
+
+    start = np.array([-1.2, 1.0])
+    residual, jacobian = at(start)
+    full = start - np.linalg.solve(jacobian[:, 0], residual[:, 0])
+    assert (at(full)[0] ** 2).sum() > 70 * (residual**2).sum()
+    found = minimise(at, start, plus)
+    assert found.settled
+    np.testing.assert_allclose(found.unknowns, [1.0, 1.0], atol=1e-9)
+
+
+def test_losses_tame_whole_residuals_not_their_components():
+    """A pose from points, some of them metres off: the loss sees three components as one length."""
+    rng = np.random.default_rng(1)
+    true = transform(rotation_exp(np.array([0.3, -2.0, 1.0])), np.array([1.0, 2.0, 3.0]))
+    x = rng.normal(size=(40, 3))
+    seen = apply(true, x) + 1e-3 * rng.normal(size=(40, 3))
+    seen[:8] += rng.normal(size=(8, 3)) * 3
+
+    def at(pose):
+        arm = x @ pose[:3, :3].T
+        jacobian = np.zeros((40, 3, 6))
+        jacobian[:, :, :3] = np.eye(3)
+        jacobian[:, :, 3:] = -skew(arm)
+        return (arm + pose[:3, 3] - seen) / 1e-2, jacobian / 1e-2
+
+    found = minimise(at, np.eye(4), retract, "cauchy")
+    assert np.abs(step_between(found.unknowns, true)).max() < 1e-3
+    length = np.linalg.norm(at(found.unknowns)[0], axis=1)
+    assert found.cost == pytest.approx(0.5 * np.log1p(length**2).sum())
+
+
+def test_exact_data_settle_at_zero(observed):
+    true = np.array([3.0, 0.4, 2.5, 0.01])
+    found = minimise(linearised(curve(true)), np.array([2.0, 0.2, 2.2, 0.0]), plus)
+    assert found.settled and found.cost < 1e-20
+    np.testing.assert_allclose(found.unknowns, true, rtol=1e-9)
+
+
+def test_what_no_residual_sees_stays(observed):
+    def at(p):
+        residual, jacobian = linearised(observed)(p[:4])
+        return residual, np.concatenate([jacobian, np.zeros((60, 1, 1))], axis=2)
+
+    found = minimise(at, np.array([2.0, 0.2, 2.2, 0.0, 7.0]), plus)
+    assert found.settled and found.unknowns[4] == 7.0
+
+
+def test_weights_are_the_losses_slopes():
+    squared = np.linspace(0, 9, 10)
+    losses = {"linear": lambda s: s, "soft_l1": lambda s: 2 * (np.sqrt(1 + s) - 1), "cauchy": np.log1p}
+    for name, rho in losses.items():
+        numeric = (rho(squared + 1e-6) - rho(squared - 1e-6)) / 2e-6
+        np.testing.assert_allclose(loss_weight(name, squared), numeric, rtol=1e-6)
