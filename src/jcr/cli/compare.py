@@ -32,7 +32,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Print the difference, and how many of the calibration's own sigmas it is where they are known."""
     from jcr.calibration.calibration_json import read_hand_eye
-    from jcr.geometry import rotation_between_deg, rotation_log
+    from jcr.geometry import rotation_between_deg, step_between
 
     ours, covariance = read_hand_eye(arguments.out)
     reference, _ = read_hand_eye(arguments.reference)
@@ -44,8 +44,7 @@ def main(arguments: Arguments) -> int:
     }
     text = f"{result['translation_mm']:.3f} mm, {result['rotation_deg']:.4f}°"
     if covariance is not None:
-        error = np.concatenate([offset, rotation_log(reference[:3, :3] @ ours[:3, :3].T)])
-        sigmas = (np.abs(error) / np.sqrt(np.diag(covariance)[:6])).tolist()
+        sigmas = (np.abs(step_between(ours, reference)) / np.sqrt(np.diag(covariance)[:6])).tolist()
         result["sigmas"] = sigmas
         text += f"; at most {max(sigmas):.1f} of its reported standard deviations on any axis"
     arguments.output.result(text + "\n", result)
