@@ -15,7 +15,7 @@ from jcr.geometry import apply, transform
 from jcr.represent.build import build_scene
 from jcr.represent.cloud_ply import write_cloud
 from jcr.represent.options import MapOptions
-from jcr.represent.robot import covering_spheres, load_robot
+from jcr.represent.robot import load_robot, spheres_of_shape
 from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap
 from places import ROOT
 
@@ -76,7 +76,7 @@ def scene() -> SceneMap:
 )
 def test_spheres_hold_the_shape_and_little_else(shape: trimesh.Trimesh):
     link_from_shape = transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.1, 0.2, 0.3]))
-    centers, radii = covering_spheres(shape, link_from_shape, EXCESS)
+    centers, radii = spheres_of_shape(shape, link_from_shape, EXCESS)
     surface = shape.sample(3000, seed=0)
     low, high = shape.bounds + [[-0.05], [0.05]]
     around = np.random.default_rng(0).uniform(low, high, (5000, 3))

@@ -150,7 +150,7 @@ def _load(path: Path, changed_ns: int, excess: float) -> RobotSpheres:
             on = scene.graph.transforms.parents[on]
             link_from_shape, name = scene.graph.get(frame_to=node, frame_from=on)
         found[on] += 1
-        center, radius = covering_spheres(scene.geometry[name], np.asarray(link_from_shape), excess)
+        center, radius = spheres_of_shape(scene.geometry[name], np.asarray(link_from_shape), excess)
         link.append(np.full(len(radius), links.index(on)))
         centers.append(center)
         radii.append(radius)
@@ -205,7 +205,7 @@ def _joints(robot: Any, links: tuple[str, ...], path: Path) -> tuple[RobotJoint,
     return tuple(joints)
 
 
-def covering_spheres(
+def spheres_of_shape(
     shape: trimesh.Trimesh, link_from_shape: Float[ndarray, "4 4"], excess: float
 ) -> tuple[Float[ndarray, "s 3"], Float[ndarray, " s"]]:
     """Centres (s,3) in the link and radii (s,) of spheres that together hold all of a solid shape.

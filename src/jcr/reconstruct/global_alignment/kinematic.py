@@ -16,10 +16,10 @@ from jcr.errors import InputError
 from jcr.geometry import (
     inverse,
     retract,
-    rotation_log,
     scale_translation,
     skew,
     step_axes,
+    step_between,
 )
 from jcr.handeye.closed_form import initial_estimate
 from jcr.handeye.noise import REACH
@@ -166,8 +166,7 @@ class HandEyeCameras:
 
     def deviation(self) -> Float[ndarray, "n 6"]:
         """How far the gripper poses have moved from the measured ones, in gripper axes."""
-        gap = inverse(self.measured) @ self.base_from_gripper
-        return np.concatenate([gap[:, :3, 3], rotation_log(gap[:, :3, :3])], axis=1)
+        return step_between(np.eye(4), inverse(self.measured) @ self.base_from_gripper)
 
 
 def align_kinematic(
