@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_log
+from jcr.geometry import step_between
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,6 @@ def difference(
     reference: Float[ndarray, "4 4"],
 ) -> Difference:
     """The difference of a reference from a calibration, whose covariance is in records.COVARIANCE_ORDER."""
-    translation = reference[:3, 3] - gripper_from_camera[:3, 3]
-    rotation = rotation_log(reference[:3, :3] @ gripper_from_camera[:3, :3].T)
-    sigmas = None
-    if covariance is not None:
-        sigmas = np.abs(np.concatenate([translation, rotation])) / np.sqrt(np.diag(covariance)[:6])
-    return Difference(translation, rotation, sigmas)
+    step = step_between(gripper_from_camera, reference)
+    sigmas = None if covariance is None else np.abs(step) / np.sqrt(np.diag(covariance)[:6])
+    return Difference(step[:3], step[3:], sigmas)
