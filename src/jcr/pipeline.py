@@ -24,7 +24,7 @@ from jcr.calibration.calibration_json import (
     read_calibration,
     write_calibration,
 )
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.capture.added import FOLDER as ADDED
@@ -33,15 +33,16 @@ from jcr.capture.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.export.points import read_cloud, write_cloud
+from jcr.extras import is_installed
 from jcr.files import remove_unfinished, write_text
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, candidates, device_of
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, PointCloud, PosePairs, Reconstruction
-from jcr.represent.build import build_scene
-from jcr.represent.cloud import CloudOptions, point_cloud
-from jcr.represent.options import MapOptions
+from jcr.represent.cloud import point_cloud
+from jcr.represent.map_file import require_packages
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunResult
 from jcr.segment.measure import Measured
 from jcr.segment.measure import measure as measure_cloud
@@ -65,7 +66,8 @@ class RunOptions:
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
-    map: MapOptions = field(default_factory=MapOptions)
+    map: MapOptions | None = field(default_factory=MapOptions)
+    """None: no cloud and no map, and no dense depth, which only these need."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 
@@ -80,14 +82,20 @@ def run(
     """Everything: calibration, cloud, map and report of a capture in the folder `out`.
 
     Finished stages are taken from `out` when capture and options are unchanged. Raises InputError on input
-    that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
+    that cannot be used, or where the map is asked for and torch is not installed, and NotTrustedError when no
+    camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
+    if options.map is None:
+        options = _sparse(options)
+    else:
+        require_map(options.reconstruct)
     with run_folder(Path(out)) as folder:
         capture = kept(capture, folder / CAPTURE)
         added = read_added(folder, capture)
         result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
+        if options.map is not None:
+            result = _map(capture, added, folder, options, options.map, result, progress)
         _report(capture, result, progress)
         return result
 
@@ -100,8 +108,13 @@ def calibrate(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
+    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does.
+
+    Without torch there is no dense depth, which only a later map needs.
+    """
     options = _with_backend(options, backend, capture)
+    if not is_installed("torch"):
+        options = _sparse(options)
     with run_folder(Path(out)) as folder:
         return _calibrate(kept(capture, folder / CAPTURE), folder, options, progress)
 
@@ -135,19 +148,32 @@ def build_map(
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
     not the calibration, and every later map of the folder has them.
     """
+    require_map()
     capture = read_capture_of(out)
     with run_folder(Path(out)) as folder:
+        made = options_of(out)
         options = replace(
-            options_of(out),
+            made,
+            reconstruct=replace(made.reconstruct, dense=True),
             cloud=cloud or CloudOptions(),
-            map=map or MapOptions(),
             segment=segment or SegmentOptions(),
         )
         added = with_images(read_added(folder, capture), add)
         result = _calibrate(capture, folder, options, progress)
-        result = _map(capture, added, folder, options, result, progress)
+        result = _map(capture, added, folder, options, map or MapOptions(), result, progress)
         _report(capture, result, progress)
         return result
+
+
+def require_map(options: ReconstructOptions | None = None) -> None:
+    """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
+    if options is not None and not options.dense:
+        raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
+    require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do without")
+
+
+def _sparse(options: RunOptions) -> RunOptions:
+    return replace(options, reconstruct=replace(options.reconstruct, dense=False))
 
 
 def read_capture_of(out: str | Path) -> Capture:
@@ -175,11 +201,12 @@ def options_of(out: str | Path) -> RunOptions:
 
 def _calibrate(capture: Capture, folder: Path, options: RunOptions, progress: Progress | None) -> RunResult:
     report = progress or silent
-    # What auto stands for changes with the weights that are on this machine.
-    made_from = fingerprint(
-        capture, asdict(options.reconstruct) | {"backend": candidates(options.reconstruct)}
-    )
     state = _read_state(folder)
+    if state.get("reconstruct") == _made_from(capture, replace(options.reconstruct, dense=True)):
+        options = replace(
+            options, reconstruct=replace(options.reconstruct, dense=True)
+        )  # it is there already
+    made_from = _made_from(capture, options.reconstruct)
     start = time.perf_counter()
     try:
         if state.get("reconstruct") == made_from:
@@ -225,9 +252,12 @@ def _map(
     added: Capture,
     folder: Path,
     options: RunOptions,
+    map_options: MapOptions,
     result: RunResult,
     progress: Progress | None,
 ) -> RunResult:
+    from jcr.represent.build import build_scene
+
     start = time.perf_counter()
     reconstruction, device = result.reconstruction, device_of(options.reconstruct)
     if len(added):
@@ -246,7 +276,7 @@ def _map(
     cloud, notes = _cloud(capture, reconstruction, result.hand_eye, options, progress)
     write_cloud(folder / "cloud.ply", cloud)
     give_back()
-    scene = build_scene(cloud, options.map, progress, device=device)
+    scene = build_scene(cloud, map_options, progress, device=device)
     scene.save(folder / "map.safetensors")
     timings = result.calibration.timings_s | {"map": round(time.perf_counter() - start, 3)}
     warnings = [*result.calibration.warnings, *notes]
@@ -358,6 +388,11 @@ def _replace_calibration(folder: Path, content: CalibrationFile) -> None:
         for name in OF_CALIBRATION:
             (folder / name).unlink(missing_ok=True)
     write_calibration(folder / "calibration.json", content)
+
+
+def _made_from(capture: Capture, options: ReconstructOptions) -> str:
+    # What auto stands for changes with the weights that are on this machine.
+    return fingerprint(capture, asdict(options) | {"backend": candidates(options)})
 
 
 def fingerprint(capture: Capture, options: dict[str, Any]) -> str:

@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.records import HandEye, PointCloud, Reconstruction
-from jcr.represent.scene import SceneMap
 from jcr.segment.measure import Measured
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class RunResult:
     hand_eye: HandEye
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
-    scene: SceneMap | None = None
+    scene: "SceneMap | None" = None
     measured: Measured | None = None
     """None without a map, and where no plane carries the scene."""
 

@@ -182,7 +182,7 @@ class Run:
     @cached_property
     def scene(self) -> "SceneMap":
         """map.safetensors."""
-        from jcr.represent.scene import load_map
+        from jcr.represent.map_file import load_map
 
         return load_map(self.arguments.out)
 

@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.extras import extra, is_installed
 from jcr.progress import Progress
 from jcr.reconstruct.checkpoints import CHECKPOINTS
 from jcr.records import CameraEvidence, Capture, Reconstruction
@@ -40,6 +40,9 @@ class ReconstructOptions:
     board: str | None = None
     """The board or tags that marker looks for, lengths in metres: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    dense: bool = True
+    """Estimate the dense depth that the map needs; without, a calibration alone comes sooner (networks predict it
+    anyway)."""
     memory_gb: float = 8.0
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
@@ -62,7 +65,7 @@ class Backend:
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
-        return not self.package or find_spec(self.package) is not None
+        return not self.package or is_installed(self.package)
 
     def reconstruct(
         self, capture: Capture, options: ReconstructOptions, progress: Progress | None
@@ -79,8 +82,16 @@ BACKENDS = {
         Backend("colmap", "BSD-3-Clause", False, "jcr.reconstruct.backends:_colmap"),
         Backend("direct", "Apache-2.0", False, "jcr.reconstruct.backends:_direct"),
         Backend("compact", CHECKPOINTS["compact"].licence, False, "jcr.reconstruct.backends:_compact"),
-        Backend("dust3r", CHECKPOINTS["dust3r"].licence, False, "jcr.reconstruct.backends:_dust3r"),
-        Backend("mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r"),
+        Backend(
+            "dust3r",
+            CHECKPOINTS["dust3r"].licence,
+            False,
+            "jcr.reconstruct.backends:_dust3r",
+            package="torch",
+        ),
+        Backend(
+            "mast3r", CHECKPOINTS["mast3r"].licence, True, "jcr.reconstruct.backends:_dust3r", package="torch"
+        ),
         Backend(
             "mapanything",
             CHECKPOINTS["mapanything"].licence,
@@ -166,8 +177,9 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
 
 def device_of(options: ReconstructOptions) -> str:
     """cuda or cpu; `auto` is cuda where there is one. InputError when cuda is asked for and absent."""
-    import torch
-
+    if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
+        return "cpu"
+    torch = extra("torch", "networks", "--device cuda")
     if options.device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: this machine has no CUDA device that torch sees; use --device cpu")
     if options.device == "auto":
@@ -175,14 +187,20 @@ def device_of(options: ReconstructOptions) -> str:
     return options.device
 
 
+def _dense(options: ReconstructOptions) -> dict[str, Any]:
+    """What the options say of dense depth, for the back ends that estimate it without a network."""
+    device = device_of(options) if options.dense else "cpu"
+    return {"dense": options.dense, "device": device, "memory_gb": options.memory_gb}
+
+
 def _colmap(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, ColmapOptions(seed=options.seed, **_dense(options)), progress)
 
 
 def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.dust3r.backend import Dust3rOptions, reconstruct
     from jcr.reconstruct.global_alignment.pairs import PairOptions
 
@@ -194,8 +212,7 @@ def _dust3r(capture: Capture, options: ReconstructOptions, progress: Progress | 
 def _direct(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
 
-    made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, DirectOptions(**_dense(options)), progress)
 
 
 def _compact(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
@@ -210,6 +227,7 @@ def _compact(capture: Capture, options: ReconstructOptions, progress: Progress |
 
 
 def _mapanything(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
+    extra("torch", "networks", "--backend mapanything")
     from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
 
     weights = options.weights or CHECKPOINTS["mapanything"].hub_id
@@ -221,8 +239,7 @@ def _marker(capture: Capture, options: ReconstructOptions, progress: Progress | 
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    made = MarkerOptions(options.board, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, MarkerOptions(options.board, **_dense(options)), progress)
 
 
 def _predictions(capture: Capture, options: ReconstructOptions, progress: Progress | None) -> Reconstruction:
@@ -239,5 +256,5 @@ def _given(capture: Capture, options: ReconstructOptions, progress: Progress | N
 
     if options.weights is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --weights PATH")
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    made = ColmapOptions(seed=options.seed, **_dense(options))
     return reconstruct(capture, Path(options.weights), made, progress)

@@ -4,6 +4,8 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from jcr.extras import is_installed
+
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
 HUB_FILES = ("config.json", "model.safetensors")
 COMPACT = Path(__file__).parents[1] / "weights" / "compact"
@@ -23,6 +25,8 @@ class Checkpoint:
         """Whether its files are on this machine, without asking the network."""
         if Path(self.hub_id).is_absolute():
             return all((Path(self.hub_id) / name).is_file() for name in HUB_FILES)
+        if not is_installed("huggingface_hub"):
+            return False
         from huggingface_hub import try_to_load_from_cache
 
         return all(isinstance(try_to_load_from_cache(self.hub_id, name), str) for name in HUB_FILES)

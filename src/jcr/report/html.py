@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from html import escape
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.extras import is_installed
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
@@ -22,9 +23,11 @@ from jcr.report.objects import objects_section
 from jcr.report.samples import sample_surface
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
-from jcr.represent.scene import SceneMap
 from jcr.results import RunResult
 from jcr.rounding import significant
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
@@ -180,7 +183,7 @@ def _before_after(capture: Capture, result: RunResult, base_from_camera: Transfo
     )
 
 
-def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = None) -> str:
+def _details(calibration: CalibrationFile, out: Path, scene: "SceneMap | None" = None) -> str:
     timings = calibration.timings_s
     blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
     blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
@@ -199,7 +202,7 @@ def _details(calibration: CalibrationFile, out: Path, scene: SceneMap | None = N
         }
     packages = ("numpy", "scipy", "torch", "pycolmap")
     blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}
-    blocks["Versions"] |= {name: metadata.version(name) for name in packages}
+    blocks["Versions"] |= {name: metadata.version(name) for name in packages if is_installed(name)}
     columns = []
     for title, rows in blocks.items():
         items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())

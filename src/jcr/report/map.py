@@ -1,6 +1,7 @@
 """The section that shows the trained map: from the cameras' places, and cut open."""
 
 from html import escape
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from jcr.report.figures import TRACK_COLOR, label_colors, picture_url, rendered_
 from jcr.report.images import THUMBNAIL, shown_names
 from jcr.report.markup import filled
 from jcr.report.samples import CLEARANCE, SurfacePoints, point_size, slices
-from jcr.represent.scene import SceneMap
 from jcr.results import RunResult
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 WIDE = 480
 """Pixels across of a picture that stands alone."""
@@ -23,7 +26,7 @@ PAIRS = 4
 
 def map_section(
     result: RunResult,
-    scene: SceneMap,
+    scene: "SceneMap",
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
 ) -> str:
@@ -70,7 +73,7 @@ def _overlaid(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> s
 
 def _pairs(
     result: RunResult,
-    scene: SceneMap,
+    scene: "SceneMap",
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
 ) -> str:

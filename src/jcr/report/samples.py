@@ -1,13 +1,16 @@
 """What the trained map says, asked where a picture of it needs an answer."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from jcr.represent.scene import SceneMap
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
+
 
 MAX_CELLS = 700_000
 """Questions that find the surface: well under a second on one core."""
@@ -44,7 +47,7 @@ class Slice:
     unknown: Bool[ndarray, "h w"]
 
 
-def sample_surface(scene: SceneMap, count: int, seed: int = 0) -> SurfacePoints:
+def sample_surface(scene: "SceneMap", count: int, seed: int = 0) -> SurfacePoints:
     """At most `count` points of occupancy over one half, spread evenly over where known free space ends."""
     low, high = scene.box
     pitch = max(scene.cell, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
@@ -78,7 +81,7 @@ def sample_surface(scene: SceneMap, count: int, seed: int = 0) -> SurfacePoints:
     return SurfacePoints(x, color, answer.label, float(sample.unknown.mean()))
 
 
-def slices(scene: SceneMap, surface: SurfacePoints) -> tuple[Slice, Slice]:
+def slices(scene: "SceneMap", surface: SurfacePoints) -> tuple[Slice, Slice]:
     """A horizontal slice just above the support surface, and a vertical one through what stands on it."""
     x = surface.points_in_base if len(surface.points_in_base) else scene.box.mean(0, keepdims=True)
     height = _fullest(x[:, 2], LAYER) + CLEARANCE
@@ -95,7 +98,7 @@ def point_size(points: Float[ndarray, "n 3"]) -> float:
     return round(2.2 * float(np.median(nearest)), 5)
 
 
-def _slice(scene: SceneMap, axes: tuple[int, int], at: float) -> Slice:
+def _slice(scene: "SceneMap", axes: tuple[int, int], at: float) -> Slice:
     extent = scene.box[:, axes]
     sides = extent[1] - extent[0]
     pitch = max(scene.cell / 2, float(sides.max()) / 320)

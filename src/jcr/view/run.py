@@ -14,7 +14,8 @@ from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.pipeline import read_capture_of
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.records import Intrinsics, PointCloud, Reconstruction
-from jcr.represent.scene import FILE, SceneMap, load_map
+from jcr.represent.map_file import FILE, load_map
+from jcr.represent.scene import SceneMap
 
 CLOUD_POINTS = 200_000
 """Of pointmaps that no map was made of yet, at most."""
