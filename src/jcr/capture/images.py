@@ -104,5 +104,5 @@ def sharpness(picture: bytes | UInt8[ndarray, "h w 3"]) -> float:
     """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
     if not isinstance(picture, bytes):
         return brightness_and_sharpness(picture)[1]
-    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
-    return 0.0 if pixels is None else brightness_and_sharpness(np.asarray(pixels, dtype=np.uint8))[1]
+    bgr = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    return 0.0 if bgr is None else brightness_and_sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))[1]
