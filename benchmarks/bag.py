@@ -16,10 +16,10 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from jcr.capture.extras import extra
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
+from jcr.extras import extra
 from jcr.geometry import ARM, rotation_between_deg, transform
 from jcr.records import Capture
 from jcr.simulate.problem import disturbed

@@ -262,7 +262,7 @@ def _fcl(
         import fcl
     except ImportError:
         raise InputError(
-            "bench map: needs python-fcl and pyoctomap; pip install 'jcr[dev,planning]'"
+            "bench map: needs python-fcl and pyoctomap; pip install 'jcr-handeye[dev,planning]'"
         ) from None
     tree: Any = fcl
     write_octomap(folder / "map.bt", scene, Provenance("base"))

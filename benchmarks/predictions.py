@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.synthetic_pairs import pairs_of_capture
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all

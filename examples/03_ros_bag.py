@@ -2,8 +2,8 @@
 
     python examples/03_ros_bag.py [BAG BASE_FRAME GRIPPER_FRAME]
 
-ROS 1, sqlite3 and MCAP bags are read without ROS; needs `pip install 'jcr[ros]'`. Without a bag a short MCAP of an
-arm over the bundled table is made and read. The capture is left in out/ros_bag/capture: go on with `jcr run`.
+ROS 1, sqlite3 and MCAP bags are read without ROS; needs `pip install 'jcr-handeye[ros]'`. Without a bag a short MCAP
+of an arm over the bundled table is made and read. The capture is left in out/ros_bag/capture: go on with `jcr run`.
 """
 
 import shutil

@@ -3,7 +3,7 @@
     jcr run examples/tabletop out/tabletop
     python examples/05_plan_with_ompl.py out/tabletop
 
-Needs `pip install 'jcr[planning]'`. The arm (arm.urdf) moves its gripper from one side of a carton to the other.
+Needs `pip install 'jcr-handeye[planning]'`. The arm (arm.urdf) moves its gripper from one side of a carton to the other.
 """
 
 import sys

@@ -7,7 +7,8 @@ from places import ROOT
 
 SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
-    {"errors"},
+    {"deflate", "errors"},
+    {"extras"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},
     {"camera"},
     {"handeye"},

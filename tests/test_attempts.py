@@ -12,7 +12,7 @@ import pytest
 
 from jcr import attempts
 from jcr.calibration import stage as calibration_stage
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform

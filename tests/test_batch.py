@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -97,14 +98,14 @@ def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 def test_without_ray_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]):
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    with pytest.raises(module.InputError, match=r"jcr\[cluster\]"):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(module.InputError, match=r"jcr-handeye\[cluster\]"):
         batch(captures[:1], tmp_path / "out", RunOptions(), replace(COMPLETE, ray="auto"))
 
 
 @pytest.mark.slow
 def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    pytest.importorskip("ray", reason="the extra jcr[cluster] is not installed")
+    pytest.importorskip("ray", reason="the extra jcr-handeye[cluster] is not installed")
     from ray.cluster_utils import Cluster
 
     def slow(task: Task) -> Row:

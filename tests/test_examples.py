@@ -61,7 +61,7 @@ def truly_touches(joint_values: np.ndarray, true_mesh: trimesh.Trimesh) -> np.nd
 def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
     done: Path, true_mesh: trimesh.Trimesh
 ):
-    pytest.importorskip("ompl", reason="needs ompl: pip install 'jcr[planning]'")
+    pytest.importorskip("ompl", reason="needs ompl: pip install 'jcr-handeye[planning]'")
     planner = example("05_plan_with_ompl")
     planner.util.RNG.setSeed(1)
     planner.util.setLogLevel(planner.util.LogLevel.LOG_ERROR)

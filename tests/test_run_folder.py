@@ -23,7 +23,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from PIL import Image
 
     from jcr.calibration.calibration_json import calibration_file, write_calibration
-    from jcr.calibration.stage import CalibrateOptions, calibrate_poses
+    from jcr.calibration.options import CalibrateOptions
+    from jcr.calibration.stage import calibrate_poses
     from jcr.reconstruct.backends import ReconstructOptions
     from jcr.records import Attempt, PosePairs
     from jcr.simulate.problem import hand_eye_problem

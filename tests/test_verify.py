@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 import jcr
 from jcr.calibration.calibration_json import calibration_file, write_calibration
 from jcr.calibration.drift import drift
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform

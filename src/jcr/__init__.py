@@ -5,34 +5,28 @@ result = jcr.run(capture, "out/table")
 scene = jcr.load_map("out/table")
 """
 
-import sys
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from jcr import deflate  # noqa: F401
 from jcr.errors import InputError, NotTrustedError
-
-# Pillow's PNG writer binds to another zlib, and crashes, where pycolmap was loaded before it.
-if "pycolmap" in sys.modules and "PIL._imaging" not in sys.modules:
-    raise ImportError("import jcr (or PIL.Image) before pycolmap: in the other order writing a PNG crashes")
-import PIL._imaging  # noqa: E402, F401
 
 if TYPE_CHECKING:
     from jcr.capture.read import read_capture
     from jcr.handeye.solve import solve_hand_eye
     from jcr.pipeline import build_map, calibrate, measure, run
-    from jcr.represent.scene import load_map
+    from jcr.represent.map_file import load_map
 
-__version__ = version("jcr")
+    __version__: str
 
-_ROOMS = {
+_MODULE_OF = {
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
     "run": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
     "measure": "jcr.pipeline",
-    "load_map": "jcr.represent.scene",
+    "load_map": "jcr.represent.map_file",
 }
 
 __all__ = [
@@ -49,7 +43,17 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Torch, SciPy and COLMAP take seconds to import; each door opens only the room behind it.
-    if name in _ROOMS:
-        return getattr(import_module(_ROOMS[name]), name)
+    # SciPy and COLMAP take seconds to import; each name imports only the module behind it.
+    if name in _MODULE_OF:
+        return getattr(import_module(_MODULE_OF[name]), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        from jcr.extras import DISTRIBUTION
+
+        return version(DISTRIBUTION)
     raise AttributeError(f"module 'jcr' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -4,7 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from jcr.calibration.stage import CalibrateOptions, calibrate, missed_m
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate, missed_m
 from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back

@@ -15,13 +15,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from html import escape
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
+from jcr.extras import extra
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
@@ -43,7 +43,7 @@ class BatchOptions:
     """Stop at calibration.json: no cloud, map and report."""
     ray: str | None = None
     """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
-    folders. Needs the extra jcr[cluster]."""
+    folders. Needs the extra jcr-handeye[cluster]."""
     cpus_per_task: int = 2
     """With --ray: cores that a capture takes."""
     gpus_per_task: float = 0.0
@@ -246,8 +246,7 @@ def _threads_per_process(threads: int) -> Iterator[None]:
 
 
 def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
-    if find_spec("ray") is None:
-        raise InputError("--ray: Ray is not installed; pip install 'jcr[cluster]'")
+    extra("ray", "cluster", "--ray")
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 

@@ -41,6 +41,8 @@ def rotation_exp(rotation_vector: Vectors) -> Rotations:
 
 def rotation_log(rotation: Rotations) -> Vectors:
     """SO(3) logarithm: matrices (...,3,3) to rotation vectors (...,3) rad, length ≤ π; safe at 0 and π."""
+    if rotation.size == 0:  # refused by SciPy before 1.14
+        return np.zeros(rotation.shape[:-1])
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(*rotation.shape[:-2], 3)
 

@@ -7,9 +7,10 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.errors import InputError
 from jcr.memory import give_back
 from jcr.progress import Progress
-from jcr.reconstruct.backends import device_of
+from jcr.reconstruct.backends import ReconstructOptions, device_of
 from jcr.records import Capture, PointCloud
 from jcr.represent.cloud import point_cloud
+from jcr.represent.map_file import require_packages
 from jcr.results import RunOptions, RunResult
 from jcr.segment.measure import Measured, measure
 from jcr.segment.segments import image_labels, label_cloud
@@ -30,6 +31,13 @@ class Mapped:
     """What the user should know of the labels."""
 
 
+def require_map(options: ReconstructOptions) -> None:
+    """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
+    if not options.dense:
+        raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
+    require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do without")
+
+
 def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
     """The map of a calibrated run and of images that were added to it later.
 
@@ -37,6 +45,7 @@ def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Pro
     """
     from jcr.represent.build import build_scene  # torch takes seconds, and is asked for by maps alone
 
+    assert options.map is not None  # or this stage is left out
     device = device_of(options.reconstruct)
     cloud, notes = _cloud(_extended(result, added, device, options, progress), options, progress)
     give_back()

@@ -12,15 +12,16 @@ from typing import Any
 from jcr import __version__
 from jcr.attempts import Choice, NothingFoundError, again, choose, timings_of
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
-from jcr.calibration.stage import CalibrateOptions, is_one
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
+from jcr.calibration.stage import is_one
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.mapping import mapped, measured
+from jcr.extras import is_installed
+from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
 from jcr.records import Capture, PosePairs
-from jcr.represent.cloud import CloudOptions
-from jcr.represent.options import MapOptions
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
 from jcr.run_folder import RunFolder, State, held, state_of
 from jcr.segment.measure import Measured
@@ -38,9 +39,14 @@ def run(
     """Everything: calibration, cloud, map and report of a capture in the folder `out`.
 
     Finished stages are taken from `out` when capture and options are unchanged. Raises InputError on input
-    that cannot be used and NotTrustedError when no camera poses are found (calibration.json then says why).
+    that cannot be used, or where the map is asked for and torch is not installed, and NotTrustedError when no
+    camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
+    if options.map is None:
+        options = _with_dense(options, False)
+    else:
+        require_map(options.reconstruct)
     with held(Path(out)) as folder:
         capture = folder.keep_capture(capture)
         added = read_added(folder.path, capture)
@@ -55,8 +61,13 @@ def calibrate(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does."""
+    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does.
+
+    Without torch there is no dense depth, which only a later map needs.
+    """
     options = _with_backend(options, backend, capture)
+    if not is_installed("torch"):
+        options = _with_dense(options, False)
     with held(Path(out)) as folder:
         return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
 
@@ -87,11 +98,15 @@ def build_map(
     """Cloud, map and report again, from the capture and the calibration that the run folder `out` names.
 
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
-    not the calibration, and every later map of the folder has them.
+    not the calibration, and every later map of the folder has them. Where the folder was made without dense depth,
+    the reconstruction is made again with it.
     """
-    made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
+    made_with = RunFolder(Path(out)).options()
+    reconstruct = replace(made_with.reconstruct, dense=True)
+    require_map(reconstruct)
+    capture = RunFolder(Path(out)).capture()
     options = RunOptions(
-        made_with.reconstruct,
+        reconstruct,
         made_with.calibrate,
         cloud or CloudOptions(),
         map or MapOptions(),
@@ -115,12 +130,17 @@ def _all_stages(
     capture: Capture, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     calibrated = _calibrate(capture, folder, options, progress)
-    with_map = _map(calibrated, added, folder, options, progress)
-    return _report(with_map, folder, options, progress)
+    if options.map is not None:
+        calibrated = _map(calibrated, added, folder, options, progress)
+    return _report(calibrated, folder, options, progress)
 
 
 def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
     """The reconstruction that the folder has of the same input, calibrated; else back ends are tried."""
+    if not options.reconstruct.dense:
+        dense = _with_dense(options, True)
+        if folder.earlier(state_of(capture, dense.reconstruct, dense.calibrate)) is not None:
+            options = dense  # it is there already
     state = state_of(capture, options.reconstruct, options.calibrate)
     try:
         choice = _kept(capture, folder, state, progress) or choose(
@@ -203,6 +223,10 @@ def _timed(content: CalibrationFile, stage: str, start: float, notes: Sequence[s
 
 def _seconds_since(start: float) -> float:
     return round(time.perf_counter() - start, 3)
+
+
+def _with_dense(options: RunOptions, dense: bool) -> RunOptions:
+    return replace(options, reconstruct=replace(options.reconstruct, dense=dense))
 
 
 def _with_backend(options: RunOptions | None, backend: str | None, capture: Capture) -> RunOptions:

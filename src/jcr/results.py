@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
-from jcr.represent.cloud import CloudOptions
-from jcr.represent.options import MapOptions
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -24,7 +23,8 @@ class RunOptions:
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
-    map: MapOptions = field(default_factory=MapOptions)
+    map: MapOptions | None = field(default_factory=MapOptions)
+    """None: no cloud and no map, and no dense depth, which only these need."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
 
 

@@ -24,7 +24,7 @@ from jcr.calibration.calibration_json import (
     read_calibration,
     write_calibration,
 )
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.capture_json import kept
@@ -35,6 +35,8 @@ from jcr.reconstruct.backends import ReconstructOptions, candidates
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
 from jcr.represent.cloud_ply import read_cloud, write_cloud
+from jcr.represent.map_file import FILE as MAP
+from jcr.represent.map_file import load_map
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
@@ -46,7 +48,7 @@ CAPTURE = "capture"
 STATE = "run.json"
 """The capture, the options of its calibration, and what reconstruction.npz was made from."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
-CLOUD, MAP, REPORT = "cloud.ply", "map.safetensors", "report.html"
+CLOUD, REPORT = "cloud.ply", "report.html"
 OF_RECONSTRUCTION = (STATE, RECONSTRUCTION)
 OF_CALIBRATION = (CLOUD, MAP, REPORT)
 """What holds of one calibration alone."""
@@ -140,9 +142,7 @@ class RunFolder:
         return read_cloud(self.path / CLOUD)
 
     def scene(self) -> "SceneMap":
-        """map.safetensors; InputError where there is none, or it was damaged."""
-        from jcr.represent.scene import load_map  # torch takes seconds, and is asked for by maps alone
-
+        """map.safetensors; InputError where there is none, it was damaged, or its packages are not installed."""
         return load_map(self.path)
 
     def has_map(self) -> bool:

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from jcr.calibration.calibration_json import CalibrationFile, intrinsics_of
 from jcr.calibration.drift import Cause, Drift, detectable, drift
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between

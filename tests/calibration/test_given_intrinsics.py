@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem

@@ -542,7 +542,7 @@ def test_wrong_sizes_and_places_are_refused(
 
 
 def test_rerun_recording_is_read_by_rerun(done: Path, tmp_path: Path):
-    pytest.importorskip("rerun", reason="rerun-sdk is an extra of its own: pip install 'jcr[rerun]'")
+    pytest.importorskip("rerun", reason="rerun-sdk is an extra of its own: pip install 'jcr-handeye[rerun]'")
     path = export(done, "rerun", tmp_path / "run.rrd")
     verified = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True, check=False
@@ -555,4 +555,4 @@ def test_rerun_that_is_not_installed_is_named(
 ):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert dispatch(["export", str(done), "rerun", str(tmp_path / "run.rrd")]) == 2
-    assert "jcr[rerun]" in capsys.readouterr().err and not (tmp_path / "run.rrd").exists()
+    assert "jcr-handeye[rerun]" in capsys.readouterr().err and not (tmp_path / "run.rrd").exists()

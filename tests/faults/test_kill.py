@@ -17,7 +17,7 @@ from jcr.calibration.calibration_json import read_calibration
 from jcr.cli import dispatch, main
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.represent.cloud_ply import read_cloud
-from jcr.represent.scene import load_map
+from jcr.represent.map_file import load_map
 
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "3"))
 WRITES = 11

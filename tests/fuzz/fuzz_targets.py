@@ -32,8 +32,8 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
 from jcr.represent.build import build_scene
 from jcr.represent.cloud_ply import read_cloud, write_cloud
+from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
-from jcr.represent.scene import load_map
 from jcr.simulate.problem import hand_eye_problem
 
 SIZE = (16, 12)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jcr import run_folder
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch, models, run
 from jcr.errors import InputError
 from jcr.reconstruct import backends

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -196,16 +194,3 @@ def test_real_cameras_follow_the_gripper(real_captures: Path, name: str, count: 
     error = _center_errors(capture, result)
     assert np.median(error) < 3e-3
     assert error.max() < 0.01
-
-
-def _python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-
-
-def test_pillow_and_pycolmap_live_together_in_a_fresh_process():
-    """In the order in which the stage is imported alone, pycolmap's zlib broke Pillow's."""
-    write = "import io; from PIL import Image; Image.effect_noise((640, 480), 50).save(io.BytesIO(), 'PNG')"
-    done = _python(f"import jcr.reconstruct.sfm; {write}")
-    assert done.returncode == 0, done.stderr
-    refused = _python("import pycolmap; import jcr")
-    assert "import jcr (or PIL.Image) before pycolmap" in refused.stderr

@@ -14,9 +14,10 @@ from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKS
 from jcr.errors import InputError
 from jcr.records import PointCloud
 from jcr.represent.build import build_scene
+from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
 from jcr.represent.rays import workspace_rays
-from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap, load_map
+from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap
 from jcr.represent.seen import CLEAR, CROSSED
 
 OPTIONS = MapOptions(workspace=WORKSPACE)

@@ -16,8 +16,8 @@ from jcr.geometry import inverse, scale_translation, transform
 from jcr.reconstruct.added import extend
 from jcr.records import Capture, HandEye, Observability, Reconstruction, RobotNoise, Tracks
 from jcr.represent.build import build_scene
-from jcr.represent.cloud import CloudOptions, point_cloud
-from jcr.represent.options import MapOptions
+from jcr.represent.cloud import point_cloud
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.represent.scene import SceneMap
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render

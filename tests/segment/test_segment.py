@@ -467,5 +467,5 @@ def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monk
     with pytest.raises(InputError, match="config.json and model.safetensors"):
         load_sam(str(tmp_path))
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(InputError, match=r"pip install 'jcr\[sam\]'"):
+    with pytest.raises(InputError, match=r"pip install 'jcr-handeye\[sam\]'"):
         load_sam("facebook/sam2.1-hiera-tiny")

@@ -1,6 +1,6 @@
 """The calibration stage: poses first, robustly; then images, points, lens and robot adjusted together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,6 +9,7 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import scale_in_words
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
@@ -40,20 +41,6 @@ PROPOSED = 2
 """Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
 """Relative; a printed marker has the size that its maker says to half a percent."""
-
-
-@dataclass(frozen=True)
-class CalibrateOptions:
-    """How the hand-eye calibration is found."""
-
-    robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
-    known_height: float | None = None
-    """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
-    known_length: tuple[str, float, float, float, float, float] | None = None
-    """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
-    bundle_adjustment: bool = True
-    """Refine with the image correspondences; without, the camera poses alone decide."""
 
 
 def calibrate(

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Int
 
 from jcr.capture.camera_info import lens_of_ros, read_camera_info
-from jcr.capture.extras import extra
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import speed
@@ -17,6 +16,7 @@ from jcr.capture.recording import capture_of_recording
 from jcr.capture.ros_image import picture_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
+from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.records import Capture, Intrinsics
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.capture.checks import MIN_FRAMES
 from jcr.capture.images import BLURRED
+from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError
 from jcr.geometry import inverse, motion_length
 from jcr.handeye.equation import ASSUMED_NOISE, most_informative, pose_information

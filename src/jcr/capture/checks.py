@@ -10,12 +10,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import read_image
+from jcr.capture.options import MIN_FRAMES
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.records import Capture, Intrinsics
 
-MIN_FRAMES = 3
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 

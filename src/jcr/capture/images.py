@@ -1,15 +1,17 @@
 """One image: read from whatever a camera or a phone wrote, written without loss, judged for sharpness."""
 
-import io
+import struct
 import warnings
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 from PIL import Image, ImageOps
 
+from jcr import deflate
 from jcr.errors import InputError
 
 MAX_PIXELS = 64_000_000
@@ -69,16 +71,38 @@ def exposure_fault(brightness: float) -> str | None:
     return "nearly black" if brightness <= DARK else "nearly white"
 
 
-def encode_png(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
-    """The picture as a PNG file, lossless."""
-    stream = io.BytesIO()
-    Image.fromarray(rgb).save(stream, format="PNG", compress_level=3)
-    return stream.getvalue()
+def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
+    """A PNG of grey (h,w) or RGB (h,w,3) pixels, without loss; not compressed where `deflate` says it is not safe."""
+    if not deflate.WORKS:
+        return _uncompressed_png(pixels)
+    bgr = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    return cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def _uncompressed_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
+    """The PNG specification's own way to do without a compressor: stored blocks, no filter."""
+    height, width = pixels.shape[:2]
+    big_endian = pixels.astype(pixels.dtype.newbyteorder(">")).reshape(height, -1).view(np.uint8)
+    rows = np.pad(big_endian, ((0, 0), (1, 0))).tobytes()  # each begins with the number of its filter
+    blocks = b""
+    for start in range(0, len(rows), 0xFFFF):
+        block = rows[start : start + 0xFFFF]
+        last = start + len(block) == len(rows)
+        blocks += struct.pack("<BHH", last, len(block), 0xFFFF - len(block)) + block
+    header = struct.pack(
+        ">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0
+    )
+    content = b"\x78\x01" + blocks + struct.pack(">I", zlib.adler32(rows))
+    chunks = ((b"IHDR", header), (b"IDAT", content), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
 
 
 def sharpness(picture: bytes | UInt8[ndarray, "h w 3"]) -> float:
     """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
     if not isinstance(picture, bytes):
         return brightness_and_sharpness(picture)[1]
-    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
-    return 0.0 if pixels is None else brightness_and_sharpness(np.asarray(pixels, dtype=np.uint8))[1]
+    bgr = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    return 0.0 if bgr is None else brightness_and_sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))[1]

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.extras import extra
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
+from jcr.extras import extra
 
 INFO = "meta/info.json"
 

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+MIN_FRAMES = 3
+"""Fewer do not calibrate."""
+
 FormatName = Literal[
     "auto",
     "capture",

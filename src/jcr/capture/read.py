@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import MIN_FRAMES, require_frames
+from jcr.capture.checks import require_frames
 from jcr.capture.colmap_model import find_model
-from jcr.capture.options import ReadOptions
+from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
 from jcr.capture.table import find_table
 from jcr.capture.table_cells import SUFFIXES

@@ -43,7 +43,7 @@ def _quat_xyzw(quat_xyzw: Float[ndarray, "n 4"]) -> Float[ndarray, "n 3 3"]:
 
 
 def _quat_wxyz(quat_wxyz: Float[ndarray, "n 4"]) -> Float[ndarray, "n 3 3"]:
-    return Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
+    return Rotation.from_quat(quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
 
 
 def _rotation_vector(vector: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:

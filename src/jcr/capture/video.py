@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.capture.extras import extra
 from jcr.errors import InputError
+from jcr.extras import extra
 
 
 def frames_at(

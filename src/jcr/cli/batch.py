@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jcr.batch import BatchOptions
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.cli.output import Output
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.represent.cloud import CloudOptions
-from jcr.represent.options import MapOptions
+from jcr.represent.options import CloudOptions, MapOptions
 
 if TYPE_CHECKING:
     from jcr.batch import Row

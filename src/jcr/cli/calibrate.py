@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show

@@ -7,8 +7,7 @@ from typing import Annotated
 import tyro
 
 from jcr.cli.output import Output
-from jcr.represent.cloud import CloudOptions
-from jcr.represent.options import MapOptions
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 

@@ -40,10 +40,13 @@ def main(arguments: Arguments) -> int:
     """Predict and write the file."""
     from jcr.capture.read import read_capture
     from jcr.errors import InputError
+    from jcr.extras import extra
     from jcr.progress import progress_bars
     from jcr.reconstruct.backends import ReconstructOptions, device_of, weights_of
-    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, predict
     from jcr.reconstruct.global_alignment.pairs import write_pairs
+
+    extra("torch", "networks", "jcr predict")
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, predict
 
     if arguments.out.suffix != ".npz":
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")

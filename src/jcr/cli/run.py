@@ -6,14 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from jcr.calibration.stage import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.cli.source import source
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.represent.cloud import CloudOptions
-from jcr.represent.options import MapOptions
+from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 
@@ -29,6 +28,7 @@ class Arguments:
       jcr run examples/tabletop out/tabletop
       jcr run captures/table out/table --robot-noise 0.1 0.05 --json
       jcr run captures/ur5 out/ur5 --pose-convention ur
+      jcr run captures/table out/table --no-map
       jcr run scan.mcap out/scan --base-frame base_link --gripper-frame tool0 --frames 12
     """
 
@@ -42,18 +42,24 @@ class Arguments:
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
+    no_map: bool = False
+    """Calibration and report alone: no dense depth, no cloud, no map; needs no torch."""
     output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
     from jcr.errors import InputError
+    from jcr.mapping import require_map
     from jcr.pipeline import RunOptions, run
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
+    map_options = None if arguments.no_map else arguments.map
+    if map_options is not None:
+        require_map(arguments.reconstruct)  # before a recording is read
     options = RunOptions(
-        arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map, arguments.segment
+        arguments.reconstruct, arguments.calibrate, arguments.cloud, map_options, arguments.segment
     )
     with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)

@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jcr.capture.checks import MIN_FRAMES
-from jcr.capture.options import ReadOptions
+from jcr.capture.options import MIN_FRAMES, ReadOptions
 
 if TYPE_CHECKING:
     from jcr.progress import Progress

@@ -16,7 +16,7 @@ class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
     The page is served until Ctrl-C, to this machine alone unless --host says otherwise. Needs viser: pip
-    install 'jcr[view]'.
+    install 'jcr-handeye[view]'.
 
     examples:
       jcr view out/table
@@ -44,18 +44,16 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Serve the page until Ctrl-C."""
     from jcr.errors import InputError
+    from jcr.extras import extra
     from jcr.progress import progress_bars
 
-    try:
-        from jcr.view.gate import Gate
-        from jcr.view.server import is_loopback, open_server
-        from jcr.view.viewer import Viewer
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        raise InputError("jcr view: needs viser; pip install 'jcr[view]'") from None
+    for package in ("viser", "matplotlib", "torch"):
+        extra(package, "view", "jcr view")
+    from jcr.view.gate import Gate
     from jcr.view.robot import read_joints, read_urdf, solve_joints
     from jcr.view.run import read_run
+    from jcr.view.server import is_loopback, open_server
+    from jcr.view.viewer import Viewer
 
     if arguments.urdf is None and (arguments.joints or arguments.tip):
         raise InputError("--joints and --tip tell how a robot stands; name its --urdf too")

@@ -1,13 +1,14 @@
 """A recording for the Rerun viewer: cloud, surface, cameras with their pictures, grippers."""
 
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.export.views import PosedImages
+from jcr.extras import extra
 from jcr.files import written_whole
 from jcr.records import PointCloud
 from jcr.represent.scene import SceneMap
@@ -28,10 +29,7 @@ def write_rrd(
 
     Raises InputError without rerun-sdk, which is 500 MB and therefore an extra of its own.
     """
-    try:
-        import rerun as rr  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError("rerun: needs rerun-sdk (500 MB); pip install 'jcr[rerun]'") from None
+    rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)
     lens = views.lens
     with written_whole(path) as temporary:

@@ -15,7 +15,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.camera import pinhole_inside, project, undistort_image, unproject
-from jcr.capture.images import read_image
+from jcr.capture.images import encode_png, read_image
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
@@ -155,7 +155,7 @@ def _place_images(
         pinhole = pinhole_inside(views.lens, max(views.lens.width, views.lens.height))
         for image, name in zip(views.images, names, strict=True):
             pixels = undistort_image(read_image(views.folder / image), views.lens, pinhole)
-            Image.fromarray(pixels).save(folder / name)
+            (folder / name).write_bytes(encode_png(pixels))
         return names, pinhole
     for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
         source = (views.folder / image).resolve()
@@ -163,7 +163,7 @@ def _place_images(
             turned = opened.getexif().get(_ORIENTATION, 1) != 1
         if turned:  # which not every reader heeds
             names[k] = f"{Path(name).stem}.png"
-            Image.fromarray(read_image(source)).save(folder / names[k])
+            (folder / names[k]).write_bytes(encode_png(read_image(source)))
         elif link:
             (folder / name).symlink_to(source)
         else:

@@ -4,18 +4,21 @@ All ask the map itself, so that they answer as `SceneMap.check_spheres` and `Sce
 """
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 from numpy import ndarray
 
+from jcr import deflate
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
+from jcr.extras import extra
 from jcr.files import write_bytes, written_whole
 from jcr.represent.scene import FREE, OCCUPIED, SceneMap
 
 MAX_VOXELS = 50_000_000
+_savez = np.savez_compressed if deflate.WORKS else np.savez
 _SIGN = "positive outside of what is solid, negative inside, metres (cuRobo wants the negative)"
 
 
@@ -26,16 +29,13 @@ def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: fl
     neither a surface nor anything unseen; all others are left out, which is how OctoMap says unknown.
     Raises InputError without pyoctomap, and where the voxels would be too many.
     """
-    try:
-        from pyoctomap import OcTree  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError:
-        raise InputError("octomap: needs pyoctomap; pip install 'jcr[planning]'") from None
+    octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
     voxel = _voxel(scene, voxel)
     # OctoMap's voxels lie between whole multiples of their side; those that the workspace holds are asked.
     low, high = np.ceil(scene.box[0] / voxel - 1e-6), np.floor(scene.box[1] / voxel + 1e-6)
     centers = _centers(low * voxel, (high - low).astype(int), voxel).reshape(-1, 3)
     state = scene.check_spheres(centers, voxel / 2, unknown="report")
-    tree = OcTree(voxel)
+    tree = octomap.OcTree(voxel)
     tree.updateNodes(centers[state == FREE], False, True)
     tree.updateNodes(centers[state == OCCUPIED], True, True)
     tree.updateInnerOccupancy()
@@ -63,7 +63,7 @@ def write_esdf(
     values = scene.query(centers.reshape(-1, 3), unknown).distance.reshape(count)
     dims = voxel * count
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(
+        _savez(
             stream,
             allow_pickle=False,
             values=values.astype(np.float32),
@@ -87,7 +87,7 @@ def write_spheres(
     """Write the spheres of `spheres_of_map` as .npz: `centers` (n,3) and `radii` (n,) m."""
     centers, radii = spheres_of_map(scene, unknown, excess)
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(
+        _savez(
             stream,
             allow_pickle=False,
             centers=centers,

@@ -4,6 +4,7 @@ Readings are ranked by screw congruence (a gripper's rotation between two images
 camera's), and the best of them solved. Nothing is ever applied: a reading that fits is named.
 """
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
@@ -161,7 +162,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
         Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
     )
     yield turned("transposed rotations", rotation.inv())
-    angles = {order: rotation.as_euler(order, suppress_warnings=True) for order in EULER_ORDERS}
+    angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
         yield turned(
             f"Euler angles ({order}) in radians that were taken as degrees",
@@ -224,7 +225,7 @@ def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses)
     step = 2 * np.pi
     turns = np.arange(-29, 30)
     for order in EULER_ORDERS[:4]:
-        read = Rotation.from_matrix(base_from_gripper[:, :3, :3]).as_euler(order, suppress_warnings=True)
+        read = _euler(Rotation.from_matrix(base_from_gripper[:, :3, :3]), order)
         # The same rotation has two triples, and the one that was meant is not known.
         read = np.stack([read, read * [1, -1, 1] + np.pi], axis=1)
         angles = np.stack(np.meshgrid(turns, turns[14:45], turns, indexing="ij"), -1).reshape(-1, 3) * step
@@ -234,14 +235,14 @@ def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses)
         gripper_from_camera = np.swapaxes(first, 1, 2) @ camera[0]
         for k in range(1, len(position)):
             meant = camera[k] @ np.swapaxes(gripper_from_camera, 1, 2)
-            expected = Rotation.from_matrix(meant).as_euler(order, degrees=True, suppress_warnings=True)
+            expected = np.degrees(_euler(Rotation.from_matrix(meant), order))
             off = np.abs((expected[:, None] - read[k] + step / 2) % step - step / 2).max(2).min(1)
             gripper_from_camera = gripper_from_camera[off < 1.5]
+            if len(gripper_from_camera) == 0:  # an empty stack of rotations is no rotation for SciPy
+                break
         if len(gripper_from_camera):
             x = gripper_from_camera[0]
-            expected = Rotation.from_matrix(camera @ x.T).as_euler(
-                order, degrees=True, suppress_warnings=True
-            )
+            expected = np.degrees(_euler(Rotation.from_matrix(camera @ x.T), order))
             nearest = read + step * np.round((expected[:, None] - read) / step)
             chosen = np.abs(nearest - expected[:, None]).max(2).argmin(1)
             rotation = Rotation.from_euler(order, nearest[np.arange(len(chosen)), chosen], degrees=True)
@@ -250,6 +251,13 @@ def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses)
                 transform(rotation.as_matrix(), position),
                 np.arange(len(position)),
             )
+
+
+def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
+    """Euler angles (rad), also at gimbal lock, where SciPy warns that any of the equal answers will do."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return rotation.as_euler(order)
 
 
 Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "3"]]

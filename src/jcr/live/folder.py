@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.capture.capture_json import FILE, read_lens
 from jcr.capture.checks import read_rigid
-from jcr.capture.images import read_image
+from jcr.capture.images import encode_png, read_image
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -62,9 +62,9 @@ class LiveFolder:
         if self.lens is not None:
             read_lens(self.lens, size, self.folder / FILE)
         name = f"images/{self._next_number():03d}.png"
-        bgr = np.ascontiguousarray(image[..., ::-1])
-        write_bytes(self.folder / name, cv2.imencode(".png", bgr)[1].tobytes())
+        write_bytes(self.folder / name, encode_png(image))
         height = round(THUMBNAIL_PX * size[1] / size[0])
+        bgr = np.ascontiguousarray(image[..., ::-1])
         small = cv2.resize(bgr, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
         write_bytes(self.folder / self.thumbnail(name), cv2.imencode(".jpg", small)[1].tobytes())
         self.size = size

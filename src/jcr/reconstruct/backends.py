@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,6 +10,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.extras import extra, install, is_installed
 from jcr.progress import Progress
 from jcr.reconstruct.hub import cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
@@ -21,19 +21,18 @@ CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, ColmapOptions(seed=options.seed, **_dense(options)), progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
 
-    made = DirectOptions(device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, DirectOptions(**_dense(options)), progress)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
+    extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct
     from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
@@ -46,6 +45,7 @@ def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress 
 def _mapanything(
     capture: Capture, options: "ReconstructOptions", progress: Progress | None
 ) -> Reconstruction:
+    extra("torch", "networks", "--backend mapanything")
     from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
 
     weights, _ = weights_of(options)
@@ -57,8 +57,7 @@ def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress 
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    made = MarkerOptions(options.board, device=device_of(options), memory_gb=options.memory_gb)
-    return reconstruct(capture, made, progress)
+    return reconstruct(capture, MarkerOptions(options.board, **_dense(options)), progress)
 
 
 def _predictions(
@@ -79,8 +78,14 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
-    made = ColmapOptions(seed=options.seed, device=device_of(options), memory_gb=options.memory_gb)
+    made = ColmapOptions(seed=options.seed, **_dense(options))
     return reconstruct(capture, options.cameras, made, progress)
+
+
+def _dense(options: "ReconstructOptions") -> dict[str, Any]:
+    """What the options say of dense depth, for the back ends that estimate it without a network."""
+    device = device_of(options) if options.dense else "cpu"
+    return {"dense": options.dense, "device": device, "memory_gb": options.memory_gb}
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ class Backend:
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
-        return not self.package or find_spec(self.package) is not None
+        return not self.package or is_installed(self.package)
 
     def has_weights(self) -> bool:
         """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
@@ -132,7 +137,7 @@ BACKENDS: dict[str, Backend] = {
             options=("weights", "pair_graph"),
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
             package="torch",
-            install="pip install torch",
+            install=install("networks"),
         ),
         Backend(
             "dust3r",
@@ -143,7 +148,7 @@ BACKENDS: dict[str, Backend] = {
             selected_by="weights",
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
             package="torch",
-            install="pip install torch",
+            install=install("networks"),
         ),
         Backend(
             "mapanything",
@@ -234,6 +239,9 @@ class ReconstructOptions:
     board: str | None = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
+    dense: bool = True
+    """Estimate the dense depth that the map needs; without, a calibration alone comes sooner (networks predict it
+    anyway)."""
     memory_gb: float = 8.0
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
@@ -260,7 +268,7 @@ def reconstruct(
     row = BACKENDS[candidates(options)[0]]
     if not row.is_installed():
         raise InputError(
-            f"--backend {row.name}: the package {row.package} is not installed; {row.install}, or choose another"
+            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}, or choose another"
         )
     # By name, so that the order of the frames changes nothing.
     order = np.argsort(np.array(capture.images), kind="stable")
@@ -375,8 +383,9 @@ def _flag(name: str) -> str:
 
 def device_of(options: ReconstructOptions) -> str:
     """cuda or cpu; `auto` is cuda where there is one. InputError when cuda is asked for and absent."""
-    import torch
-
+    if options.device == "cpu" or (options.device == "auto" and not is_installed("torch")):
+        return "cpu"
+    torch = extra("torch", "networks", "--device cuda")
     if options.device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: this machine has no CUDA device that torch sees; use --device cpu")
     if options.device == "auto":

@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+from jcr.extras import is_installed
+
 HUB_FILES = ("config.json", "model.safetensors")
 
 
 def cached_files(hub_id: str) -> list[Path]:
     """HUB_FILES of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
+    if not is_installed("huggingface_hub"):
+        return []
     from huggingface_hub import try_to_load_from_cache
 
     # Not a path where a file is missing, or known to be missing on the hub.

@@ -19,6 +19,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.camera import fold_distance_px, resized
+from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
 from jcr.memory import GB, give_back, resident
@@ -100,7 +101,7 @@ def extract(
         db.write_rig(rig, use_rig_id=True)
         for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
             grey = Image.fromarray(pixels).convert("L").resize(size, Image.Resampling.BOX)
-            grey.save(database.parent / name, compress_level=1)
+            (database.parent / name).write_bytes(encode_png(np.asarray(grey)))
             image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
             db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)

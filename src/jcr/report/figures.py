@@ -12,6 +12,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.camera import project, unproject, without_distortion
+from jcr.capture.images import encode_png
 from jcr.geometry import apply
 from jcr.records import Intrinsics
 from jcr.report.map_samples import Slice
@@ -156,9 +157,12 @@ def label_colors(count: int) -> UInt8[ndarray, "k 3"]:
 
 
 def picture_url(pixels: UInt8[ndarray, "h w *c"], kind: str) -> str:
-    """A data URL of grey, RGB or RGBA pixels as JPEG, PNG or WEBP."""
+    """A data URL of grey, RGB or (WEBP) RGBA pixels as JPEG, PNG or WEBP."""
     stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, kind, quality=80)
+    if kind == "PNG":
+        stream.write(encode_png(pixels))
+    else:
+        Image.fromarray(pixels).save(stream, kind, quality=80)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import attempt_in_words, missed, pixels
+from jcr.extras import is_installed
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
@@ -194,7 +195,7 @@ def _details(
         blocks[f"Options: {stage}"] = {name: _value(value) for name, value in chosen.items()}
     packages = ("numpy", "scipy", "torch", "pycolmap")
     blocks["Versions"] = {"jcr": calibration.version, "python": platform.python_version()}
-    blocks["Versions"] |= {name: metadata.version(name) for name in packages}
+    blocks["Versions"] |= {name: metadata.version(name) for name in packages if is_installed(name)}
     columns = []
     for title, rows in blocks.items():
         items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())

@@ -1,7 +1,5 @@
 """From pointmaps and a calibration to one metric point cloud in the base frame (paper, section IV-C)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Integer
 from numpy import ndarray
@@ -9,20 +7,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
-
-
-@dataclass(frozen=True)
-class CloudOptions:
-    """Which points of the pointmaps enter the map."""
-
-    confidence_percentile: float = 20.0
-    """Drop this share (%) of the estimated points, the least confident first."""
-    confidence_threshold: float | None = None
-    """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
-    max_points: int = 200_000
-    """Keep at most so many points, drawn evenly over the pixels of all images."""
-    cloud_seed: int = 0
-    """Seed of that draw."""
+from jcr.represent.options import CloudOptions
 
 
 def point_cloud(

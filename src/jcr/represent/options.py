@@ -1,7 +1,21 @@
-"""How a map is built; apart from the training, so that the command line's help need not import torch."""
+"""How a map is built; apart from the building, so that the command line's help need not import SciPy and torch."""
 
 from dataclasses import dataclass
 from typing import Literal
+
+
+@dataclass(frozen=True)
+class CloudOptions:
+    """Which points of the pointmaps enter the map."""
+
+    confidence_percentile: float = 20.0
+    """Drop this share (%) of the estimated points, the least confident first."""
+    confidence_threshold: float | None = None
+    """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
+    max_points: int = 200_000
+    """Keep at most so many points, drawn evenly over the pixels of all images."""
+    cloud_seed: int = 0
+    """Seed of that draw."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import json
 import threading
 from dataclasses import asdict
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -21,12 +19,11 @@ from jcr.geometry import apply, require_rigid
 from jcr.represent.chunks import in_chunks
 from jcr.represent.distance import DistanceGrid, distance_grid
 from jcr.represent.fields import Fields, FieldShape, Lattice
+from jcr.represent.map_file import FORMAT, digest
 from jcr.represent.robot import JointValues, RobotSpheres, load_robot
 from jcr.represent.sample import Sample
 from jcr.represent.seen import CROSSED, HIT, SeenGrid, dilate, halve
 
-FORMAT = "jcr.map/1"
-FILE = "map.safetensors"
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 """What is answered to `unknown="report"`."""
 
@@ -231,48 +228,12 @@ class SceneMap:
         tensors = {f"fields.{name}": value for name, value in self.fields.state_dict().items()}
         tensors |= {"seen": self.seen.state, "lower": self.seen.lower}
         tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
-        metadata = {"format": FORMAT, "about": json.dumps(about), "digest": _digest(tensors)}
+        metadata = {"format": FORMAT, "about": json.dumps(about), "digest": digest(tensors)}
         write_bytes(path, save(tensors, metadata=metadata))
 
 
-def load_map(folder: str | Path, device: str = "cpu") -> SceneMap:
-    """The map of a run folder (or a map file itself).
-
-    Raises InputError where there is none, where it is damaged, or where another version of jcr wrote it.
-    """
-    path = Path(folder)
-    path = path / FILE if path.is_dir() else path
-    if not path.is_file():
-        raise InputError(f"{path}: no map here; make one with jcr run CAPTURE OUT, or jcr map OUT")
-    again = "make it again with jcr map OUT"
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, no mapping
-    except SafetensorError as error:
-        raise InputError(f"{path}: the map file is damaged ({error}); {again}") from None
-    if metadata.get("format") != FORMAT:
-        found = metadata.get("format", "no map of jcr")
-        raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
-    if metadata.get("digest") != _digest(tensors):
-        raise InputError(
-            f"{path}: the map file is damaged (its numbers changed since it was written); {again}"
-        )
-    try:
-        return _from_tensors(tensors, json.loads(metadata["about"])).to(device)
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        raise InputError(f"{path}: the map file is damaged ({error!r}); {again}") from None
-
-
-def _digest(tensors: dict[str, Tensor]) -> str:
-    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
-    digest = blake2b(digest_size=16)
-    for name in sorted(tensors):
-        digest.update(name.encode() + tensors[name].numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _from_tensors(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
+def scene_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:
+    """The map of what `save` put in a file; raises KeyError, ValueError and their like for anything else."""
     seen = SeenGrid(tensors.pop("lower"), about["cell"], tensors.pop("seen"))
     lattices = [
         Lattice(seen.lower, cell, tuple(shape), tensors[f"fields.lattices.{k}.nodes"])

@@ -24,7 +24,7 @@ class SegmentOptions:
 
     segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
     """labels: labels/NAME.png beside the images' folder; tabletop: the plane that carries the scene and what stands
-    on it; sam: Segment Anything 2 (pip install 'jcr[sam]'); auto: labels where there are some, else tabletop."""
+    on it; sam: Segment Anything 2 (pip install 'jcr-handeye[sam]'); auto: labels where there are some, else tabletop."""
     sam_weights: str = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from jcr.errors import InputError
+from jcr.extras import extra
 from jcr.geometry import apply_similarity
 from jcr.progress import Progress
 from jcr.records import HandEye, Reconstruction
@@ -42,10 +43,9 @@ OVERLAP = 0.5
 
 def load_sam(weights: str) -> "Sam2Model":
     """Segment Anything 2 by hub id or path; raises InputError, with the cure, where it cannot be had."""
-    try:
-        from transformers import Sam2Model, logging
-    except ImportError:
-        raise InputError("--segments sam: transformers is not installed; pip install 'jcr[sam]'") from None
+    extra("transformers", "sam", "--segments sam")
+    from transformers import Sam2Model, logging
+
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()  # loading takes moments, and --quiet means quiet
     try:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import rotation_exp
@@ -280,5 +281,5 @@ def _degraded(
 def _encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:
     """RGB as JPEG of that quality, or as PNG."""
     if jpeg_quality == "lossless":
-        return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+        return encode_png(image)
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()

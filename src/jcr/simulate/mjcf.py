@@ -3,10 +3,10 @@
 from collections.abc import Iterable
 from xml.etree import ElementTree as xml
 
-import cv2
 import numpy as np
 from numpy import ndarray
 
+from jcr.capture.images import encode_png
 from jcr.simulate.objects import Part
 from jcr.simulate.scenes import Scene
 
@@ -106,9 +106,7 @@ def _add_body(
         )
         material = xml.SubElement(assets, "material", name=name, specular=f"{part.shine}", shininess="0.4")
         if textured and part.texture is not None:
-            files[f"{name}.png"] = cv2.imencode(
-                ".png", part.texture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]
-            )[1].tobytes()
+            files[f"{name}.png"] = encode_png(part.texture)
             xml.SubElement(assets, "texture", name=name, type="2d", file=f"{name}.png")
             material.set("texture", name)
         else:

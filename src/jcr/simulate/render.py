@@ -6,7 +6,6 @@ import platform
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import cv2
@@ -15,6 +14,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.extras import extra
 from jcr.records import Intrinsics
 from jcr.simulate.mjcf import CAMERA, LABEL_PREFIX, to_mjcf
 from jcr.simulate.scenes import Scene
@@ -78,12 +78,7 @@ def _renderers(mjcf: str, files: dict[str, bytes], *sizes: tuple[int, int]) -> I
     if platform.system() == "Linux":
         egl = ctypes.util.find_library("EGL") or not ctypes.util.find_library("OSMesa")
         os.environ.setdefault("MUJOCO_GL", "egl" if egl else "osmesa")
-    try:
-        mujoco: Any = import_module("mujoco")
-    except ImportError as error:
-        raise InputError(
-            f"MuJoCo, which draws the simulation, cannot be imported ({error}): pip install 'jcr[sim]'"
-        ) from error
+    mujoco: Any = extra("mujoco", "sim", "the simulation")
     model = mujoco.MjModel.from_xml_string(mjcf, files)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
+from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
@@ -163,7 +164,7 @@ def _path(truth: Truth, kind: str, image: int) -> Path:
 
 
 def _write(path: Path, pixels: ndarray) -> None:
-    write_bytes(path, cv2.imencode(".png", pixels)[1].tobytes())
+    write_bytes(path, encode_png(pixels))
 
 
 def _read(path: Path) -> ndarray:

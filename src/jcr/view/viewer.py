@@ -358,4 +358,4 @@ class Viewer:
 
 
 def _wxyz(a_from_b: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:
-    return Rotation.from_matrix(a_from_b[:3, :3]).as_quat(scalar_first=True)
+    return Rotation.from_matrix(a_from_b[:3, :3]).as_quat()[[3, 0, 1, 2]]

@@ -9,7 +9,8 @@ import pytest
 from benchmarks.align import camera_errors
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.stage import CalibrateOptions, calibrate
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.stage import calibrate
 from jcr.calibration.words import scale_in_words
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs

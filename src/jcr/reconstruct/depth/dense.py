@@ -9,9 +9,17 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import pinhole_inside, rays, undistort_image
+from jcr.extras import extra
 from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
 from jcr.progress import Progress
-from jcr.reconstruct.depth.views import PLANES, choose_neighbours, sweep_planes
+from jcr.reconstruct.depth.views import (
+    BYTES_OF_PLANE,
+    BYTES_OF_RESULT,
+    BYTES_OF_THREAD,
+    PLANES,
+    choose_neighbours,
+    sweep_planes,
+)
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 BYTES_OF_FEATURES_FOUND = 5_000_000
@@ -105,6 +113,7 @@ def dense_pointmaps(
     `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times. Confidence
     is the plane sweep's, 0 for no estimate.
     """
+    extra("torch", "map", "dense depth")
     from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions, plane_sweep
 
     depth, confidence = plane_sweep(
@@ -128,19 +137,21 @@ def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, featu
     `features` are the bytes that finding features takes at least. Raises InputError where the budget cannot be
     kept with one image at a time.
     """
-    from jcr.reconstruct.depth.plane_sweep import BYTES_OF_PLANE, BYTES_OF_RESULT, BYTES_OF_THREAD
+    if options.dense:
+        extra("torch", "map", "dense depth")  # imported now, for it is a large part of the program
 
     width, height = size
     pixels = int(width * height * min(1.0, options.pointmap_size_px / max(size)) ** 2)
     program = resident() + ALLOWANCE
     pictures = 3 * width * height * images
     result = images * (pixels * BYTES_OF_RESULT + BYTES_OF_FEATURES_FOUND)
-    one = pixels * (BYTES_OF_THREAD + PLANES * BYTES_OF_PLANE)
+    of_thread, of_planes = pixels * BYTES_OF_THREAD, pixels * PLANES * BYTES_OF_PLANE
+    one = of_thread + of_planes if options.dense else 0
     budget = options.memory_gb * GB
     least = program + pictures + max(features, result + max(one, MAP))
     require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
     cores = os.cpu_count() or 1
-    all_at_once = pixels * (min(cores, images) * BYTES_OF_THREAD + images * PLANES * BYTES_OF_PLANE)
+    all_at_once = min(cores, images) * of_thread + images * of_planes if options.dense else 0
     # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
     ample = program + pictures + max(features * min(cores, images), result + all_at_once + MAP)
     announce(min(ample, int(budget)), budget)

@@ -1,4 +1,4 @@
-"""What sparse tracks tell a plane sweep: which views to compare, and where their surfaces may lie."""
+"""What a plane sweep takes: which views to compare, where their surfaces may lie (as sparse tracks tell), memory."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,6 +9,8 @@ from jcr.records import Tracks
 
 PLANES = 48
 """Of a sweep."""
+BYTES_OF_THREAD, BYTES_OF_PLANE, BYTES_OF_RESULT = 2000, 4, 80
+"""Per pixel: of the image that a thread works on; of each plane of an image that is smoothed; of every image."""
 
 
 def choose_neighbours(

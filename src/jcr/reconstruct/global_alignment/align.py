@@ -1,5 +1,6 @@
 """Global alignment: pairwise pointmaps of a set of images become one reconstruction."""
 
+from jcr.extras import extra
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, check_connected, check_options
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
@@ -19,6 +20,7 @@ def align(
     check_connected(predictions)
     if options.method == "adam":
         # torch takes seconds to import and the default does without.
+        extra("torch", "networks", "--method adam")
         from jcr.reconstruct.global_alignment.adam import align_adam
 
         return align_adam(predictions, options, progress)

@@ -1,0 +1,17 @@
+"""How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """How the hand-eye calibration is found."""
+
+    robot_noise: tuple[float, float] | None = None
+    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    known_height: float | None = None
+    """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
+    known_length: tuple[str, float, float, float, float, float] | None = None
+    """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
+    bundle_adjustment: bool = True
+    """Refine with the image correspondences; without, the camera poses alone decide."""

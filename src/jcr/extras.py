@@ -1,0 +1,30 @@
+"""Packages that not every use needs: each comes with an extra of this distribution, and a missing one is named so."""
+
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+
+from jcr.errors import InputError
+
+DISTRIBUTION = "jcr-handeye"
+"""What pip calls it; the package that is imported, and the command, are `jcr`."""
+
+
+def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
+    """The module that `what` needs, or an InputError that says which extra brings it, or what to do `otherwise`."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        reason = f"cannot be imported ({error})" if is_installed(package) else "is not installed"
+        raise InputError(f"{what} needs {package}, which {reason}: {install(name)}{otherwise}") from None
+
+
+def install(name: str) -> str:
+    """The command that installs an extra."""
+    return f"pip install '{DISTRIBUTION}[{name}]'"
+
+
+def is_installed(module: str) -> bool:
+    """Whether a top-level module is there, without importing it."""
+    return find_spec(module) is not None

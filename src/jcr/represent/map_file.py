@@ -1,0 +1,66 @@
+"""The file of a map; without torch, which its fields need, reading one says what to install."""
+
+import json
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jcr.errors import InputError
+from jcr.extras import extra
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from jcr.represent.scene import SceneMap
+
+FORMAT = "jcr.map/1"
+FILE = "map.safetensors"
+
+
+def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
+    """The map of a run folder (or a map file itself).
+
+    Raises InputError where there is none, where it is damaged, where another version of jcr wrote it, and where its
+    packages are not installed.
+    """
+    path = Path(folder)
+    path = path / FILE if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(f"{path}: no map here; make one with jcr run CAPTURE OUT, or jcr map OUT")
+    again = "make it again with jcr map OUT"
+    require_packages("a map")
+    from safetensors import SafetensorError, safe_open
+
+    from jcr.represent.scene import scene_of
+
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, no mapping
+    except SafetensorError as error:
+        raise InputError(f"{path}: the map file is damaged ({error}); {again}") from None
+    if metadata.get("format") != FORMAT:
+        found = metadata.get("format", "no map of jcr")
+        raise InputError(f"{path}: holds {found} where this jcr reads {FORMAT}; update jcr, or {again}")
+    if metadata.get("digest") != digest(tensors):
+        raise InputError(
+            f"{path}: the map file is damaged (its numbers changed since it was written); {again}"
+        )
+    try:
+        return scene_of(tensors, json.loads(metadata["about"])).to(device)
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise InputError(f"{path}: the map file is damaged ({error!r}); {again}") from None
+
+
+def require_packages(what: str, otherwise: str = "") -> None:
+    """InputError where a package is not installed that training, reading and meshing a map need."""
+    for package in ("torch", "safetensors", "skimage"):
+        extra(package, "map", what, otherwise)
+
+
+def digest(tensors: "dict[str, Tensor]") -> str:
+    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
+    total = blake2b(digest_size=16)
+    for name in sorted(tensors):
+        total.update(name.encode() + tensors[name].numpy().tobytes())
+    return total.hexdigest()

@@ -1,0 +1,71 @@
+"""The names of the package, and that pycolmap may be imported before or after it."""
+
+import subprocess
+import sys
+from io import BytesIO
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import jcr
+from jcr import deflate
+from jcr.capture.images import encode_png
+
+
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+
+
+def test_the_api_is_listed_and_every_name_of_it_is_there():
+    assert set(jcr.__all__) <= set(dir(jcr)) and "__version__" in dir(jcr)
+    assert all(hasattr(jcr, name) for name in dir(jcr))
+    assert len(set(jcr.__all__)) == len(jcr.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'calibrated'"):
+        _ = jcr.calibrated  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    "first", ["import jcr.calibration.bundle as b, jcr.handeye.solve as s", "import jcr; jcr.calibrate"]
+)
+def test_packages_and_functions_have_names_of_their_own(first: str):
+    done = python(
+        f"{first}\nimport jcr.calibration.bundle as b, jcr.handeye.solve as s, jcr\n"
+        "assert jcr.calibrate is jcr.pipeline.calibrate and s.solve_hand_eye is jcr.solve_hand_eye and b.adjust"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("order", ["import pycolmap, jcr", "import jcr, pycolmap"])
+def test_pngs_and_archives_are_written_in_either_order_with_pycolmap(order: str, tmp_path):
+    done = python(
+        f"{order}\nimport numpy as np\nfrom jcr.capture.images import encode_png\n"
+        f"pixels = np.random.default_rng(0).integers(0, 256, (300, 400, 3), np.uint8)\n"
+        f"open({str(tmp_path / 'a.png')!r}, 'wb').write(encode_png(pixels))"
+    )
+    assert done.returncode == 0, done.stderr
+    expected = np.random.default_rng(0).integers(0, 256, (300, 400, 3), np.uint8)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), expected)
+
+
+def test_others_write_pngs_and_archives_where_jcr_came_first():
+    write = "Image.effect_noise((640, 480), 50).save(io.BytesIO(), 'PNG'); zlib.compress(b'a' * 10000)"
+    done = python(f"import jcr, pycolmap, io, zlib; from PIL import Image; {write}")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+@pytest.mark.parametrize("shape", [(7, 5, 3), (480, 640), (1, 1)])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_png_holds_the_same_pixels(
+    compressed: bool, shape: tuple[int, ...], kind: type, monkeypatch: pytest.MonkeyPatch
+):
+    if kind == np.uint16 and len(shape) == 3:
+        pytest.skip("depth is grey")
+    monkeypatch.setattr(deflate, "WORKS", compressed)
+    pixels = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
+    file = encode_png(pixels[::-1])
+    read = np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
+    np.testing.assert_array_equal(read[..., ::-1] if pixels.ndim == 3 else read, pixels[::-1])
+    np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(file))), pixels[::-1])

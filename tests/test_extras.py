@@ -1,0 +1,47 @@
+"""Every extra that a message or a page names is one of the distribution."""
+
+import re
+import sys
+import tomllib
+
+import pytest
+
+from jcr.errors import InputError
+from jcr.extras import DISTRIBUTION, extra
+from places import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_the_extras_that_are_named_exist():
+    assert PROJECT["name"] == DISTRIBUTION
+    named = set()
+    for folder in ("src", "benchmarks", "docs", "examples"):
+        for file in (ROOT / folder).rglob("*.*"):
+            if file.suffix in (".py", ".md"):
+                text = file.read_text()
+                assert not re.search(r"pip\s+install\s+'?jcr\b(?!-)", text), file
+                named |= {(name, file.name) for name in re.findall(r'\bextra\("[\w.]+", "(\w+)"', text)}
+                for names in re.findall(rf"{DISTRIBUTION}\[([\w,]+)\]", text):
+                    named |= {(name, file.name) for name in names.split(",")}
+    assert {name for name, _ in named} >= {
+        "map",
+        "networks",
+        "view",
+        "sam",
+        "ros",
+        "lerobot",
+        "sim",
+        "planning",
+    }
+    assert not {(name, file) for name, file in named if name not in PROJECT["optional-dependencies"]}
+
+
+def test_a_package_that_is_there_but_broken_says_why(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "brokenpackage.py").write_text("raise ImportError('libmissing.so: no such file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"cannot be imported \(libmissing.so: no such file\): pip install"):
+        extra("brokenpackage", "sim", "the simulation")
+    monkeypatch.setitem(sys.modules, "brokenpackage", None)
+    with pytest.raises(InputError, match="the simulation needs brokenpackage, which is not installed"):
+        extra("brokenpackage", "sim", "the simulation")

@@ -1,0 +1,146 @@
+"""What a core install does, in processes that cannot import torch, and what it says where torch is needed."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from conftest import shrunk_capture
+from jcr.cli import COMMANDS
+from jcr.extras import DISTRIBUTION
+from places import ROOT
+
+MAY_NEED_TORCH = (
+    "reconstruct/depth/plane_sweep", "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
+    "reconstruct/mapanything", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
+    "export/mesh", "export/rrd", "export/volume", "view/",
+)  # fmt: skip
+"""Modules in src/jcr that may import torch (or viser) when they are imported themselves."""
+NEED_NONE = {"represent/cloud", "represent/map_file", "represent/options", "represent/robot"}
+"""Among these, what a run without a map imports all the same."""
+
+
+ABSENT = """
+import sys
+from importlib.machinery import PathFinder
+
+class WithoutTorch(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] == "torch" else super().find_spec(name, path, target)
+
+sys.meta_path = [WithoutTorch if finder is PathFinder else finder for finder in sys.meta_path]
+"""
+"""Whoever looks for torch, to import it or to see whether it is there, finds none."""
+
+
+def without_torch(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """A process on a machine where torch is not installed."""
+    command = [sys.executable, "-c", ABSENT + code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+def run_jcr(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return without_torch("from jcr.cli import main; main()", *arguments)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
+    return shrunk_capture(tabletop, tmp_path_factory.mktemp("core") / "capture", 8, 400)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+    """A run folder made without torch, by a program that imported pycolmap before jcr."""
+    out = tmp_path_factory.mktemp("core") / "out"
+    done = without_torch(
+        "import pycolmap\nfrom jcr.cli import main; main()", "run", capture, out, "--no-map", "--quiet"
+    )
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_a_capture_is_calibrated_and_reported(calibrated: Path, tabletop: Path):
+    names = {path.name for path in calibrated.iterdir()} - {".lock"}
+    assert names == {"calibration.json", "reconstruction.npz", "report.html", "log.txt", "run.json"}
+    compared = run_jcr("compare", calibrated, tabletop, "--json")
+    assert compared.returncode == 0, compared.stderr
+    assert json.loads(compared.stdout)["translation_mm"] < 1.5
+
+
+def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_path: Path):
+    done = run_jcr("calibrate", capture, tmp_path / "out", "--quiet")
+    assert done.returncode == 0, done.stderr
+    one, other = (
+        json.loads((out / "calibration.json").read_text()) for out in (calibrated, tmp_path / "out")
+    )
+    assert one["gripper_from_camera"] == other["gripper_from_camera"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("run", "CAPTURE", "NEW"), ("map", "OUT"), ("predict", "CAPTURE", "pairs.npz")],
+    ids=lambda arguments: arguments[0],
+)
+def test_what_needs_torch_says_what_to_install_before_any_work(
+    arguments: tuple[str, ...], capture: Path, calibrated: Path, tmp_path: Path
+):
+    paths = {"CAPTURE": capture, "OUT": calibrated, "NEW": tmp_path / "new"}
+    done = run_jcr(*(paths.get(argument, argument) for argument in arguments))
+    extra = "networks" if arguments[0] == "predict" else "map"
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert f"needs torch, which is not installed: pip install '{DISTRIBUTION}[{extra}]'" in done.stderr
+    assert not (tmp_path / "new").exists()
+    assert ("--no-map" in done.stderr) == (extra == "map")
+
+
+def test_torch_is_absent():
+    done = without_torch("import importlib.util\nprint(importlib.util.find_spec('torch'))\nimport torch")
+    assert done.stdout == "None\n" and "No module named 'torch'" in done.stderr
+
+
+def test_a_map_is_not_read(tmp_path: Path):
+    (tmp_path / "map.safetensors").write_bytes(b"")
+    code = "import jcr\ntry: jcr.load_map(sys.argv[1])\nexcept jcr.InputError as error: print(error)"
+    done = without_torch(code, tmp_path)
+    assert f"pip install '{DISTRIBUTION}[map]'" in done.stdout, done.stderr
+
+
+def test_only_the_modules_that_work_with_tensors_need_torch():
+    source = ROOT / "src" / "jcr"
+    names = [str(file.relative_to(source).with_suffix("")) for file in sorted(source.rglob("*.py"))]
+    names = [name for name in names if name not in ("__init__", "__main__")]
+    code = """
+from importlib import import_module
+for name in sys.argv[1:]:
+    try:
+        import_module("jcr." + name.replace("/", ".").removesuffix(".__init__"))
+    except ModuleNotFoundError as error:
+        print(name)
+"""
+    done = without_torch(code, *names)
+    assert done.returncode == 0, done.stderr
+    need = set(done.stdout.split())
+    assert "represent/scene" in need
+    assert not {name for name in need if not name.startswith(MAY_NEED_TORCH)} | (need & NEED_NONE)
+
+
+def test_help_imports_nothing_heavy():
+    code = """
+import contextlib, io
+from jcr.cli import dispatch
+heavy = {"torch", "pycolmap", "mujoco", "transformers", "viser", "scipy", "cv2", "PIL", "pydantic"}
+for name in sys.argv[1:]:
+    with contextlib.redirect_stdout(io.StringIO()):
+        dispatch([name, "--help"] if name else ["--help"])
+    print(name or "jcr", *sorted(heavy & sys.modules.keys()))
+"""
+    assert without_torch(code, "", "run", "calibrate", "check", "map", "view").stdout.split() == [
+        "jcr", "run", "calibrate", "check", "map", "view",
+    ]  # fmt: skip
+    everything = without_torch(code, *COMMANDS)
+    assert everything.returncode == 0, everything.stderr
+    assert not {"torch", "pycolmap", "mujoco", "transformers", "viser"} & set(everything.stdout.split())
