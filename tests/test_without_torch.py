@@ -1,6 +1,7 @@
 """What a core install does, in processes that cannot import torch, and what it says where torch is needed."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -81,20 +82,29 @@ def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_p
 
 @pytest.mark.parametrize(
     "arguments",
-    [("run", "CAPTURE", "NEW"), ("map", "OUT"), ("predict", "CAPTURE", "pairs.npz")],
+    [
+        ("run", "CAPTURE", "NEW"),
+        ("map", "OUT"),
+        ("export", "MAPPED", "glb"),
+        ("export", "MAPPED", "octomap"),
+        ("predict", "CAPTURE", "pairs.npz"),
+    ],
     ids=lambda arguments: arguments[0],
 )
 def test_what_needs_torch_says_what_to_install_before_any_work(
     arguments: tuple[str, ...], capture: Path, calibrated: Path, tmp_path: Path
 ):
-    paths = {"CAPTURE": capture, "OUT": calibrated, "NEW": tmp_path / "new"}
+    mapped = tmp_path / "mapped"
+    shutil.copytree(calibrated, mapped)
+    (mapped / "map.safetensors").write_bytes(b"")
+    paths = {"CAPTURE": capture, "OUT": calibrated, "MAPPED": mapped, "NEW": tmp_path / "new"}
     done = run_jcr(*(paths.get(argument, argument) for argument in arguments))
     extra = "networks" if arguments[0] == "predict" else "map"
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
     assert f"needs torch, which is not installed: pip install '{DISTRIBUTION}[{extra}]'" in done.stderr
     assert not (tmp_path / "new").exists()
-    assert ("--no-map" in done.stderr) == (extra == "map")
+    assert ("--no-map" in done.stderr) == (arguments[0] in ("run", "map"))
 
 
 def test_torch_is_absent():
