@@ -37,6 +37,23 @@ def test_the_extras_that_are_named_exist():
     assert not {(name, file) for name, file in named if name not in PROJECT["optional-dependencies"]}
 
 
+def test_the_lowest_versions_are_those_that_are_tested():
+    bounds = {}
+    for requirement in [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ros"],
+                        *PROJECT["optional-dependencies"]["lerobot"]]:  # fmt: skip
+        name, version = re.fullmatch(r"([\w-]+)>=([\d.]+)(?:,.*)?", requirement).groups()
+        bounds[name] = version
+    pinned = dict(
+        line.split("==")
+        for line in (ROOT / "constraints-lowest.txt").read_text().splitlines()
+        if "==" in line
+    )
+    assert pinned.keys() == bounds.keys()
+    for name, version in bounds.items():
+        shortest = re.sub(r"(\.0)+$", "", pinned[name])
+        assert shortest == version or pinned[name].startswith(f"{version}.0."), name
+
+
 def test_a_package_that_is_there_but_broken_says_why(tmp_path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "brokenpackage.py").write_text("raise ImportError('libmissing.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)

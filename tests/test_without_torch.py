@@ -1,6 +1,7 @@
 """What a core install does, in processes that cannot import torch, and what it says where torch is needed."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -81,20 +82,46 @@ def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_p
 
 @pytest.mark.parametrize(
     "arguments",
-    [("run", "CAPTURE", "NEW"), ("map", "OUT"), ("predict", "CAPTURE", "pairs.npz")],
+    [
+        ("run", "CAPTURE", "NEW"),
+        ("map", "OUT"),
+        ("export", "MAPPED", "glb"),
+        ("export", "MAPPED", "octomap"),
+        ("predict", "CAPTURE", "pairs.npz"),
+    ],
     ids=lambda arguments: arguments[0],
 )
 def test_what_needs_torch_says_what_to_install_before_any_work(
     arguments: tuple[str, ...], capture: Path, calibrated: Path, tmp_path: Path
 ):
-    paths = {"CAPTURE": capture, "OUT": calibrated, "NEW": tmp_path / "new"}
+    mapped = tmp_path / "mapped"
+    shutil.copytree(calibrated, mapped)
+    (mapped / "map.safetensors").write_bytes(b"")
+    paths = {"CAPTURE": capture, "OUT": calibrated, "MAPPED": mapped, "NEW": tmp_path / "new"}
     done = run_jcr(*(paths.get(argument, argument) for argument in arguments))
     extra = "networks" if arguments[0] == "predict" else "map"
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
     assert f"needs torch, which is not installed: pip install '{DISTRIBUTION}[{extra}]'" in done.stderr
     assert not (tmp_path / "new").exists()
-    assert ("--no-map" in done.stderr) == (extra == "map")
+    assert ("--no-map" in done.stderr) == (arguments[0] in ("run", "map"))
+
+
+def test_a_map_is_made_later_where_torch_is(calibrated: Path, tmp_path: Path):
+    pytest.importorskip("torch", reason="the map needs torch")
+    from jcr.cli import dispatch
+
+    out = tmp_path / "out"
+    shutil.copytree(calibrated, out)
+    capture = json.loads((out / "run.json").read_text())["capture"]
+    assert dispatch(["run", capture, str(out), "--no-dense", "--quiet"]) == 2 and not list(out.glob("map.*"))
+    assert dispatch(["map", str(out), "--max-seconds", "1", "--quiet"]) == 0
+    assert (out / "map.safetensors").is_file() and (out / "cloud.ply").is_file()
+    one, other = (json.loads((folder / "calibration.json").read_text()) for folder in (calibrated, out))
+    assert one["gripper_from_camera"] == other["gripper_from_camera"]
+    made = (out / "reconstruction.npz").stat().st_mtime_ns
+    assert dispatch(["run", capture, str(out), "--no-map", "--quiet"]) == 0
+    assert (out / "reconstruction.npz").stat().st_mtime_ns == made  # dense depth is there already
 
 
 def test_torch_is_absent():

@@ -35,6 +35,8 @@ PARALLEL = 1e-6
 
 def rotation_exp(rotation_vector: Vectors) -> Rotations:
     """SO(3) exponential: rotation vectors (...,3) rad to matrices (...,3,3)."""
+    if rotation_vector.size == 0:  # refused by SciPy before 1.14
+        return np.zeros((*rotation_vector.shape[:-1], 3, 3))
     flat = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
     return flat.reshape(*rotation_vector.shape[:-1], 3, 3)
 

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.stage import calibrate_poses
 from jcr.geometry import inverse, transform
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.next_poses import next_poses
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import PosePairs
 from jcr.simulate.problem import hand_eye_problem
 
@@ -108,7 +108,7 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
     names = tuple(f"{k}.png" for k in range(12))
     pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
-    found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    found = calibrate_poses(pairs)
     assert not found.converged
     promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
     used = problem.base_from_gripper[found.inliers]

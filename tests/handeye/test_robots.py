@@ -198,7 +198,7 @@ def test_arm_agrees_with_its_mujoco_model(name, atol):
     for row in joints:
         pose, angles = np.eye(4), iter(row)
         for position, quat_wxyz, axis in MUJOCO_FORMS[name]:
-            body = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
+            body = Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()
             turn = np.zeros(3) if axis is None else next(angles) * np.array(axis, float)
             pose = pose @ transform(body @ rotation_exp(turn), np.array(position, float))
         other.append(pose)

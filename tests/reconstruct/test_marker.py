@@ -178,6 +178,7 @@ def test_lines_that_a_detector_drew_over_a_board_are_no_hindrance(tmp_path):
 
 
 def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tmp_path):
+    pytest.importorskip("torch", reason="dense depth needs torch")
     border = np.random.default_rng(0).integers(0, 255, (70, 90), dtype=np.uint8)
     sheet = cv2.resize(border, (900, 700), interpolation=cv2.INTER_CUBIC)
     sheet[140:560, 180:720] = 255

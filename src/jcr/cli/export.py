@@ -183,7 +183,7 @@ class Run:
 
     @cached_property
     def scene(self) -> "SceneMap":
-        """map.safetensors."""
+        """map.safetensors; asked for before what writes it is imported, which needs torch as well."""
         return self.folder.scene()
 
     @cached_property
@@ -236,28 +236,32 @@ def _ply(run: Run, path: Path) -> None:
 
 
 def _glb(run: Run, path: Path) -> None:
+    scene = run.scene
     from jcr.export.mesh import write_glb
 
-    write_glb(path, run.scene, run.provenance)
+    write_glb(path, scene, run.provenance)
 
 
 def _octomap(run: Run, path: Path) -> None:
+    scene = run.scene
     from jcr.export.volume import write_octomap
 
-    write_octomap(path, run.scene, run.provenance, run.arguments.voxel_size)
+    write_octomap(path, scene, run.provenance, run.arguments.voxel_size)
 
 
 def _esdf(run: Run, path: Path) -> None:
+    scene = run.scene
     from jcr.export.volume import write_esdf
 
     unknown = run.arguments.unknown or "occupied"
-    write_esdf(path, run.scene, run.provenance, unknown, run.arguments.voxel_size)
+    write_esdf(path, scene, run.provenance, unknown, run.arguments.voxel_size)
 
 
 def _spheres(run: Run, path: Path) -> None:
+    scene = run.scene
     from jcr.export.volume import write_spheres
 
-    write_spheres(path, run.scene, run.provenance, run.arguments.unknown or "free", run.arguments.excess)
+    write_spheres(path, scene, run.provenance, run.arguments.unknown or "free", run.arguments.excess)
 
 
 def _nerfstudio(run: Run, path: Path) -> None:
@@ -274,10 +278,11 @@ def _colmap(run: Run, path: Path) -> None:
 
 
 def _rerun(run: Run, path: Path) -> None:
+    scene = run.scene
     from jcr.export.rrd import write_rrd
 
     base_from_gripper = run.capture.base_from_gripper[run.reconstruction.image_index]
-    write_rrd(path, run.views, base_from_gripper, run.cloud, run.scene, run.provenance)
+    write_rrd(path, run.views, base_from_gripper, run.cloud, scene, run.provenance)
 
 
 FORMATS = (
