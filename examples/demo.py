@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import jcr
-from jcr.cli.result import summary
+from jcr.calibration.words import summary
 from jcr.geometry import fit_similarity, rotation_between_deg
 from jcr.progress import progress_bars
 
@@ -26,7 +26,7 @@ error_mm = 1e3 * np.linalg.norm(hand_eye.gripper_from_camera[:3, 3] - truth[:3, 
 error_deg = rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth[:3, :3])
 
 print()
-print(summary(result))
+print(summary(result.calibration))
 error_scale = 100 * (hand_eye.scale / true_scale - 1)
 print(f"against the truth: {error_mm:.3f} mm, {error_deg:.4f}°, scale {error_scale:+.3f} % ({seconds:.0f} s)")
 print(f"report: {result.out / 'report.html'}")
