@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -149,6 +148,8 @@ def write_transforms(folder: Path, capture: Capture, recon_from_camera: np.ndarr
 
 def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
     """A model without points in sparse/0, its images in images/, and a table with their names."""
+    import pycolmap
+
     write_table(folder, capture)
     (folder / "camera_info.yaml").unlink()
     lens = capture.intrinsics

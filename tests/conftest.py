@@ -3,16 +3,19 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
 from places import ROOT, SHARED
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
@@ -64,8 +67,10 @@ def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def true_mesh(tabletop: Path) -> trimesh.Trimesh:
+def true_mesh(tabletop: Path) -> "trimesh.Trimesh":
     """The simulated table of the bundled capture and all that stands on it, in the base frame."""
+    import trimesh
+
     scene = make_scene("tabletop", read_truth(tabletop).seed)
     base_from_table = transform(np.eye(3), scene.table_center_in_base)
     placed = [(base_from_table, part.mesh) for part in scene.table]

@@ -8,15 +8,17 @@ import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import trimesh
-import yourdfpy
 
 import jcr
 from jcr.geometry import rotation_between_deg
 from places import ROOT
+
+if TYPE_CHECKING:
+    import trimesh
 
 EXAMPLES = ROOT / "examples"
 
@@ -30,8 +32,11 @@ def example(name: str) -> ModuleType:
     return module
 
 
-def truly_touches(joint_values: np.ndarray, true_mesh: trimesh.Trimesh) -> np.ndarray:
+def truly_touches(joint_values: np.ndarray, true_mesh: "trimesh.Trimesh") -> np.ndarray:
     """Whether the arm's own collision shapes meet the simulated scene (n,), by FCL: no map, no spheres."""
+    import trimesh
+    import yourdfpy
+
     arm = yourdfpy.URDF.load(
         EXAMPLES / "arm.urdf",
         build_scene_graph=True,
@@ -59,7 +64,7 @@ def truly_touches(joint_values: np.ndarray, true_mesh: trimesh.Trimesh) -> np.nd
 
 
 def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
-    done: Path, true_mesh: trimesh.Trimesh
+    done: Path, true_mesh: "trimesh.Trimesh"
 ):
     pytest.importorskip("ompl", reason="needs ompl: pip install 'jcr-handeye[planning]'")
     planner = example("05_plan_with_ompl")

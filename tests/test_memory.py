@@ -12,15 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
 from benchmarks.align import CHILD
-from benchmarks.pairs import random_network
 from benchmarks.synthetic_pairs import synthetic_pairs
 from jcr.errors import InputError
 from jcr.memory import GB, give_back, require, resident
-from jcr.reconstruct.dust3r import predictor
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import align
 from jcr.reconstruct.global_alignment.pairs import (
@@ -39,6 +36,10 @@ SIDE = 320
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten pictures of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
+    from safetensors.torch import save_file
+
+    from benchmarks.pairs import random_network
+
     folder = tmp_path_factory.mktemp("capture")
     rng = np.random.default_rng(0)
     frames = []
@@ -99,6 +100,8 @@ def test_a_back_end_without_network_names_the_budget_it_needs(capture: Path, tmp
 
 
 def test_pointmaps_in_a_file_leave_the_resident_set(tmp_path: Path) -> None:
+    from jcr.reconstruct.dust3r import predictor
+
     shape = (100, 256, 256)
     points, conf = predictor._new_array((*shape, 3), False), predictor._new_array(shape, False)
     pairs = PairPredictions(np.tile([[0, 1]], (100, 1)), points, conf, points, conf)
@@ -138,6 +141,8 @@ def test_pairs_left_in_their_file_align_and_match_to_the_same_bits(tmp_path: Pat
 def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, system: str
 ) -> None:
+    from jcr.reconstruct.dust3r import predictor
+
     if system == "macos":
         monkeypatch.delattr(os, "posix_fallocate")
     size = 4 * 3 * 400_001
@@ -151,6 +156,8 @@ def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
 
 
 def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from jcr.reconstruct.dust3r import predictor
+
     def full(*arguments: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

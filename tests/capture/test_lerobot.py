@@ -1,6 +1,7 @@
 """LeRobot data sets, v2.1 and v3.0: the right pictures with the right poses, out of AV1 videos."""
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -15,9 +16,10 @@ from jcr.capture.options import ReadOptions
 from jcr.records import Capture
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
-pytest.importorskip("av", reason="av is not installed (extra lerobot)")
-pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
-pq = pytest.importorskip("pyarrow.parquet")
+pytestmark = [
+    pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed (extra lerobot)")
+    for name in ("av", "pyarrow")
+]
 
 HOLD, MOVE = 5, 5
 """Frames at rest, and on the way to the next view."""
@@ -84,6 +86,9 @@ def test_cartesian_states_give_still_frames_with_their_poses(
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_pictures_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     states = writers.rows_as("rpy", problem.base_from_gripper[:6])
     other = pictured(tabletop, 2, first=9), walked(states[:2])
     episode = pictured(tabletop, 6), walked(states)

@@ -7,16 +7,13 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-import pycolmap
-import pyoctomap
 import pytest
-import trimesh
 import yaml
-import yourdfpy
 from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -29,13 +26,17 @@ from jcr.cli.export import FORMATS
 from jcr.errors import InputError
 from jcr.export import ros
 from jcr.export.provenance import Provenance
-from jcr.export.views import PosedImages, write_colmap, write_nerfstudio
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
-from jcr.represent.scene import FREE, OCCUPIED, SceneMap
 from jcr.simulate.scenes import make_scene, solid_labels
 from jcr.simulate.truth import read_truth
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from jcr.export.views import PosedImages
+    from jcr.represent.scene import SceneMap
 
 DOUBT = "scale: every view turns about <one> point -- vary the distance"
 """With what ends an XML comment in it."""
@@ -43,7 +44,7 @@ PARENT_FROM_CHILD = transform(rotation_exp(np.array([0.4, -2.1, 1.3])), np.array
 
 
 @pytest.fixture(scope="module")
-def scene(done: Path) -> SceneMap:
+def scene(done: Path) -> "SceneMap":
     return jcr.load_map(done)
 
 
@@ -85,6 +86,8 @@ def of_launch_py(path: Path) -> np.ndarray:
 
 
 def of_urdf(path: Path) -> np.ndarray:
+    import yourdfpy
+
     return yourdfpy.URDF.load(path).get_transform("optical", "tool0")
 
 
@@ -222,8 +225,10 @@ LENS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3, -2e-3
 
 
 @pytest.fixture
-def views(tmp_path: Path) -> PosedImages:
+def views(tmp_path: Path) -> "PosedImages":
     """Three noisy pictures through a lens with all five coefficients, and the exact pixels of 60 points."""
+    from jcr.export.views import PosedImages
+
     rng = np.random.default_rng(5)
     folder = tmp_path / "capture"
     images = ("left/0.png", "left/1.png", "right/0.png")
@@ -254,8 +259,12 @@ def views(tmp_path: Path) -> PosedImages:
 @pytest.mark.parametrize("undistorted", [False, True])
 @pytest.mark.parametrize("read", ["read_binary", "read_text"])
 def test_colmap_model_reprojects_its_points_exactly(
-    views: PosedImages, undistorted: bool, read: str, tmp_path: Path
+    views: "PosedImages", undistorted: bool, read: str, tmp_path: Path
 ):
+    import pycolmap
+
+    from jcr.export.views import write_colmap
+
     out = tmp_path / "model"
     write_colmap(out, views, Provenance("base_link", DOUBT), undistorted, link=False)
     model = pycolmap.Reconstruction()
@@ -279,8 +288,12 @@ def test_colmap_model_reprojects_its_points_exactly(
 
 @pytest.mark.parametrize("undistorted", [False, True])
 def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
-    views: PosedImages, undistorted: bool, tmp_path: Path
+    views: "PosedImages", undistorted: bool, tmp_path: Path
 ):
+    import trimesh
+
+    from jcr.export.views import write_nerfstudio
+
     out = tmp_path / "splat"
     n = len(views.points_in_base)
     gray = np.full((n, 3), 90, np.uint8)
@@ -314,7 +327,9 @@ def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
     np.testing.assert_allclose(np.asarray(first.vertices), views.points_in_base, atol=1e-6)  # pyright: ignore
 
 
-def test_pictures_turned_by_a_tag_are_copied_upright(views: PosedImages, tmp_path: Path):
+def test_pictures_turned_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):
+    from jcr.export.views import write_colmap
+
     tag = Image.Exif()
     tag[0x0112] = 3
     source = views.folder / views.images[0]
@@ -332,6 +347,8 @@ def export(done: Path, name: str, path: Path, *options: object) -> Path:
 
 
 def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
+    import trimesh
+
     path = export(done, "ply", tmp_path / "out.ply", "--base-frame", "arm_base")
     cloud, written = read_cloud(done / "cloud.ply"), read_cloud(path)
     np.testing.assert_array_equal(written.label, cloud.label)
@@ -343,8 +360,10 @@ def test_ply_holds_points_colours_and_labels(done: Path, tmp_path: Path):
 
 
 def test_mesh_lies_on_the_true_surface_and_faces_free_space(
-    done: Path, true_mesh: trimesh.Trimesh, tmp_path: Path
+    done: Path, true_mesh: "trimesh.Trimesh", tmp_path: Path
 ):
+    import trimesh
+
     loaded = trimesh.load_scene(export(done, "glb", tmp_path / "map.glb"))
     assert loaded.metadata["frame"] == "base_link" and loaded.metadata["unit"] == "m"
     mesh = loaded.to_geometry()
@@ -365,8 +384,12 @@ def test_mesh_lies_on_the_true_surface_and_faces_free_space(
 
 
 def test_octomap_tells_free_from_occupied_from_unknown(
-    done: Path, scene: SceneMap, tabletop: Path, tmp_path: Path
+    done: Path, scene: "SceneMap", tabletop: Path, tmp_path: Path
 ):
+    import pyoctomap
+
+    from jcr.represent.scene import FREE, OCCUPIED
+
     path = export(done, "octomap", tmp_path / "map.bt", "--voxel-size", 0.02)
     assert b"# frame: base_link\n# unit: m\n" in path.read_bytes()[:200]
     tree = pyoctomap.OcTree(1.0)  # pyright: ignore[reportAttributeAccessIssue]
@@ -389,7 +412,7 @@ def test_octomap_tells_free_from_occupied_from_unknown(
 
 @pytest.mark.parametrize("unknown", ["occupied", "free"])
 def test_esdf_voxels_hold_the_distance_at_their_centres(
-    done: Path, scene: SceneMap, unknown: str, tmp_path: Path
+    done: Path, scene: "SceneMap", unknown: str, tmp_path: Path
 ):
     path = export(done, "esdf", tmp_path / "esdf.npz", "--unknown", unknown, "--voxel-size", 0.015)
     with np.load(path) as file:
@@ -407,7 +430,7 @@ def test_esdf_voxels_hold_the_distance_at_their_centres(
     assert np.isfinite(grid["values"]).all() and grid["values"].min() < 0 < grid["values"].max()
 
 
-def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: SceneMap, tmp_path: Path):
+def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: "SceneMap", tmp_path: Path):
     with np.load(export(done, "spheres", tmp_path / "spheres.npz")) as file:
         centers, radii, frame = file["centers"], file["radii"], str(file["frame"])
     assert frame == "base_link" and radii.min() > 0 and len(radii) < 3000
@@ -423,6 +446,8 @@ def test_spheres_cover_what_is_solid_and_little_else(done: Path, scene: SceneMap
 
 
 def test_run_exports_its_cameras_where_they_truly_were(done: Path, tabletop: Path, tmp_path: Path):
+    import pycolmap
+
     truth = read_truth(tabletop)
     out = export(done, "colmap", tmp_path / "colmap")
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
@@ -445,6 +470,8 @@ def test_run_exports_its_cameras_where_they_truly_were(done: Path, tabletop: Pat
 def test_command_gives_the_root_link_asked_for(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
+    import yourdfpy
+
     gripper_from_camera = np.array(json.loads((done / "calibration.json").read_text())["gripper_from_camera"])
     options = ["--to-root", "camera_link", "--parent-frame", "flange"]
     path = export(done, "urdf", tmp_path / "a.urdf", *options)

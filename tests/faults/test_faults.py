@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from jcr import attempts, pipeline, run_folder
@@ -233,8 +232,14 @@ def pickled_weights(path: Path) -> None:
         pickle.dump({"model": Evil(executed(path))}, stream)
 
 
+def saved_weights(path: Path, shape: tuple[int, ...], **more: object) -> None:
+    import torch
+
+    torch.save({"model": {"conv.weight": torch.zeros(shape)}, **more}, path)
+
+
 def torch_pickled_weights(path: Path) -> None:
-    torch.save({"model": {"weight": torch.zeros(2)}, "args": Evil(executed(path))}, path)
+    saved_weights(path, (2,), args=Evil(executed(path)))
 
 
 def pickled_predictions(path: Path) -> None:
@@ -348,12 +353,12 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     "weights that are a pickle with code": (weights(pickled_weights), 2, "weights.pth"),
     "weights that are torch's pickle with code": (weights(torch_pickled_weights), 2, "weights.pth"),
     "truncated weights": (
-        weights(lambda p: (torch.save({"model": {"w": torch.zeros(999)}}, p), cut(p))),
+        weights(lambda p: (saved_weights(p, (999,)), cut(p))),
         2,
         "weights.pth",
     ),
     "weights of another network": (
-        weights(lambda p: torch.save({"model": {"conv.weight": torch.zeros(3, 3)}}, p)),
+        weights(lambda p: saved_weights(p, (3, 3))),
         2,
         "weights.pth",
     ),

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import atheris
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+TESTS = Path(__file__).parents[1]
+sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 READERS = [
     "jcr.capture",
     "jcr.calibration.calibration_json",
@@ -23,7 +24,6 @@ READERS = [
 READERS += ["jcr.represent", "rosbags", "safetensors", "yaml"]
 with atheris.instrument_imports(include=READERS):
     from fuzz_targets import targets
-
     from jcr.errors import InputError
     from jcr.live.line_server import parsed, pose_of
 

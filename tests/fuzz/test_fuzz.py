@@ -9,11 +9,11 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from fuzz_targets import Target, targets
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jcr
+from fuzz_targets import Target, targets
 from jcr.errors import InputError
 from jcr.geometry import rotation_exp, transform
 from jcr.simulate.poses import Pattern

@@ -3,26 +3,25 @@
 import importlib.util
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import torch
 from numpy import ndarray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
 from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, transform
-from jcr.reconstruct import backends, mapanything, predictions
+from jcr.reconstruct import backends, predictions
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.dust3r import dust3r
-from jcr.reconstruct.dust3r.dust3r import Dust3rOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays
-from jcr.reconstruct.mapanything import MapAnythingOptions
 from jcr.reconstruct.predictions import PredictionsOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 from places import SHARED
+
+if TYPE_CHECKING:
+    import torch
 
 ALIGN = SHARED / "align"
 COUNT, WIDTH, HEIGHT = 5, 128, 96
@@ -208,6 +207,9 @@ def test_a_network_gives_the_same_record(
     capture: Capture, truth: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The dust3r back end around synthetic predictions on the grid it prepared."""
+    from jcr.reconstruct.dust3r import dust3r
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions
+
     made = pairs_from_arrays(pair_arrays(truth), "synthetic")
 
     def predict(capture: Capture, options: object, progress: object, *, aligned: bool) -> tuple:
@@ -233,7 +235,9 @@ class FakeMapAnything:
         self.truth = truth
         self.views: list[dict[str, Any]] = []
 
-    def infer(self, views: list[dict[str, Any]], **options: Any) -> list[dict[str, torch.Tensor]]:
+    def infer(self, views: list[dict[str, Any]], **options: Any) -> "list[dict[str, torch.Tensor]]":
+        import torch
+
         self.views = views
         assert options["apply_mask"] is False
         answers = []
@@ -259,6 +263,9 @@ class FakeMapAnything:
 def test_mapanything_is_given_our_intrinsics_and_its_poses_are_compared(
     capture: Capture, truth: dict[str, Any]
 ) -> None:
+    from jcr.reconstruct import mapanything
+    from jcr.reconstruct.mapanything import MapAnythingOptions
+
     model = FakeMapAnything(truth)
     options = MapAnythingOptions("X")
     result = mapanything.reconstruct(capture, options, model=model)

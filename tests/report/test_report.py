@@ -28,7 +28,6 @@ from jcr.report.map_samples import CLEARANCE, sample_surface, slices
 from jcr.report.motion import excitation_bars
 from jcr.report.notations import notations
 from jcr.report.pictures import MAGNIFIED
-from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
 from jcr.results import RunResult
@@ -45,6 +44,8 @@ CELL = 0.02
 @pytest.fixture(scope="module")
 def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """A run on the bundled images whose pointmaps are cast against the true table and boxes."""
+    from jcr.represent.build import build_scene
+
     truth = read_truth(tabletop)
     folder = tmp_path_factory.mktemp("report") / "a & <b>"
     names = [EVIL if k == 1 else name for k, name in enumerate(truth.images)]

@@ -4,21 +4,20 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
 
 import analytic_scene
 from analytic_scene import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, WORKSPACE, signed_distance
 from jcr.errors import InputError
 from jcr.records import PointCloud
-from jcr.represent.build import build_scene
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
-from jcr.represent.rays import workspace_rays
-from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap
-from jcr.represent.seen import CLEAR, CROSSED
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 OPTIONS = MapOptions(workspace=WORKSPACE)
 INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
@@ -39,7 +38,9 @@ def warmth(cloud: PointCloud) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scene(cloud: PointCloud) -> SceneMap:
+def scene(cloud: PointCloud) -> "SceneMap":
+    from jcr.represent.build import build_scene
+
     return build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
 
 
@@ -57,7 +58,7 @@ def near_surface(count: int) -> np.ndarray:
 # What nobody has seen
 
 
-def test_what_no_ray_crossed_is_claimed_by_nobody(scene: SceneMap):
+def test_what_no_ray_crossed_is_claimed_by_nobody(scene: "SceneMap"):
     hidden = np.stack([INSIDE_BOX, BALL_CENTER, UNDER_TABLE, [0.0, 0.0, -0.02], OUTSIDE])
     sample = scene.query(hidden)
     assert sample.unknown.all()
@@ -67,7 +68,7 @@ def test_what_no_ray_crossed_is_claimed_by_nobody(scene: SceneMap):
     assert (scene.query(hidden, unknown="free").occupancy == 0).all()
 
 
-def test_no_place_that_no_camera_could_see_is_called_free(scene: SceneMap):
+def test_no_place_that_no_camera_could_see_is_called_free(scene: "SceneMap"):
     x = uniform(200_000)
     deep = signed_distance(x) < -0.005
     assert deep.sum() > 1000
@@ -76,7 +77,7 @@ def test_no_place_that_no_camera_could_see_is_called_free(scene: SceneMap):
     assert claimed_free.mean() < 0.001
 
 
-def test_the_box_is_no_wall_and_nothing_is_clamped_into_it(scene: SceneMap):
+def test_the_box_is_no_wall_and_nothing_is_clamped_into_it(scene: "SceneMap"):
     just_out = np.array([[0.0, 0.0, 0.601], [0.0, 0.0, 5.0], [-0.451, 0, 0.3], [1e30, 0, 0], [0, -3e9, 0]])
     sample = scene.query(just_out)
     assert sample.unknown.all()
@@ -85,7 +86,9 @@ def test_the_box_is_no_wall_and_nothing_is_clamped_into_it(scene: SceneMap):
     assert np.isnan(sample.color).all()
 
 
-def test_the_planner_chooses_how_unknown_counts(scene: SceneMap):
+def test_the_planner_chooses_how_unknown_counts(scene: "SceneMap"):
+    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+
     centers = np.stack([FREE_SPOT, UNDER_TABLE, BOX_CENTER + [0, 0, BOX_HALF[2]], OUTSIDE])
     radii = np.array([0.05, 0.01, 0.02, 0.05])
     assert scene.check_spheres(centers, radii, unknown="report").tolist() == [
@@ -98,7 +101,7 @@ def test_the_planner_chooses_how_unknown_counts(scene: SceneMap):
     assert scene.check_spheres(centers, radii, unknown="free").tolist() == [False, False, True, False]
 
 
-def test_free_space_that_was_seen_is_not_called_solid(scene: SceneMap):
+def test_free_space_that_was_seen_is_not_called_solid(scene: "SceneMap"):
     x = uniform(200_000)
     clear = signed_distance(x) > 0.005
     sample = scene.query(x[clear])
@@ -106,7 +109,11 @@ def test_free_space_that_was_seen_is_not_called_solid(scene: SceneMap):
     assert ((sample.occupancy >= 0.5) & ~sample.unknown).mean() < 0.002
 
 
-def test_cells_called_clear_are_free_all_over(scene: SceneMap):
+def test_cells_called_clear_are_free_all_over(scene: "SceneMap"):
+    import torch
+
+    from jcr.represent.seen import CLEAR, CROSSED
+
     clear = (scene.seen.state & CLEAR) != 0
     assert clear.sum() > 0.5 * ((scene.seen.state & CROSSED) != 0).sum()
     x = torch.tensor(uniform(200_000), dtype=torch.float32)
@@ -118,7 +125,7 @@ def test_cells_called_clear_are_free_all_over(scene: SceneMap):
 # Distance
 
 
-def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: SceneMap):
+def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: "SceneMap"):
     x = uniform(200_000)
     true = signed_distance(x)
     beside = (true > 0.01) & (true < 0.15) & ~scene.query(x).unknown
@@ -133,14 +140,14 @@ def test_distances_and_gradients_are_those_of_the_box_and_the_ball(scene: SceneM
     assert np.percentile(np.linalg.norm(sample.gradient, axis=1), 90) < 1.1
 
 
-def test_distance_is_negative_inside_and_zero_on_the_surface(scene: SceneMap, cloud: PointCloud):
+def test_distance_is_negative_inside_and_zero_on_the_surface(scene: "SceneMap", cloud: PointCloud):
     assert scene.query(INSIDE_BOX[None], unknown="occupied").distance[0] < -0.02
     on_surface = scene.query(cloud.points_in_base[:5000]).distance
     assert np.abs(np.median(on_surface)) < 0.001
     assert np.percentile(np.abs(on_surface), 95) < 0.004
 
 
-def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: SceneMap):
+def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: "SceneMap"):
     x = uniform(50_000)
     careful, bold = (scene.query(x, unknown=choice).distance for choice in ("occupied", "free"))
     outside = bold > 0
@@ -152,7 +159,7 @@ def test_unknown_as_occupied_is_no_farther_than_unknown_as_free(scene: SceneMap)
 # Spheres and segments
 
 
-def test_spheres_touch_what_they_reach_and_nothing_else(scene: SceneMap):
+def test_spheres_touch_what_they_reach_and_nothing_else(scene: "SceneMap"):
     centers = uniform(100_000)
     radii = np.random.default_rng(1).uniform(0.005, 0.05, len(centers))
     true = signed_distance(centers)
@@ -164,7 +171,7 @@ def test_spheres_touch_what_they_reach_and_nothing_else(scene: SceneMap):
     assert scene.check_spheres(centers, radii + scene.cell / 2)[answer].all()
 
 
-def test_spheres_come_in_any_batch(scene: SceneMap):
+def test_spheres_come_in_any_batch(scene: "SceneMap"):
     centers = uniform(24).reshape(2, 3, 4, 3)
     flat = scene.check_spheres(centers.reshape(-1, 3), 0.03)
     assert (scene.check_spheres(centers, 0.03) == flat.reshape(2, 3, 4)).all()
@@ -173,7 +180,9 @@ def test_spheres_come_in_any_batch(scene: SceneMap):
     assert scene.check_spheres(np.zeros((0, 3)), 0.03).shape == (0,)
 
 
-def test_a_segment_touches_where_its_middle_does(scene: SceneMap):
+def test_a_segment_touches_where_its_middle_does(scene: "SceneMap"):
+    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+
     start, end = BALL_CENTER + [0, -0.12, 0.02], BALL_CENTER + [0, 0.12, 0.02]
     above = np.array([0, 0, BALL_RADIUS + 0.05])
     ends = [FREE, FREE]
@@ -188,7 +197,7 @@ def test_a_segment_touches_where_its_middle_does(scene: SceneMap):
 # What is there
 
 
-def test_colours_labels_and_further_values_are_learnt(scene: SceneMap, cloud: PointCloud):
+def test_colours_labels_and_further_values_are_learnt(scene: "SceneMap", cloud: PointCloud):
     x = cloud.points_in_base
     sample = scene.query(x)
     assert np.abs(sample.color - analytic_scene.true_color(x)).mean() < 0.03
@@ -199,6 +208,8 @@ def test_colours_labels_and_further_values_are_learnt(scene: SceneMap, cloud: Po
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_the_papers_networks_learn_all_three(cloud: PointCloud, joint: bool):
+    from jcr.represent.build import build_scene
+
     scene = build_scene(cloud, replace(OPTIONS, preset="paper", joint=joint, max_seconds=6.0))
     x = uniform(100_000)
     surface, free = cloud.points_in_base[:20_000], x[signed_distance(x) > 0.03]
@@ -211,6 +222,8 @@ def test_the_papers_networks_learn_all_three(cloud: PointCloud, joint: bool):
 
 
 def test_one_network_for_all_properties_answers_as_well(cloud: PointCloud):
+    from jcr.represent.build import build_scene
+
     scene = build_scene(cloud, replace(OPTIONS, joint=True))
     assert len(scene.fields.of) == 1
     x = cloud.points_in_base[:20_000]
@@ -219,6 +232,8 @@ def test_one_network_for_all_properties_answers_as_well(cloud: PointCloud):
 
 
 def test_reliable_points_weigh_more(cloud: PointCloud):
+    from jcr.represent.rays import workspace_rays
+
     n = len(cloud.points_in_base)
     half = np.arange(n) < n // 2
     box = np.reshape(WORKSPACE, (2, 3))
@@ -230,6 +245,8 @@ def test_reliable_points_weigh_more(cloud: PointCloud):
 
 
 def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCloud):
+    from jcr.represent.build import build_scene
+
     wrong = np.random.default_rng(0).random(len(cloud.color)) < 0.4
     stained = replace(
         cloud,
@@ -245,7 +262,9 @@ def test_a_wrong_colour_that_nobody_trusts_does_not_stain_the_map(cloud: PointCl
 # Torch, threads, files
 
 
-def test_torch_differentiates_every_answer(scene: SceneMap):
+def test_torch_differentiates_every_answer(scene: "SceneMap"):
+    import torch
+
     def wanted(x: np.ndarray) -> torch.Tensor:
         return torch.tensor(x, dtype=torch.float32, requires_grad=True)
 
@@ -271,7 +290,9 @@ def test_torch_differentiates_every_answer(scene: SceneMap):
     assert (rise[steep] / 2e-5 / of_occupancy.norm(dim=1)[steep]).median() == pytest.approx(1, abs=0.1)
 
 
-def test_arrays_and_tensors_get_the_same_answers(scene: SceneMap):
+def test_arrays_and_tensors_get_the_same_answers(scene: "SceneMap"):
+    import torch
+
     x = uniform(1000)
     array, tensor = scene.query(x), scene.query(torch.tensor(x, dtype=torch.float32))
     assert isinstance(array.distance, np.ndarray)
@@ -279,7 +300,7 @@ def test_arrays_and_tensors_get_the_same_answers(scene: SceneMap):
     assert np.array_equal(array.occupancy, tensor.occupancy.numpy())
 
 
-def test_eight_threads_get_the_answers_of_one(cloud: PointCloud, scene: SceneMap, tmp_path: Path):
+def test_eight_threads_get_the_answers_of_one(cloud: PointCloud, scene: "SceneMap", tmp_path: Path):
     x = uniform(50_000)
     alone = scene.query(x, unknown="occupied")
     expected = alone.occupancy, alone.distance, alone.label, scene.check_spheres(x, 0.02)
@@ -296,7 +317,7 @@ def test_eight_threads_get_the_answers_of_one(cloud: PointCloud, scene: SceneMap
                 assert np.array_equal(answer, right, equal_nan=True)
 
 
-def test_a_loaded_map_answers_as_the_saved_one(scene: SceneMap, tmp_path: Path):
+def test_a_loaded_map_answers_as_the_saved_one(scene: "SceneMap", tmp_path: Path):
     scene.save(tmp_path / "map.safetensors")
     again = load_map(tmp_path)
     x = np.concatenate([uniform(20_000), OUTSIDE[None]])
@@ -309,7 +330,9 @@ def test_a_loaded_map_answers_as_the_saved_one(scene: SceneMap, tmp_path: Path):
     assert again.history == scene.history
 
 
-def test_the_same_seed_gives_the_same_map(cloud: PointCloud, scene: SceneMap):
+def test_the_same_seed_gives_the_same_map(cloud: PointCloud, scene: "SceneMap"):
+    from jcr.represent.build import build_scene
+
     again = build_scene(cloud, OPTIONS, values={"warmth": warmth(cloud)})
     x = uniform(20_000)
     assert np.array_equal(scene.query(x).occupancy, again.query(x).occupancy)
@@ -318,7 +341,9 @@ def test_the_same_seed_gives_the_same_map(cloud: PointCloud, scene: SceneMap):
     assert not np.array_equal(untrained[0].query(x).color, untrained[1].query(x).color)
 
 
-def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: SceneMap):
+def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: "SceneMap"):
+    from jcr.represent.build import build_scene
+
     shift = np.array([0.5, -0.25, 1.0])
     moved = replace(
         cloud,
@@ -344,13 +369,13 @@ def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: 
         (np.array([[np.inf, 0, 0]]), "row 0 is not finite"),
     ],
 )
-def test_points_that_are_none_are_refused(scene: SceneMap, points: np.ndarray, says: str):
+def test_points_that_are_none_are_refused(scene: "SceneMap", points: np.ndarray, says: str):
     # Past the shape checks of the test run, as a user's call comes.
     with pytest.raises(InputError, match=says):
         scene._points(points, "points")
 
 
-def test_questions_that_make_no_sense_are_refused(scene: SceneMap):
+def test_questions_that_make_no_sense_are_refused(scene: "SceneMap"):
     with pytest.raises(InputError, match="negative"):
         scene.check_spheres(np.zeros((2, 3)), np.array([0.1, -0.1]))
     with pytest.raises(InputError, match="does not fit"):
@@ -362,6 +387,8 @@ def test_questions_that_make_no_sense_are_refused(scene: SceneMap):
 
 
 def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
+    from jcr.represent.build import build_scene
+
     broken = cloud.points_in_base.copy()
     broken[7, 1] = np.nan
     with pytest.raises(InputError, match="not finite"):
@@ -376,7 +403,9 @@ def test_clouds_that_make_no_map_are_refused(cloud: PointCloud):
         build_scene(cloud, OPTIONS, values={"warmth": np.full((len(broken), 1), np.nan)})
 
 
-def test_damaged_and_foreign_map_files_are_named(scene: SceneMap, tmp_path: Path):
+def test_damaged_and_foreign_map_files_are_named(scene: "SceneMap", tmp_path: Path):
+    import torch
+
     path = tmp_path / "map.safetensors"
     with pytest.raises(InputError, match="no map here"):
         load_map(tmp_path)

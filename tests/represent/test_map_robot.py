@@ -3,21 +3,23 @@
 import re
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import trimesh
 
 import analytic_scene
 from analytic_scene import BALL_CENTER, WORKSPACE
 from jcr.errors import InputError
 from jcr.geometry import apply, transform
-from jcr.represent.build import build_scene
 from jcr.represent.cloud_ply import write_cloud
 from jcr.represent.options import MapOptions
-from jcr.represent.robot import load_robot, spheres_of_shape
-from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN, SceneMap
 from places import ROOT
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from jcr.represent.scene import SceneMap
 
 EXCESS = 0.01
 
@@ -46,6 +48,8 @@ URDF = """<robot name="arm">
 
 @pytest.fixture(scope="module")
 def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import trimesh
+
     folder = tmp_path_factory.mktemp("robot")
     wedge = trimesh.convex.convex_hull(np.array([[0, -20, -20], [0, 20, -20], [0, 0, 20], [40, 0, 0]], float))
     wedge.export(folder / "wedge.stl")
@@ -54,27 +58,36 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene() -> SceneMap:
+def scene() -> "SceneMap":
+    from jcr.represent.build import build_scene
+
     return build_scene(analytic_scene.cloud(), MapOptions(workspace=WORKSPACE))
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        trimesh.creation.box((0.2, 0.06, 0.03)),
-        trimesh.creation.cylinder(0.04, 0.3),
-        trimesh.creation.cylinder(0.15, 0.02),
-        trimesh.creation.icosphere(radius=0.07),
-        trimesh.util.concatenate(
-            [
-                trimesh.creation.box((0.3, 0.03, 0.03)),
-                trimesh.creation.box((0.03, 0.03, 0.3), transform(np.eye(3), np.array([0.15, 0, 0.15]))),
-            ]
-        ),
-    ],
-    ids=["box", "rod", "disc", "ball", "elbow"],
-)
-def test_spheres_hold_the_shape_and_little_else(shape: trimesh.Trimesh):
+def shape_named(name: str) -> "trimesh.Trimesh":
+    from trimesh.creation import box, cylinder, icosphere
+    from trimesh.util import concatenate
+
+    match name:
+        case "box":
+            return box((0.2, 0.06, 0.03))
+        case "rod":
+            return cylinder(0.04, 0.3)
+        case "disc":
+            return cylinder(0.15, 0.02)
+        case "ball":
+            return icosphere(radius=0.07)
+    across = transform(np.eye(3), np.array([0.15, 0, 0.15]))
+    return concatenate([box((0.3, 0.03, 0.03)), box((0.03, 0.03, 0.3), across)])
+
+
+@pytest.mark.parametrize("name", ["box", "rod", "disc", "ball", "elbow"])
+def test_spheres_hold_the_shape_and_little_else(name: str):
+    import trimesh
+
+    from jcr.represent.robot import spheres_of_shape
+
+    shape = shape_named(name)
     link_from_shape = transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.1, 0.2, 0.3]))
     centers, radii = spheres_of_shape(shape, link_from_shape, EXCESS)
     surface = shape.sample(3000, seed=0)
@@ -91,6 +104,8 @@ def test_spheres_hold_the_shape_and_little_else(shape: trimesh.Trimesh):
 
 
 def test_joints_move_the_spheres_as_the_urdf_says(urdf: Path):
+    from jcr.represent.robot import load_robot
+
     robot = load_robot(urdf)
     assert robot.joint_names == ("turn", "bend", "push")
     assert len(robot.links) == 6
@@ -109,6 +124,8 @@ def test_joints_move_the_spheres_as_the_urdf_says(urdf: Path):
 def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
     import yourdfpy
 
+    from jcr.represent.robot import load_robot
+
     peer, robot = yourdfpy.URDF.load(str(urdf), load_meshes=False), load_robot(urdf)
     q = np.array([0.7, -1.1, 0.03])
     peer.update_cfg(q)
@@ -118,7 +135,10 @@ def test_yourdfpy_puts_the_links_at_the_same_places(urdf: Path):
         assert np.allclose(robot.centers(q)[mine], expected, atol=1e-9)
 
 
-def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: SceneMap, urdf: Path):
+def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: "SceneMap", urdf: Path):
+    from jcr.represent.robot import load_robot
+    from jcr.represent.scene import FREE, OCCUPIED, UNKNOWN
+
     # The foot stands on the table, behind the ball as seen along x.
     base_from_robot = transform(np.eye(3), BALL_CENTER * [1, 1, 0] + [-0.13, 0, 0.01])
 
@@ -138,7 +158,9 @@ def test_the_arm_touches_the_ball_where_it_bends_into_it(scene: SceneMap, urdf: 
     assert scene.check_robot(load_robot(urdf), many, "free", base_from_robot, ("foot",)).shape == (4, 5)
 
 
-def test_robots_and_joints_that_make_no_sense_are_refused(scene: SceneMap, urdf: Path, tmp_path: Path):
+def test_robots_and_joints_that_make_no_sense_are_refused(scene: "SceneMap", urdf: Path, tmp_path: Path):
+    from jcr.represent.robot import load_robot
+
     robot = load_robot(urdf)
     with pytest.raises(InputError, match="no such URDF"):
         scene.check_robot(tmp_path / "none.urdf", np.zeros(3))
@@ -167,7 +189,7 @@ def test_robots_and_joints_that_make_no_sense_are_refused(scene: SceneMap, urdf:
 
 
 def test_the_page_on_the_map_runs_as_printed(
-    scene: SceneMap, urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: "SceneMap", urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     page = (ROOT / "docs" / "map.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.S)

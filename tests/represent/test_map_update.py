@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,14 +16,15 @@ from jcr.errors import InputError
 from jcr.geometry import inverse, scale_translation, transform
 from jcr.reconstruct.added import extend
 from jcr.records import Capture, HandEye, Observability, Reconstruction, RobotNoise, Tracks
-from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.represent.scene import SceneMap
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render
 from jcr.simulate.scenes import Scene, make_scene
 from jcr.simulate.truth import Truth, read_truth, true_depth
+
+if TYPE_CHECKING:
+    from jcr.represent.scene import SceneMap
 
 pytestmark = pytest.mark.gl
 
@@ -129,7 +131,9 @@ def added_views(
     return with_images(read_added(folder, capture), pairs)
 
 
-def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> SceneMap:
+def mapped(truth: Truth, capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> "SceneMap":
+    from jcr.represent.build import build_scene
+
     box = tuple(truth.workspace_in_base.ravel().tolist())
     cloud = point_cloud(capture, reconstruction, hand_eye, options=CloudOptions(confidence_percentile=0.0))
     return build_scene(cloud, MapOptions(workspace=box))

@@ -28,7 +28,6 @@ from jcr.records import (
 from jcr.segment.labels import read_labels
 from jcr.segment.measure import measure
 from jcr.segment.options import SegmentOptions, TabletopOptions
-from jcr.segment.sam import image_masks, load_sam, merged, sam_labels
 from jcr.segment.segments import image_labels, label_cloud
 from jcr.segment.tabletop import label_tabletop, support_plane
 
@@ -380,6 +379,8 @@ def test_labels_are_asked_for_only_where_they_are_wanted(tmp_path: Path):
 
 def test_masks_of_different_images_become_objects_by_where_they_lie():
     """Two images see one plane from opposite sides; a third mask is seen by one image alone."""
+    from jcr.segment.sam import merged
+
     grid = np.stack(np.meshgrid(np.linspace(0, 0.4, 40), np.linspace(0, 0.3, 30)), -1)
     plane = np.concatenate([grid, np.zeros((30, 40, 1))], -1)
     x_in_base = np.stack([plane, plane[::-1, ::-1]])
@@ -442,6 +443,8 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     tiny_sam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
     """A random network is sure of nothing: its masks pass once the thresholds are gone."""
+    from jcr.segment.sam import image_masks, load_sam, sam_labels
+
     model = load_sam(str(tiny_sam))
     assert capfd.readouterr() == ("", "")
     image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
@@ -463,6 +466,8 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
 
 
 def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from jcr.segment.sam import load_sam
+
     pytest.importorskip("transformers", reason="the extra `sam` is not installed")
     with pytest.raises(InputError, match="config.json and model.safetensors"):
         load_sam(str(tmp_path))

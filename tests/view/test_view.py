@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,13 +17,11 @@ from scipy.ndimage import minimum_filter
 from chromium import Chromium
 from jcr.errors import InputError
 from jcr.simulate.truth import Truth, read_truth
-from jcr.view import layers
 from jcr.view.gate import Gate
-from jcr.view.layers import level_slice
 from jcr.view.robot import read_joints, read_urdf, solve_joints
-from jcr.view.run import read_run
-from jcr.view.server import open_server
-from jcr.view.viewer import CHOSEN, CLOUD, COLLIDES, FREE, REJECTED, Viewer
+
+if TYPE_CHECKING:
+    from jcr.view.viewer import Viewer
 
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
@@ -51,7 +50,12 @@ def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def viewer(done: Path, gantry: Path) -> Iterator[Viewer]:
+def viewer(done: Path, gantry: Path) -> "Iterator[Viewer]":
+    from jcr.view import layers
+    from jcr.view.run import read_run
+    from jcr.view.server import open_server
+    from jcr.view.viewer import Viewer
+
     run, robot = read_run(done), read_urdf(gantry)
     values = solve_joints(robot, "revolute_x", run.base_from_gripper)
     server = open_server("127.0.0.1", 0, "test")
@@ -61,7 +65,9 @@ def viewer(done: Path, gantry: Path) -> Iterator[Viewer]:
     server.stop()
 
 
-def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: Viewer):
+def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: "Viewer"):
+    from jcr.view.viewer import CLOUD
+
     counts = []
     for threshold in (0.02, 0.5, 0.98):
         viewer.threshold.value = threshold
@@ -77,7 +83,9 @@ def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: View
     viewer.show_points()
 
 
-def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: Viewer, truth: Truth):
+def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
+    from jcr.view.viewer import COLLIDES, FREE
+
     book = next(thing for thing in truth.objects if thing.name == "book")
     top = book.base_from_box[2, 3] + book.box_size[2] / 2
 
@@ -103,7 +111,9 @@ def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: Viewer, t
     color(*over)
 
 
-def test_click_finds_the_first_point_and_says_what_is_there(viewer: Viewer, truth: Truth):
+def test_click_finds_the_first_point_and_says_what_is_there(viewer: "Viewer", truth: Truth):
+    from jcr.view.viewer import CLOUD
+
     book = next(thing for thing in truth.objects if thing.name == "book")
     x, y, z = book.base_from_box[:3, 3]
     viewer.shown.value = CLOUD
@@ -118,7 +128,9 @@ def test_click_finds_the_first_point_and_says_what_is_there(viewer: Viewer, trut
     viewer.show_points()
 
 
-def test_slice_has_the_base_frames_y_upwards(viewer: Viewer, truth: Truth):
+def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):
+    from jcr.view.layers import level_slice
+
     can = next(thing for thing in truth.objects if thing.name == "can")
     scene, (x, y, z) = viewer.run.scene, can.base_from_box[:3, 3]
     pixels = level_slice(scene, z, "distance", "occupied")
@@ -130,7 +142,9 @@ def test_slice_has_the_base_frames_y_upwards(viewer: Viewer, truth: Truth):
     assert mirrored.tolist() != [200, 30, 30, 230]
 
 
-def test_robot_and_chosen_camera_follow_the_image(viewer: Viewer):
+def test_robot_and_chosen_camera_follow_the_image(viewer: "Viewer"):
+    from jcr.view.viewer import CHOSEN
+
     for row in (7, 2):
         viewer.image.value = row
         viewer.choose_image()
@@ -156,7 +170,11 @@ def test_joint_values_are_read_and_doubted(gantry: Path, tmp_path: Path):
         solve_joints(robot, "revolute_x", away[None])
 
 
-def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: Path, viewer: Viewer):
+def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: Path, viewer: "Viewer"):
+    from jcr.view.run import read_run
+    from jcr.view.server import open_server
+    from jcr.view.viewer import REJECTED, Viewer
+
     for name in ("calibration.json", "reconstruction.npz"):
         shutil.copy(done / name, tmp_path / name)
     run = read_run(tmp_path)
@@ -178,6 +196,8 @@ def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: 
 
 
 def test_port_and_host_are_taken_or_refused(done: Path):
+    from jcr.view.server import open_server
+
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 .*--port"):
@@ -213,6 +233,8 @@ def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
 
 
 def test_others_need_the_token_of_the_address(done: Path):
+    from jcr.view.server import open_server
+
     server = open_server("127.0.0.1", 0, "")
     gate = Gate("127.0.0.1", 0, server.get_port())
 
@@ -244,7 +266,7 @@ def test_others_need_the_token_of_the_address(done: Path):
         server.stop()
 
 
-def test_in_a_browser(viewer: Viewer, tmp_path: Path):
+def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
     gpu = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     chromium = Chromium(tmp_path, *gpu)
     try:

@@ -1,6 +1,7 @@
 """Plane sweep on a scene whose depth is known: a box on a table, drawn by casting rays."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.reconstruct.depth import plane_sweep as plane_sweep_module
-from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions, plane_sweep
 from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Tracks
+
+if TYPE_CHECKING:
+    from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions
 
 PINHOLE = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
 BOX_HEIGHT, BOX_HALF_WIDTH = 0.06, 0.05
@@ -96,8 +98,10 @@ def swept(scene: Scene) -> tuple[ndarray, ndarray]:
 
 
 def _sweep(
-    images: ndarray, recon_from_camera: ndarray, tracks: Tracks, options: PlaneSweepOptions | None = None
+    images: ndarray, recon_from_camera: ndarray, tracks: Tracks, options: "PlaneSweepOptions | None" = None
 ) -> tuple[ndarray, ndarray]:
+    from jcr.reconstruct.depth.plane_sweep import plane_sweep
+
     neighbours = choose_neighbours(tracks, recon_from_camera, 4)
     planes = sweep_planes(tracks, recon_from_camera)
     return plane_sweep(images, recon_from_camera, PINHOLE, neighbours, planes, options)
@@ -106,6 +110,9 @@ def _sweep(
 def test_a_tight_budget_takes_the_images_one_by_one_and_changes_no_bit(
     scene: Scene, swept: tuple[ndarray, ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from jcr.reconstruct.depth import plane_sweep as plane_sweep_module
+    from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions
+
     together = []
     smooth = plane_sweep_module._add_semi_global_paths
     monkeypatch.setattr(

@@ -6,21 +6,18 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
 
 from jcr.memory import give_back
-from jcr.reconstruct.dust3r.network import (
-    Dust3r,
-    Features,
-    grid_positions,
-    pointmap,
-    rotary_embedding,
-    rotate,
-)
 from places import SHARED
+
+if TYPE_CHECKING:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
 
 OF_DUST3R = SHARED / "dust3r"
 FIXTURES = OF_DUST3R / "fixtures"
@@ -40,7 +37,11 @@ def seeded_weights() -> ModuleType:
 
 
 @cache
-def seeded_network(config: str, seed: int) -> Dust3r:
+def seeded_network(config: str, seed: int) -> "Dust3r":
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     with torch.device("meta"):
         network = Dust3r(**json.loads(config))
     weights = seeded_weights().fill(network.state_dict(), seed)
@@ -56,7 +57,17 @@ def networks_given_back() -> Iterator[None]:
     give_back()
 
 
-def fixture(name: str) -> tuple[dict[str, torch.Tensor], Dust3r]:
+@pytest.fixture
+def inference_mode() -> Iterator[None]:
+    import torch
+
+    with torch.inference_mode():
+        yield
+
+
+def fixture(name: str) -> "tuple[dict[str, torch.Tensor], Dust3r]":
+    import torch
+
     arrays = dict(np.load(FIXTURES / f"{name}.npz"))
     network = seeded_network(str(arrays.pop("cfg")), int(arrays.pop("weight_seed")))
     return {key: torch.from_numpy(value) for key, value in arrays.items()}, network
@@ -70,8 +81,10 @@ def fixture(name: str) -> tuple[dict[str, torch.Tensor], Dust3r]:
         pytest.param("vitl512dpt_160x224", marks=pytest.mark.slow),
     ],
 )
-@torch.inference_mode()
+@pytest.mark.usefixtures("inference_mode")
 def test_pointmaps_equal_the_published_network(name: str) -> None:
+    import torch
+
     truth, network = fixture(name)
     view1, view2 = network(truth["img1"], truth["img2"], truth["true_shape1"], truth["true_shape2"])
     torch.testing.assert_close(view1.points, truth["pts3d"], **TOLERANCE)
@@ -89,8 +102,12 @@ def test_pointmaps_equal_the_published_network(name: str) -> None:
         pytest.param("vitl512dpt_48x64", marks=pytest.mark.slow),
     ],
 )
-@torch.inference_mode()
+@pytest.mark.usefixtures("inference_mode")
 def test_tokens_equal_the_published_network(name: str) -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import grid_positions
+
     truth, network = fixture(name)
     features1, features2 = network.encode(truth["img1"]), network.encode(truth["img2"])
     torch.testing.assert_close(features1.tokens, truth["enc1"], **TOLERANCE)
@@ -104,6 +121,10 @@ def test_tokens_equal_the_published_network(name: str) -> None:
 
 @pytest.mark.parametrize("keys", sorted(FIXTURES.glob("*_keys.tsv")), ids=lambda path: path.stem)
 def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     if keys.stem.startswith("vitl"):
         config = json.loads((FIXTURES / "vitl512dpt_config.json").read_text())
     else:
@@ -116,6 +137,10 @@ def test_state_dict_has_the_published_keys_and_shapes(keys: Path) -> None:
 
 
 def test_rotary_positions_and_activations_equal_the_published_ones() -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import pointmap, rotary_embedding, rotate
+
     units = {key: torch.from_numpy(value) for key, value in np.load(FIXTURES / "units.npz").items()}
     for x, position, out in zip(units["rope_in"], units["rope_pos"], units["rope_out"], strict=True):
         turned = rotate(x[None], rotary_embedding(position, x.shape[-1], 100.0))
@@ -126,8 +151,12 @@ def test_rotary_positions_and_activations_equal_the_published_ones() -> None:
     torch.testing.assert_close(view.confidence, units["conf_out"], rtol=1e-5, atol=1e-6)
 
 
-@torch.inference_mode()
+@pytest.mark.usefixtures("inference_mode")
 def test_a_batch_of_pairs_equals_its_pairs_one_by_one() -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Features
+
     truth, network = fixture("tiny_dpt_portrait_64x48_b2")
     whole = network.encode(truth["img1"])
     for row in range(2):
@@ -140,8 +169,10 @@ def test_a_batch_of_pairs_equals_its_pairs_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["tiny_dpt12_mixed_48x64_64x48", "tiny_linear_48x64_b1"])
-@torch.inference_mode()
+@pytest.mark.usefixtures("inference_mode")
 def test_features_made_for_many_pairs_give_the_same_pointmaps(name: str) -> None:
+    import torch
+
     truth, network = fixture(name)
     kept1, kept2 = (network.encode(truth[image], many_pairs=True) for image in ("img1", "img2"))
     assert (kept1.finest[0] is None) == ("linear" in name)
@@ -150,8 +181,10 @@ def test_features_made_for_many_pairs_give_the_same_pointmaps(name: str) -> None
     torch.testing.assert_close(view2.points, truth["pts3d_in_other_view"], **TOLERANCE)
 
 
-@torch.inference_mode()
+@pytest.mark.usefixtures("inference_mode")
 def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
+    import torch
+
     truth, network = fixture("tiny_dpt12_48x64_b1")
     network.mixed_precision = True
     try:
@@ -169,11 +202,15 @@ def test_bfloat16_stays_near_float32_and_returns_float32() -> None:
     [("head_type", "catmlp"), ("pos_embed", "cosine"), ("depth_mode", ["linear"]), ("patch_size", 14)],
 )
 def test_a_configuration_of_another_network_is_refused(field: str, value: object) -> None:
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     with pytest.raises(ValueError, match=field):
         Dust3r(**{field: value})
 
 
 def test_an_image_that_is_no_whole_number_of_patches_is_refused() -> None:
+    import torch
+
     _, network = fixture("tiny_linear_48x64_b1")
     with pytest.raises(ValueError, match="multiples of 16"):
         network.encode(torch.zeros(1, 3, 50, 64))

@@ -3,29 +3,33 @@
 import dataclasses
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from jcr import memory
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
-from jcr.reconstruct.dust3r import predictor
-from jcr.reconstruct.dust3r.network import Dust3r
 from jcr.reconstruct.dust3r.pair_graph import PairOptions, complete_pairs, overlapping_pairs, window_pairs
-from jcr.reconstruct.dust3r.predictor import estimate_memory, predict_pairs
-from jcr.reconstruct.dust3r.weights import LoadedNetwork
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, read_pairs, write_pairs
 from jcr.reconstruct.preprocess import PreparedImages, image_grid
 from jcr.records import Intrinsics
+
+if TYPE_CHECKING:
+    from jcr.reconstruct.dust3r.weights import LoadedNetwork
 
 NAMES = ("a.png", "b.png", "c.png", "d.png")
 
 
 @pytest.fixture(scope="module")
-def loaded() -> LoadedNetwork:
+def loaded() -> "LoadedNetwork":
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+    from jcr.reconstruct.dust3r.weights import LoadedNetwork
+
     torch.manual_seed(0)
     network = Dust3r(
         enc_embed_dim=32, enc_depth=2, enc_num_heads=2, dec_embed_dim=32, dec_depth=2, dec_num_heads=2
@@ -44,7 +48,9 @@ def options(folder: Path, **changes: object) -> PairOptions:
     return PairOptions(cache=folder, **changes)
 
 
-def predicted(loaded: LoadedNetwork, images: PreparedImages, options: PairOptions) -> PairPredictions:
+def predicted(loaded: "LoadedNetwork", images: PreparedImages, options: PairOptions) -> PairPredictions:
+    from jcr.reconstruct.dust3r.predictor import predict_pairs
+
     return predict_pairs(loaded, images, NAMES, np.tile(np.eye(4), (4, 1, 1)), options)[0]
 
 
@@ -54,23 +60,27 @@ def test_pair_graphs() -> None:
     assert len(window_pairs(5, 9)) == 20
 
 
-@torch.inference_mode()
 def test_each_pair_is_what_the_network_says_of_its_two_images(
-    loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path
+    loaded: "LoadedNetwork", images: PreparedImages, tmp_path: Path
 ) -> None:
+    import torch
+
     pairs = predicted(loaded, images, options(tmp_path))
     assert pairs.edges.tolist() == complete_pairs(4).tolist()
     assert pairs.is_metric and pairs.images == NAMES
     tensors = (torch.from_numpy(images.colors).permute(0, 3, 1, 2) / 255 - 0.5) / 0.5
     for e, (first, second) in enumerate(pairs.edges):
-        view1, view2 = loaded.network(tensors[first, None], tensors[second, None])
+        with torch.inference_mode():
+            view1, view2 = loaded.network(tensors[first, None], tensors[second, None])
         np.testing.assert_allclose(pairs.pts3d[e], view1.points[0], rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(pairs.conf2[e], view2.confidence[0], rtol=1e-4, atol=1e-5)
 
 
 def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
-    loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    loaded: "LoadedNetwork", images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
+    from jcr.reconstruct.dust3r.predictor import predict_pairs
+
     encoded, decoded = [], []
     encode, decode = loaded.network.encode, loaded.network.decode
     monkeypatch.setattr(loaded.network, "encode", lambda x, **how: encoded.append(len(x)) or encode(x, **how))
@@ -103,15 +113,18 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
     assert sum(decoded) == 20 + 12, "the cache is off"
 
 
-def test_the_cache_keeps_its_limit(loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path) -> None:
+def test_the_cache_keeps_its_limit(loaded: "LoadedNetwork", images: PreparedImages, tmp_path: Path) -> None:
     limit_gb = 5.5 * (48 * 64 * 8 * 4 + 16) / 1e9
     predicted(loaded, images, options(tmp_path, cache_gb=limit_gb))
     assert len(list(tmp_path.iterdir())) == 5
 
 
 def test_pointmaps_too_large_for_the_budget_are_the_same_from_a_file(
-    loaded: LoadedNetwork, images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    loaded: "LoadedNetwork", images: PreparedImages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from jcr.reconstruct.dust3r import predictor
+    from jcr.reconstruct.dust3r.predictor import estimate_memory
+
     monkeypatch.setattr(predictor, "resident", lambda: 0)
     monkeypatch.setattr(predictor, "ALLOWANCE", 0)
     estimate = estimate_memory(loaded.network, 4, 12, 48, 64)
@@ -126,12 +139,16 @@ def test_pointmaps_too_large_for_the_budget_are_the_same_from_a_file(
 
 
 def test_out_of_memory_halves_the_batch_and_says_so(
-    loaded: LoadedNetwork,
+    loaded: "LoadedNetwork",
     images: PreparedImages,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r import predictor
+
     monkeypatch.setitem(predictor.MAX_BATCH, "cpu", 8)
     decode = loaded.network.decode
     batches = []
@@ -153,12 +170,18 @@ def test_out_of_memory_halves_the_batch_and_says_so(
 
 
 def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_says_so(
-    loaded: LoadedNetwork,
+    loaded: "LoadedNetwork",
     images: PreparedImages,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r import predictor
+    from jcr.reconstruct.dust3r.network import Dust3r
+    from jcr.reconstruct.dust3r.predictor import predict_pairs
+
     monkeypatch.setattr(Dust3r, "device", torch.device("cuda"))
     encode = predictor._Predictor._encode
     tried = []

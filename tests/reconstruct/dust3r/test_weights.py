@@ -4,20 +4,22 @@ import argparse
 import json
 import pickle
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, weights_of
-from jcr.reconstruct.dust3r.network import Dust3r
-from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
 from jcr.reconstruct.global_alignment.pairs import read_pairs
+
+if TYPE_CHECKING:
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
 
 CONFIG = {
     "head_type": "dpt",
@@ -41,24 +43,36 @@ LINEAR_MODEL = MODEL.replace("'dpt'", "'linear'").replace("dec_depth=10", "dec_d
 
 
 @pytest.fixture(scope="module")
-def network() -> Dust3r:
+def network() -> "Dust3r":
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     torch.manual_seed(0)
     return Dust3r(**CONFIG).eval()
 
 
 @pytest.fixture(scope="module")
-def linear() -> Dust3r:
+def linear() -> "Dust3r":
+    import torch
+
+    from jcr.reconstruct.dust3r.network import Dust3r
+
     torch.manual_seed(0)
     return Dust3r(**LINEAR_CONFIG).eval()
 
 
-def write_pth(path: Path, network: Dust3r, model: str = MODEL, **tensors: torch.Tensor) -> Path:
+def write_pth(path: Path, network: "Dust3r", model: str = MODEL, **tensors: "torch.Tensor") -> Path:
+    import torch
+
     state = {**network.state_dict(), **tensors}
     torch.save({"args": argparse.Namespace(model=model, epochs=100), "model": state}, path)
     return path
 
 
-def write_folder(folder: Path, network: Dust3r, config: dict[str, object] = CONFIG) -> Path:
+def write_folder(folder: Path, network: "Dust3r", config: dict[str, object] = CONFIG) -> Path:
+    from safetensors.torch import save_file
+
     # Published safetensors name a tied tensor once and write Infinity into their JSON.
     state = {key: tensor for key, tensor in network.state_dict().items() if ".layer_rn." not in key}
     folder.mkdir(exist_ok=True)
@@ -68,7 +82,9 @@ def write_folder(folder: Path, network: Dust3r, config: dict[str, object] = CONF
     return folder
 
 
-def assert_same_output(network: Dust3r, loaded: Dust3r) -> None:
+def assert_same_output(network: "Dust3r", loaded: "Dust3r") -> None:
+    import torch
+
     image = torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(1)) * 2 - 1
     with torch.inference_mode():
         for ours, theirs in zip(network(image, image.flip(3)), loaded(image, image.flip(3)), strict=True):
@@ -76,8 +92,10 @@ def assert_same_output(network: Dust3r, loaded: Dust3r) -> None:
 
 
 def test_every_layout_loads_to_the_same_network(
-    tmp_path: Path, network: Dust3r, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, network: "Dust3r", capsys: pytest.CaptureFixture[str]
 ) -> None:
+    from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
+
     folder = write_folder(tmp_path / "folder", network)
     pth = write_pth(tmp_path / "weights.pth", network)
     for source in (folder, folder / "model.safetensors", pth):
@@ -90,14 +108,22 @@ def test_every_layout_loads_to_the_same_network(
     assert said.count(f"weights {pth}: licence unknown") == 1
 
 
-def test_a_second_decoder_that_is_not_stored_is_a_copy_of_the_first(tmp_path: Path, linear: Dust3r) -> None:
+def test_a_second_decoder_that_is_not_stored_is_a_copy_of_the_first(tmp_path: Path, linear: "Dust3r") -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     state = {key: value for key, value in linear.state_dict().items() if not key.startswith("dec_blocks2.")}
     torch.save({"args": argparse.Namespace(model=LINEAR_MODEL), "model": state}, tmp_path / "croco.pth")
     loaded = load_weights(tmp_path / "croco.pth").network
     assert torch.equal(loaded.dec_blocks2[1].mlp.fc1.weight, linear.dec_blocks[1].mlp.fc1.weight)
 
 
-def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: Dust3r) -> None:
+def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: "Dust3r") -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     model = MODEL.replace("AsymmetricCroCo3DStereo", "AsymmetricMASt3R").replace("'dpt'", "'catmlp+dpt'")
     model = model.replace("'pts3d'", "'pts3d+desc24'").replace(")\n", "")[:-1] + ", two_confs=True)"
     matching = {
@@ -123,6 +149,10 @@ class Trap:
 
 @pytest.mark.parametrize("layout", ["pickle", "torch"])
 def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     sprung = tmp_path / "sprung"
     content = {"args": argparse.Namespace(model=MODEL, trap=Trap(sprung)), "model": {}}
     bad = tmp_path / "bad.pth"
@@ -145,12 +175,18 @@ def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
         "os.abort",
     ],
 )
-def test_the_model_string_is_read_and_never_evaluated(tmp_path: Path, linear: Dust3r, model: str) -> None:
+def test_the_model_string_is_read_and_never_evaluated(tmp_path: Path, linear: "Dust3r", model: str) -> None:
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     with pytest.raises(InputError, match="no checkpoint of DUSt3R"):
         load_weights(write_pth(tmp_path / "weights.pth", linear, model))
 
 
-def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear: Dust3r) -> None:
+def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear: "Dust3r") -> None:
+    import torch
+
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     def complaint(source: Path | str) -> str:
         with pytest.raises(InputError) as caught:
             load_weights(source)
@@ -196,9 +232,11 @@ def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear:
 
 
 def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
-    tmp_path: Path, linear: Dust3r, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, linear: "Dust3r", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import huggingface_hub.constants
+
+    from jcr.reconstruct.dust3r.weights import load_weights
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
@@ -219,7 +257,7 @@ def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
 
 
 def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(
-    tmp_path: Path, linear: Dust3r, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, linear: "Dust3r", capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(0)
     frames = []

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 import capture_writers as writers
@@ -26,11 +25,9 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
 from jcr.geometry import inverse
-from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
-from jcr.represent.build import build_scene
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
@@ -128,6 +125,8 @@ def pictures(folder: Path) -> dict[str, Target]:
 
 def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Target]:
     """The files of a run folder that are read again."""
+    from jcr.represent.build import build_scene
+
     folder.mkdir()
     draw = np.random.default_rng(3)
     pairs = PosePairs(capture.folder, capture.images, capture.base_from_gripper, cameras, True)
@@ -183,6 +182,10 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
 
 def networks(folder: Path) -> dict[str, Target]:
     """What networks leave, or are."""
+    import torch
+
+    from jcr.reconstruct.dust3r.weights import load_weights
+
     folder.mkdir()
     shape = (2, 4, 4)
     arrays = {name: np.zeros((*shape, 3), np.float32) for name in ("pts3d", "pts3d_in_other_view")}
