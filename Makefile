@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: env demo test test-lowest lint audit
+.PHONY: env demo test test-fast test-lowest lint audit
 env: .venv/ready
 
 # torch first and pinned: an open range pulls several GB of CUDA packages.
@@ -17,6 +17,9 @@ demo: .venv/ready
 
 test: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-fast: .venv/ready
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow"
 
 # The core with the lowest versions of its packages, and without torch. Left out: OpenCV before 4.14 finds a few of the
 # corners of a board that was drawn over, and says that this is too little.

@@ -2,8 +2,10 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import pytest
@@ -41,6 +43,30 @@ def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A job in the background of a shell ignores Ctrl-C, and so would the commands that tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+SLOW_FIXTURES = {"done", "opengl", "real_captures", "simulated"}
+"""They run the command line, draw, or reconstruct from pictures."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("gl") or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """No test of the fast tier starts a process; wide-scoped fixtures run inside this, too."""
+
+    def refuse(*arguments: object, **options: object) -> NoReturn:
+        pytest.fail(f"{item.nodeid} starts a process: mark it slow")
+
+    with pytest.MonkeyPatch.context() as patch:
+        if not item.get_closest_marker("slow"):
+            patch.setattr(subprocess.Popen, "__init__", refuse)
+            patch.setattr(BaseProcess, "start", refuse)
+        return (yield)
 
 
 @pytest.fixture(scope="session")

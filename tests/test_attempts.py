@@ -115,6 +115,7 @@ def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
         auto_result(problem, {"mast3r": damaged, "colmap": nothing}, monkeypatch)
 
 
+@pytest.mark.slow
 def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):

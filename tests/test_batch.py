@@ -15,6 +15,8 @@ from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
 from jcr.cli import dispatch
 from jcr.pipeline import RunOptions
 
+pytestmark = pytest.mark.slow
+
 COMPLETE = BatchOptions(calibrate_only=True, processes=2)
 
 

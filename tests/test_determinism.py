@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 def calibration(capture: Path, out: Path, threads: int) -> dict:
     """What `jcr calibrate` finds with so many threads on so many cores."""

@@ -20,6 +20,8 @@ from places import ROOT
 if TYPE_CHECKING:
     import trimesh
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = ROOT / "examples"
 
 

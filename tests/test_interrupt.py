@@ -7,6 +7,10 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 
 def test_an_interrupted_run_says_so_in_one_line_and_resumes(small_capture: Path, tmp_path: Path):
     command = [

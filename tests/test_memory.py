@@ -68,6 +68,7 @@ def refusal(arguments: list[str]) -> float:
     return float(found[1])
 
 
+@pytest.mark.slow
 def test_a_network_keeps_the_least_budget_that_is_not_refused(capture: Path, tmp_path: Path) -> None:
     arguments = ["predict", str(capture), str(tmp_path / "pairs.npz"), "--weights", str(capture)]
     arguments += ["--pair-graph", "complete", "--device", "cpu", "--cache-gb", "0"]
@@ -91,6 +92,7 @@ def test_a_network_keeps_the_least_budget_that_is_not_refused(capture: Path, tmp
         assert archive.testzip() is None
 
 
+@pytest.mark.slow
 def test_a_back_end_without_network_names_the_budget_it_needs(capture: Path, tmp_path: Path) -> None:
     run = ["run", str(capture), str(tmp_path / "out"), "--device", "cpu"]
     assert 0.5 < refusal([*run, "--backend", "colmap"]) < 2

@@ -188,6 +188,7 @@ def places(content: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[
         yield from places(content[0], (*path, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.json", "calibration.json"])
 def test_any_value_exchanged_is_read_or_refused(sound: Path, tmp_path: Path, name: str):
     """Each value in turn for one of another kind: what is read then is what the schema allows."""

@@ -23,6 +23,8 @@ from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.simulate.capture import with_robot_noise
 
+pytestmark = pytest.mark.slow
+
 OLD = 9
 """Images of the bundled capture that calibrate; the other three are of the day after."""
 SCALE = 0.37

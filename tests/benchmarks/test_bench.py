@@ -46,6 +46,7 @@ def test_every_page_of_results_says_which_command_writes_it():
         assert all((RESULTS / picture).is_file() for picture in pictures)
 
 
+@pytest.mark.slow
 def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     (tmp_path / "map.md").write_text(f"{CLAIM}the map is good\n")
     told: list[Outcome] = []
@@ -67,6 +68,7 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 
 
+@pytest.mark.slow
 def test_a_page_older_than_the_sources_is_measured_again(tmp_path: Path):
     page = tmp_path / "real.md"
     page.write_text("old\n")
@@ -96,6 +98,7 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
         assert (abs(found - scale) < 3 / 20_000) == found_there
 
 
+@pytest.mark.slow
 def test_benches_run_as_a_package_of_their_own_and_are_not_installed(tmp_path: Path):
     """`python -m benchmarks` is the command line; the package alone says where they are and completes all else."""
 

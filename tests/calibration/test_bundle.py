@@ -75,6 +75,7 @@ def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
     assert solved(problem, tracks).sigma_px == pytest.approx(0.3, rel=0.1)
 
 
+@pytest.mark.slow
 def test_robot_noise_is_found_and_the_ellipsoid_covers():
     noise = (5e-4, np.radians(0.1))
     runs, inside, estimates = 60, 0, []

@@ -57,6 +57,7 @@ def said(hand_eye: HandEye) -> str:
     return next((text for text in hand_eye.warnings if text.startswith("the pictures show ")), "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("images", [3, 5, 10])
 @pytest.mark.parametrize("motion", [{}, {"pattern": "translation", "deviation": np.radians(6.0)}])
 def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
@@ -64,6 +65,7 @@ def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
         assert said(calibrated(seed, images, LENS, **motion)[1]) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.8, 0.95, 1.05, 1.2])
 @pytest.mark.parametrize("images", [5, 10])
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
@@ -89,6 +91,7 @@ def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
     assert np.abs(off / std)[:6].max() < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.03, 0.95, 1.2])
 def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) -> None:
     offset, promised, reported = [], [], []
@@ -103,6 +106,7 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) 
     assert np.linalg.norm(offset[1] - offset[0]) < promised[1] < reported[1]
 
 
+@pytest.mark.slow
 def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:
     k1, *others = LENS.distortion
     turned = said(calibrated(0, 10, replace(LENS, distortion=(-k1, *others)))[1])

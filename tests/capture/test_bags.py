@@ -34,6 +34,7 @@ def mcap(tmp_path_factory: pytest.TempPathFactory, capture: Capture) -> Path:
     return write_bag(tmp_path_factory.mktemp("mcap") / "scan", capture, "mcap", 12.0, fps=10.0, tf_hz=50.0)
 
 
+@pytest.mark.slow
 def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture: Capture, mcap: Path):
     """And the same poses, hence the same calibration, come from all three."""
     bags = {
@@ -54,6 +55,7 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
         assert (again.base_from_gripper == got.base_from_gripper).all() and again.images == got.images
 
 
+@pytest.mark.slow
 def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Capture):
     """Two publishers on one topic, as with an arm and its gripper; the arm halts at eight places."""
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -108,6 +110,7 @@ def test_joint_states_and_a_urdf_stand_in_for_tf(tmp_path: Path, capture: Captur
     writers.assert_joints(got, angles)
 
 
+@pytest.mark.slow
 def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):
     bag = write_bag(tmp_path / "raw", capture, "mcap", 6.0, fps=4.0, tf_hz=50.0, compressed=False)
     got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
@@ -118,6 +121,7 @@ def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):
         assert np.abs(picture - original).max() <= 1  # the noise that the bag adds
 
 
+@pytest.mark.slow
 def test_a_bag_is_read_once(tmp_path: Path, mcap: Path):
     into = tmp_path / "frames"
     first = jcr.read_capture(mcap, FRAMES, into=into)
@@ -154,6 +158,7 @@ def test_what_is_not_in_the_bag_is_listed(tmp_path: Path, mcap: Path, options: d
     assert not (tmp_path / "frames").exists()
 
 
+@pytest.mark.slow
 def test_stale_poses_are_refused_with_their_gap(tmp_path: Path, capture: Capture):
     """At 5 Hz the poses around an image are 200 ms apart."""
     bag = write_bag(tmp_path / "slow", capture, "mcap", 12.0, fps=10.0, tf_hz=5.0)
@@ -274,6 +279,7 @@ def test_colours_of_raw_images(encoding: str):
         picture_of(message, "bag")
 
 
+@pytest.mark.slow
 def test_the_command_line_judges_a_bag(mcap: Path):
     command = [sys.executable, "-m", "jcr", "check", str(mcap), "--poses-only", "--json"]
     command += ["--base-frame", "base_link", "--gripper-frame", "tool0", "--frames", "8"]

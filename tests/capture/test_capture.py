@@ -182,6 +182,7 @@ def test_each_fault_is_one_line_with_place_and_cure(capture: Path, fault: str):
     assert str(capture) in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_decompression_bomb_is_refused_before_it_is_unpacked(tmp_path: Path):
     Image.new("1", (20_000, 20_000)).save(tmp_path / "bomb.png")
     with pytest.raises(jcr.InputError, match="million pixels"):

@@ -392,6 +392,7 @@ def run_jcr(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
 
+@pytest.mark.slow
 def test_the_command_line_calibrates_samples(tmp_path: Path, problem: HandEyeProblem):
     cameras = scale_translation(problem.recon_from_camera, problem.scale)
     path = writers.write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
@@ -408,6 +409,7 @@ def test_the_command_line_calibrates_samples(tmp_path: Path, problem: HandEyePro
     )
 
 
+@pytest.mark.slow
 def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProblem):
     """Gripper poses given as base in gripper, the commonest mistake of all."""
     cameras = scale_translation(problem.recon_from_camera, problem.scale)

@@ -15,6 +15,8 @@ import jcr
 from jcr.cli import COMMANDS
 from jcr.represent.cloud_ply import read_cloud
 
+pytestmark = pytest.mark.slow
+
 
 def run_jcr(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "jcr", *map(str, arguments)]

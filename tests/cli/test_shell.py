@@ -107,6 +107,7 @@ TYPED = {
 """What is typed, and what Tab offers, in a folder that holds a folder `images`."""
 
 
+@pytest.mark.slow
 def test_bash_completes(tmp_path: Path):
     (tmp_path / "images").mkdir()
     (tmp_path / "jcr.bash").write_text(script("bash"))

@@ -19,6 +19,8 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.map_file import load_map
 
+pytestmark = pytest.mark.slow
+
 KILLS = int(os.environ.get("JCR_TEST_KILLS", "3"))
 WRITES = 11
 """Times that a run writes a file."""

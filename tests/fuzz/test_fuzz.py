@@ -19,6 +19,8 @@ from jcr.geometry import rotation_exp, transform
 from jcr.simulate.poses import Pattern
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
+pytestmark = pytest.mark.slow
+
 LONGER = int(os.environ.get("JCR_TEST_FUZZ", "1"))
 TOKENS = [
     b"NaN", b"-Infinity", b"1e999", b"1e-999", b"sNaN", b"1e99999999", b"9" * 5000, b"0x10", b"null", b"true", b"{}",

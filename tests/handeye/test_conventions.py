@@ -58,6 +58,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_each_mistake_is_named(mistake: str):
     write, words = MISTAKES[mistake]
@@ -70,6 +71,7 @@ def test_each_mistake_is_named(mistake: str):
     assert found[0].translation_mm < 1.0 < found[1].translation_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
 def test_sound_poses_are_left_alone(noise):
     for seed in range(2):

@@ -289,6 +289,7 @@ def test_a_known_tool_is_taken_into_account_and_twelve_poses_are_quick():
     assert inverse_kinematics(small, poses).fits
 
 
+@pytest.mark.slow
 def test_poses_of_another_arm_are_refused_in_one_line():
     large = arm_named("ur10e")
     poses = forward_kinematics(large, postures(large, 8, spread=0.3))

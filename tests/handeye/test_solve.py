@@ -110,6 +110,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
         assert gap @ np.linalg.solve(both, gap) < chi2.ppf(0.999, 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
     inside = np.zeros(2)
@@ -126,6 +127,7 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
     assert (inside / runs >= 0.90).all() and (inside / runs <= 0.98).all()
 
 
+@pytest.mark.slow
 def test_three_images_do_not_promise_too_much():
     """Few degrees of freedom tell how noisy the robot is, and this one's noises are in no usual relation."""
     inside, runs = 0, 100
@@ -148,6 +150,7 @@ def test_an_image_that_is_given_twice_is_one():
     assert (doubled.translation_residual_m == once.translation_residual_m[twice]).all()
 
 
+@pytest.mark.slow
 def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
     given, inside, runs = (1e-4, np.radians(0.02)), 0, 50
     for seed in range(runs):
@@ -254,6 +257,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
         assert nearly or deviation_deg == 0.0 or pattern == "two"
 
 
+@pytest.mark.slow
 def test_general_motion_is_never_called_degenerate():
     for seed in range(200):
         rng = np.random.default_rng(seed)

@@ -19,6 +19,8 @@ from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import Capture, Reconstruction
 from jcr.simulate.truth import read_truth
 
+pytestmark = pytest.mark.slow
+
 SMALL = ColmapOptions(pointmap_size_px=80)
 """For tests that ask for poses only."""
 

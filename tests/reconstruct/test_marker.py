@@ -22,6 +22,8 @@ from jcr.records import Intrinsics
 from jcr.simulate.problem import TARGET_IN_BASE, hand_eye_problem
 from places import SHARED
 
+pytestmark = pytest.mark.slow
+
 LENS = Intrinsics(620.0, 620.0, 322.0, 236.0, 640, 480, (-0.08, 0.03, 0.0, 0.0, 0.0))
 PX_PER_M = 2000
 """Of the printed sheets."""

@@ -34,6 +34,8 @@ from jcr.results import RunResult
 from jcr.rounding import significant
 from jcr.simulate.truth import Truth, read_truth
 
+pytestmark = pytest.mark.slow
+
 EVIL = "<script>alert(1)</script>&\"'.jpg"
 """The name of the second image; a legal path on every Unix."""
 WRONG, UNREGISTERED = 5, 11

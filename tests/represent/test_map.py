@@ -19,6 +19,8 @@ from jcr.represent.options import MapOptions
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = MapOptions(workspace=WORKSPACE)
 INSIDE_BOX = BOX_CENTER - [0, 0, 0.01]
 UNDER_TABLE = np.array([0.0, 0.0, -0.08])

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from jcr.represent.scene import SceneMap
 
+pytestmark = pytest.mark.slow
+
 EXCESS = 0.01
 
 URDF = """<robot name="arm">

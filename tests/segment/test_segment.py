@@ -208,6 +208,7 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
     ]
 
 
+@pytest.mark.slow
 def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator):
     """Depth errs together within an image: plane and top are off by 2 mm each, anew in every image."""
     misses, stated = [], []

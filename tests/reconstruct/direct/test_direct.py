@@ -28,6 +28,8 @@ from jcr.records import Intrinsics
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.truth import read_truth
 
+pytestmark = pytest.mark.slow
+
 SPARSE = DirectOptions(dense=False)
 
 

@@ -91,6 +91,7 @@ def assert_same_output(network: "Dust3r", loaded: "Dust3r") -> None:
             torch.testing.assert_close(ours.points, theirs.points, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_layout_loads_to_the_same_network(
     tmp_path: Path, network: "Dust3r", capsys: pytest.CaptureFixture[str]
 ) -> None:

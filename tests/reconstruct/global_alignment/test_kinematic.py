@@ -71,6 +71,7 @@ def test_exact_input_gives_the_hand_eye_transform_metres_and_the_base_frame():
     np.testing.assert_array_equal(found.base_from_gripper, truth.base_from_gripper)
 
 
+@pytest.mark.slow
 def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
     free, kinematic = [], []
     for seed in range(8):
@@ -94,6 +95,7 @@ def test_few_images_give_more_than_free_alignment_and_hand_eye_after_it():
     assert translation < 2e-3
 
 
+@pytest.mark.slow
 def test_covariance_covers_the_error():
     noise = 0.0005, 0.0017
     squared = []

@@ -76,6 +76,7 @@ def case(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_an_exact_robot_more_than_halves_the_errors_of_few_cameras(count: int):
     free, chosen = [], []
@@ -112,6 +113,7 @@ def test_a_wrong_gripper_pose_leaves_the_cameras_free_and_is_named():
     assert error @ np.linalg.solve(found.covariance, error) < 18.5  # 99 of 100 draws
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [(0.0, 0.0), NOISE])
 def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     # With an exact robot the network's errors are all there is; the robot's own noise is not known beforehand.
@@ -127,6 +129,7 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
     assert np.sum(np.array(squared) > 14.07) <= 2
 
 
+@pytest.mark.slow
 def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_say():
     # Errors that neighbouring pixels share look like signal to an adjustment of independent observations.
     refined, poses = [], []
@@ -140,6 +143,7 @@ def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_say(
     assert np.mean(refined) < 1.1 * np.mean(poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "off_percent"), [(1.0, 0.0), (1.05, 5.0), (1000.0, 99900.0)])
 def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: float):
     made = case(6, 3, (1e-4, 2e-4))
