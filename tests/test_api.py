@@ -26,6 +26,7 @@ def test_the_api_is_listed_and_every_name_of_it_is_there():
         _ = jcr.calibrated  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "first", ["import jcr.calibration.bundle as b, jcr.handeye.solve as s", "import jcr; jcr.calibrate"]
 )
@@ -37,6 +38,7 @@ def test_packages_and_functions_have_names_of_their_own(first: str):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["import pycolmap, jcr", "import jcr, pycolmap"])
 def test_pngs_and_archives_are_written_in_either_order_with_pycolmap(order: str, tmp_path):
     done = python(
@@ -49,6 +51,7 @@ def test_pngs_and_archives_are_written_in_either_order_with_pycolmap(order: str,
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), expected)
 
 
+@pytest.mark.slow
 def test_others_write_pngs_and_archives_where_jcr_came_first():
     write = "Image.effect_noise((640, 480), 50).save(io.BytesIO(), 'PNG'); zlib.compress(b'a' * 10000)"
     done = python(f"import jcr, pycolmap, io, zlib; from PIL import Image; {write}")

@@ -13,6 +13,8 @@ from jcr.cli import COMMANDS
 from jcr.extras import DISTRIBUTION
 from places import ROOT
 
+pytestmark = pytest.mark.slow
+
 MAY_NEED_TORCH = (
     "reconstruct/depth/plane_sweep", "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
     "reconstruct/mapanything", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",

@@ -105,6 +105,7 @@ def test_a_planar_capture_is_told_to_tilt():
     assert proposed[-1].expected_std[:3].max() < 0.02 * now[:3].max()
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     noise = (0.03, np.radians(4.0))
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)

@@ -17,6 +17,8 @@ from jcr.records import Intrinsics, Tracks
 if TYPE_CHECKING:
     from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions
 
+pytestmark = pytest.mark.slow
+
 PINHOLE = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
 BOX_HEIGHT, BOX_HALF_WIDTH = 0.06, 0.05
 BLANK_X = 0.11

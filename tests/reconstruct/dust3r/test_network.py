@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from jcr.reconstruct.dust3r.network import Dust3r
 
+pytestmark = pytest.mark.slow
+
 OF_DUST3R = SHARED / "dust3r"
 FIXTURES = OF_DUST3R / "fixtures"
 TOLERANCE = {"rtol": 1e-4, "atol": 2e-5}

@@ -20,6 +20,8 @@ from jcr.records import Intrinsics
 if TYPE_CHECKING:
     from jcr.reconstruct.dust3r.weights import LoadedNetwork
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("a.png", "b.png", "c.png", "d.png")
 
 

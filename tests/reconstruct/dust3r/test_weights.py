@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from jcr.reconstruct.dust3r.network import Dust3r
 
+pytestmark = pytest.mark.slow
+
 CONFIG = {
     "head_type": "dpt",
     "enc_embed_dim": 32,
