@@ -1,7 +1,12 @@
 """Imports run one way: read from the source, so that a shortcut is found on the day it is taken."""
 
 import ast
+import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 from places import ROOT
 
@@ -10,7 +15,7 @@ LAYERS = [
     {"deflate", "errors"},
     {"extras"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},
-    {"camera"},
+    {"camera", "least_squares"},
     {"handeye"},
     {"capture"},
     {"reconstruct"},
@@ -30,16 +35,57 @@ LAYERS = [
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 TORCH_ROOMS = {"reconstruct", "represent", "segment"}
+BACK_ENDS = ["backends", "from_pairs", "colmap", "mapanything", "marker", "predictions"]
+SOLVERS = [
+    "least_squares",
+    *(f"handeye.{name}" for name in ("closed_form", "fit", "known_scale", "residuals", "robust", "solve")),
+    *(f"calibration.{name}" for name in ("bundle", "cues", "drift", "given_intrinsics", "stage")),
+    *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
+]
+FORBIDDEN = {
+    "reconstruct.global_alignment": ["dust3r", "direct", "depth", *BACK_ENDS],
+    "reconstruct.depth": ["dust3r", "direct", "global_alignment", *BACK_ENDS],
+    "reconstruct.direct": ["dust3r", "global_alignment", *BACK_ENDS],
+    "report": SOLVERS,
+    "cli": SOLVERS,
+}
+"""What a part must not import, by names beside it or from the top; handeye has a rule of its own."""
+
+
+def module_name(file: Path) -> str:
+    parts = file.relative_to(SOURCE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+FILES = {module_name(file): file for file in SOURCE.rglob("*.py")}
+
+
+def named(node: ast.Import | ast.ImportFrom) -> list[str]:
+    """The modules that a statement imports, where `from a import b` may name a module b or what is in a."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    assert node.module and not node.level, "imports are absolute"
+    inside = [f"{node.module}.{alias.name}" for alias in node.names]
+    return [module if module in FILES else node.module for module in inside]
 
 
 def imports(file: Path) -> list[str]:
-    found = []
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            found.extend(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found.append(node.module)
-    return found
+    statements = ast.walk(ast.parse(file.read_text()))
+    return [
+        name for node in statements if isinstance(node, ast.Import | ast.ImportFrom) for name in named(node)
+    ]
+
+
+def imports_when_loaded(body: list[ast.stmt]) -> Iterator[str]:
+    """Without what functions import when they are called, and what only type checkers read."""
+    for node in body:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield from named(node)
+        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            yield from imports_when_loaded(node.orelse)
+        elif not isinstance(node, ast.FunctionDef):
+            for part in ("body", "orelse", "handlers", "finalbody"):
+                yield from imports_when_loaded(getattr(node, part, []))
 
 
 def room(file: Path) -> str:
@@ -64,6 +110,50 @@ def test_imports_run_one_way():
             if other != mine and LEVEL[other] >= LEVEL[mine]:
                 against.append(f"{file.relative_to(SOURCE)} imports {module}")
     assert not against
+
+
+def is_under(module: str, parent: str) -> bool:
+    return module == parent or module.startswith(parent + ".")
+
+
+@pytest.mark.parametrize("part", FORBIDDEN)
+def test_parts_of_rooms_do_not_know_one_another(part: str):
+    above = part.rpartition(".")[0]
+    forbidden = [".".join(filter(None, ("jcr", above, name))) for name in FORBIDDEN[part]]
+    assert not [name for name in forbidden if not any(is_under(module, name) for module in FILES)]
+    against = [
+        f"{module} imports {other}"
+        for module, file in FILES.items()
+        if is_under(module, f"jcr.{part}")
+        for other in imports(file)
+        if any(is_under(other, name) for name in forbidden)
+    ]
+    assert not against
+
+
+def test_hand_eye_calibration_takes_arrays_and_gives_arrays():
+    known = {"jcr", "jaxtyping", "numpy", "scipy"}
+    files = {"io", "json", "os", "pathlib", "pickle", "shutil", "tempfile"}
+    against = [
+        f"{module} imports {other}"
+        for module, file in FILES.items()
+        if is_under(module, "jcr.handeye")
+        for other in imports(file)
+        if (root := other.split(".")[0]) in files or root not in known | sys.stdlib_module_names
+    ]
+    assert not against
+
+
+def test_no_file_needs_itself_to_be_loaded():
+    graph = {}
+    for module, file in FILES.items():
+        others = set(imports_when_loaded(ast.parse(file.read_text()).body))
+        graph[module] = (others & set(FILES)) - {module}
+    assert sum(map(len, graph.values())) > len(FILES), "the imports are read"
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
 def test_torch_stays_where_networks_are():
