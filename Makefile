@@ -19,7 +19,7 @@ test: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-fast: .venv/ready
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 # The core with the lowest versions of its packages, and without torch. Left out: OpenCV before 4.14 finds a few of the
 # corners of a board that was drawn over, and says that this is too little.

@@ -45,8 +45,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "opengl", "real_captures", "simulated"}
-"""They run the command line, draw, or reconstruct from pictures."""
+SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam"}
+"""They run the command line, draw, reconstruct from pictures, or load a network."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

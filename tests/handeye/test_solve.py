@@ -309,6 +309,7 @@ def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
         jcr.solve_hand_eye(gripper, camera)
 
 
+@pytest.mark.slow
 def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
     """The larger half of what three images leave open is how far the robot's poses scatter."""
     noise = (5e-4, np.radians(0.1))

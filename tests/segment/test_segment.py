@@ -227,6 +227,7 @@ def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator)
     assert scaled == pytest.approx(0.05 * 0.06, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.random.Generator):
     cloud = cloud_of(
         rng, table(rng), box(rng, (0.05, 0.05, 0.08), (-0.1, 0)), box(rng, (0.04, 0.04, 0.06), (0.1, 0))
@@ -466,6 +467,7 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     np.testing.assert_array_equal(labels.labels[0], labels.labels[1])
 
 
+@pytest.mark.slow
 def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from jcr.segment.sam import load_sam
 

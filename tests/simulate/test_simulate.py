@@ -29,6 +29,7 @@ def simulated(opengl, tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("simulate") / "tabletop", SimulateOptions(seed=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
 def test_objects_stand_on_the_table_and_apart(name):
     for seed in range(3):
