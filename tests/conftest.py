@@ -45,7 +45,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam"}
+SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
 """They run the command line, draw, reconstruct from pictures, or load a network."""
 
 

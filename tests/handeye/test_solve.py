@@ -82,7 +82,10 @@ def test_agrees_with_opencv_where_scale_is_known():
     assert solved.scale == pytest.approx(1.0, abs=5e-3)
 
 
-@pytest.mark.parametrize(("count", "wrong"), [(10, 3), (15, 4), (20, 6)])
+@pytest.mark.parametrize(
+    ("count", "wrong"),
+    [(10, 3), pytest.param(15, 4, marks=pytest.mark.slow), pytest.param(20, 6, marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("kind", ["shuffled", "stale", "mirrored"])
 def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
     for seed in range(4):
