@@ -21,6 +21,9 @@ from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
 MAX_TRIPLES = 1500
+CONCENTRATED = 20
+"""Best triples from which the trimmed fit is sought: with 5 its cost was 2 % above the least that was found, with 20
+0.1 % (240 simulated problems of 6 to 15 images, a fifth of them wrong)."""
 REJECT_AT = 1e-5
 """Chance that a sound image is rejected, by the F distribution of its deleted residual."""
 TOLERANCE = (1e-3, np.radians(0.2))
@@ -86,7 +89,7 @@ def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[n
     x, scale, z = closed_form(base_from_gripper[triples], recon_from_camera[triples], rounds=0)
     error = _squared_error(x, scale, z, base_from_gripper, recon_from_camera)
     error[scale <= 0] = np.inf
-    ranked = np.argsort(np.sort(error, axis=1)[:, :keep].sum(1), kind="stable")[:5]
+    ranked = np.argsort(np.sort(error, axis=1)[:, :keep].sum(1), kind="stable")[:CONCENTRATED]
 
     best, best_cost, tried = np.ones(n, dtype=bool), np.inf, set()
     for candidate in ranked:
