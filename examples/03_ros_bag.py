@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 import jcr
-from benchmarks.bag import write_bag
 from jcr.capture.options import ReadOptions
 from jcr.check import check
+from jcr.simulate.ros_bag import write_bag
 
 out = Path("out/ros_bag")
 shutil.rmtree(out, ignore_errors=True)

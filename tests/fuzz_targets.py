@@ -9,7 +9,6 @@ import numpy as np
 from PIL import Image
 
 import capture_writers as writers
-from benchmarks.bag import write_bag
 from jcr.calibration.calibration_json import (
     calibration_file,
     read_calibration,
@@ -32,6 +31,7 @@ from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
 from jcr.simulate.problem import hand_eye_problem
+from jcr.simulate.ros_bag import write_bag
 
 SIZE = (16, 12)
 COUNT = 4

@@ -11,7 +11,6 @@ import pytest
 
 import capture_writers as writers
 import jcr
-from benchmarks.bag import nearest_view, write_bag
 from jcr.capture.best_frames import best_frames
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
@@ -19,6 +18,7 @@ from jcr.capture.ros_image import picture_of
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture
 from jcr.simulate.problem import hand_eye_problem
+from jcr.simulate.ros_bag import nearest_view, write_bag
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
 FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)
