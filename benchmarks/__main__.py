@@ -16,6 +16,7 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
+from jcr.extras import DISTRIBUTION
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ def heading(arguments: Arguments) -> str:
 
 def machine() -> str:
     """Processor, cores and versions in a sentence."""
-    versions = ", ".join(f"{name} {version(name)}" for name in ("jcr", "numpy", "scipy", "torch", "pycolmap"))
+    names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
+    versions = ", ".join(f"{name} {version(name)}" for name in names)
     return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
 
 
