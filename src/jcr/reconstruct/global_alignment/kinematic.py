@@ -23,7 +23,7 @@ from jcr.geometry import (
     step_axes,
     transform,
 )
-from jcr.handeye.noise import REACH
+from jcr.handeye.systematic import REACH
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import (
     Alignment,
