@@ -3,14 +3,13 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 import jcr
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.equation import residuals, residuals_by_camera
 from jcr.handeye.fit import Cues, fit_poses
-from jcr.handeye.noise import NoiseShare, widened
 from jcr.simulate.problem import error, hand_eye_problem, unit_similarity
 
 NOISE = (5e-4, np.radians(0.1))
@@ -159,18 +158,6 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         assert any("more than the robot noise that was given" in warning for warning in solved.warnings)
     # Binomial: 47.5 ± 1.5; none where the given noise is believed.
     assert inside >= 42
-
-
-def test_a_covariance_is_widened_by_what_hangs_on_the_noise_and_how_little_is_known_of_it():
-    root = np.random.default_rng(9).normal(size=(7, 7)) * np.logspace(-4, 0, 7)[:, None]
-    covariance, none, nu = root @ root.T, np.zeros((7, 7)), 5.0
-    of_log = np.diag([2 / nu, 1e6])
-    alone = widened(covariance, NoiseShare(np.stack([covariance, none]), of_log))
-    assert np.allclose(alone, covariance * 7 * f.ppf(0.99, 7, nu) / chi2.ppf(0.99, 7), rtol=1e-6)
-    # A noise of which nothing is known widens nothing where nothing hangs on it.
-    assert np.allclose(widened(covariance, NoiseShare(np.stack([none, none]), of_log)), covariance, rtol=1e-6)
-    both = widened(covariance, NoiseShare(np.stack([covariance / 2, covariance / 2]), np.eye(2) * 2 / nu))
-    assert np.allclose(both, covariance * 7 * f.ppf(0.99, 7, 2 * nu) / chi2.ppf(0.99, 7), rtol=1e-6)
 
 
 def test_the_equations_jacobians_match_finite_differences():

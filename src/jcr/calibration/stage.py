@@ -14,7 +14,7 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.fit import Cues, deleted_residuals
+from jcr.handeye.fit import Cues, exceeds
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import excitation
 from jcr.handeye.residuals import paper_residuals
@@ -300,7 +300,12 @@ def _refined(
         covariance=adjusted.covariance,
         translation_residual_m=metres,
         rotation_residual_rad=radians,
-        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
+        robot_noise=RobotNoise(
+            *adjusted.noise,
+            exceeds(adjusted.noise, adjusted.given_noise),
+            adjusted.given_noise,
+            adjusted.systematic,
+        ),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=adjusted.bundle.camera,
@@ -311,12 +316,11 @@ def _refined(
 
 
 def _held_out(adjusted: Adjusted) -> HeldOut | None:
-    """Each image's robot pose predicted by an adjustment that was not told it."""
-    m = len(adjusted.robot_residual)
+    """Each image's gripper pose predicted by an adjustment that does not use it."""
+    m = len(adjusted.missed)
     if m < 4:
         return None
-    sigma = np.repeat(adjusted.noise, 3)
-    missed = deleted_residuals(adjusted.robot_residual / sigma, adjusted.robot_hat) * sigma
+    missed = adjusted.missed
     metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
     pixels = median_reprojection(adjusted, retract(adjusted.bundle.base_from_gripper, -missed))
     return HeldOut(

@@ -81,7 +81,7 @@ def solve_hand_eye(
         translation_residual_m=np.linalg.norm(fit.translation_residual, axis=1)[back],
         rotation_residual_rad=np.linalg.norm(fit.rotation_residual, axis=1)[back],
         observability=seen,
-        robot_noise=RobotNoise(*fit.noise, fit.noise_estimated, robot_noise),
+        robot_noise=RobotNoise(*fit.noise, fit.noise_estimated, robot_noise, fit.systematic),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         converged=False,
