@@ -67,7 +67,9 @@ def test_each_mistake_is_named(mistake: str):
     found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
     assert found is not None
     assert re.search(words, explained(found))
-    assert found[0].translation_mm < 1.0 < found[1].translation_mm
+    # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
+    assert found[0].misfit < 1.0 and found[0].translation_mm < 0.5
+    assert found[1].misfit > 10.0
 
 
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, np.radians(0.1)), (5e-3, np.radians(1.0))])
@@ -108,7 +110,7 @@ def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
     problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
     names = tuple(f"{k}.png" for k in range(12))
     pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
-    found = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    found = calibrate_poses(pairs)
     assert not found.converged
     promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
     used = problem.base_from_gripper[found.inliers]

@@ -17,12 +17,12 @@ from scipy.stats import chi2
 
 from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
-from jcr.handeye.components import Budget, Equations, most_likely, posterior, solve
+from jcr.handeye.components import Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, residuals
 from jcr.handeye.fit import left_out
 from jcr.handeye.systematic import Region, smooth_errors
 from jcr.least_squares import loss_weight
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Budget, Intrinsics, Tracks
 
 POINTS_AT_ONCE = 4096
 """Points whose coupling to the cameras is held in memory together."""
@@ -61,11 +61,13 @@ class Adjusted:
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     budget: Budget
-    """Parts of it: the first seven of the unknowns are in that order, then come the six of base_from_recon."""
+    """Parts of it."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) of the random errors of gripper poses."""
     systematic: float
     """σ_s (rad) of their systematic errors."""
+    systematic_left: tuple[float, float]
+    """m, rad per axis: what of these is left in the poses."""
     given_noise: tuple[float, float] | None
     """As `adjust` was told it."""
     sigma_px: float
@@ -195,6 +197,7 @@ def adjust(
         found.budget,
         (sigma_t, sigma_r),
         sigma_s,
+        equations.systematic_left(log_sizes),
         noise,
         sigma_px,
         missed,

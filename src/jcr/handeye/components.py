@@ -22,6 +22,7 @@ from scipy.optimize import root_scalar
 from scipy.stats import chi2
 
 from jcr.handeye.systematic import REACH, Region
+from jcr.records import Budget
 
 NOISE_FLOOR = (2e-5, np.radians(0.002))
 """m, rad; so that a perfect fit does not claim a perfect robot."""
@@ -98,6 +99,14 @@ class Equations:
         translation, rotation = self.variances(log_sizes)[:2]
         return translation * self.of_position + rotation * (1 - self.of_position)
 
+    def systematic_left(self, log_sizes: LogSizes) -> tuple[float, float]:
+        """Root mean square per axis (m, rad) of the systematic part of the residuals."""
+        if self.systematic is None:
+            return 0.0, 0.0
+        variance = self.variances(log_sizes)[2] * np.diag(self.systematic).reshape(-1, 2, 3).mean((0, 2))
+        metres, radians = np.sqrt(variance)
+        return float(metres), float(radians)
+
     def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "s s"]:
         """V of the residuals."""
         covariance = np.diag(self.random(log_sizes))
@@ -127,15 +136,6 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Budget:
-    """Parts of the covariance of the unknowns, by what they come from; they sum to it."""
-
-    random: Float[ndarray, "p p"]
-    systematic: Float[ndarray, "p p"]
-    cameras: Float[ndarray, "p p"]
-
-
-@dataclass(frozen=True)
 class Posterior:
     """The unknowns averaged over the sizes."""
 
@@ -143,6 +143,7 @@ class Posterior:
     covariance: Float[ndarray, "p p"]
     """Scaled so that its 99 % ellipsoid holds 99 %."""
     budget: Budget
+    """Of the first seven unknowns."""
     log_sizes: LogSizes
     """At the mode."""
 
@@ -343,7 +344,7 @@ def _widening(
 def _budget(
     equations: Equations, log_sizes: LogSizes, region: Region | None, covariance: Float[ndarray, "p p"]
 ) -> Budget:
-    """The covariance by its causes, which share what the averaging over sizes added."""
+    """The covariance of X and scale by its causes, which share what the averaging over sizes added."""
     solution = solve(equations, log_sizes)
     gain = solution.gain
     none = np.zeros_like(covariance)
@@ -355,4 +356,4 @@ def _budget(
     cameras = none if equations.known is None else gain @ equations.known @ gain.T
     whole = np.sqrt(np.diag(covariance) / np.diag(random + systematic + cameras))
     share = np.outer(whole, whole)
-    return Budget(random * share, systematic * share, cameras * share)
+    return Budget(*((part * share)[:7, :7] for part in (random, systematic, cameras)))

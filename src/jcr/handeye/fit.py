@@ -20,9 +20,10 @@ from numpy import ndarray
 from scipy.linalg import cho_solve
 
 from jcr.geometry import retract
-from jcr.handeye.components import Budget, Equations, Solution, most_likely, posterior, solve
+from jcr.handeye.components import Equations, Solution, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals, residuals_by_camera
 from jcr.handeye.systematic import Region, smooth_errors
+from jcr.records import Budget
 
 LEAST_FREEDOM, MOST_FREEDOM = 0.1, 1e6
 SHOWN = 1.1
@@ -62,12 +63,14 @@ class PoseFit:
     given_noise: tuple[float, float] | None
     systematic: float
     """σ_s (rad) of the systematic errors."""
+    systematic_left: tuple[float, float]
+    """m, rad per axis: what of them is left in the used poses."""
     degrees_of_freedom: tuple[float, float]
     """Of the two estimates of the noise."""
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER."""
-    budget: Budget
-    """Its parts, of all 13 unknowns."""
+    budget: Budget | None
+    """Its parts; None of a fit that is not averaged."""
     missed: Float[ndarray, "n 6"]
     """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
     missed_covariance: Float[ndarray, "n 6 6"]
@@ -120,7 +123,7 @@ def fit_poses(
         unknowns, covariance, budget = _moved(*unknowns, found.step), found.covariance, found.budget
     else:
         covariance = solution.covariance
-        budget = Budget(covariance, np.zeros_like(covariance), np.zeros_like(covariance))
+        budget = None
     sigma_t, sigma_r, sigma_s = (float(x) for x in np.sqrt(linear.equations.variances(log_sizes)))
     missed, missed_covariance = _missed(problem, linear, solution, (sigma_t, sigma_r), sigma_s)
     # Of log σ²; a given part of it is known.
@@ -136,6 +139,7 @@ def fit_poses(
         exceeds((sigma_t, sigma_r), noise),
         noise,
         sigma_s,
+        linear.equations.systematic_left(log_sizes),
         (float(freedom[0]), float(freedom[1])),
         covariance[:7, :7],
         budget,

@@ -17,7 +17,9 @@ from numpy import ndarray
 
 from jcr.geometry import rotation_angle
 from jcr.handeye.equation import SCALE, Poses
-from jcr.handeye.robots import Arm, ErrorSizes, Joints, error_jacobian, error_std
+from jcr.handeye.inverse_kinematics import required_posture
+from jcr.handeye.mounting import mounted_arm
+from jcr.handeye.robots import Arm, ErrorSizes, Joints, error_jacobian, error_std, with_tool
 
 REACH = 0.45
 """m. A joint's error shows in the gripper's position as in its rotation (rad) times the reach behind it."""
@@ -29,6 +31,21 @@ LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 """m per rad: arms that are made better are better in both, 0.03° and 0.1 mm, 0.1° and 0.3 mm, 0.3° and 1 mm."""
 LEAST_FREE = 0.4
 """One less a pose's leverage counts as at least this: of three or four images every pose is nearly fitted by itself."""
+
+
+def systematic_errors(
+    base_from_gripper: Poses, arm: Arm | None = None, joints: Joints | None = None
+) -> Float[ndarray, "s s"]:
+    """Covariance (6n,6n) of systematic errors at 1 rad: those of the arm, or of nobody knows what.
+
+    Without `joints` (n,dof) they are found from the poses. InputError where poses, joints and arm do not fit.
+    """
+    if arm is None:
+        return smooth_errors(base_from_gripper)
+    if joints is not None:
+        return arm_errors(mounted_arm(arm, joints, base_from_gripper), joints)
+    posture = required_posture(arm, base_from_gripper)
+    return arm_errors(with_tool(arm, posture.flange_from_tool), posture.joints)
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
