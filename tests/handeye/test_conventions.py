@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.stage import calibrate_poses
 from jcr.geometry import inverse, transform
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.next_poses import next_poses
-from jcr.handeye.solve import solve_hand_eye
 from jcr.records import PosePairs
 from jcr.simulate.problem import hand_eye_problem
 

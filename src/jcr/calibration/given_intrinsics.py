@@ -45,6 +45,7 @@ def lens_doubt(
     held: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None,
+    systematic: Float[ndarray, "s s"],
     adjusted: Adjusted | None,
 ) -> LensDoubt | None:
     """What the used images say against the lens that was held; None where they say nothing.
@@ -55,7 +56,16 @@ def lens_doubt(
     if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
-    freed = adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, refine_lens=True)
+    freed = adjust(
+        base_from_gripper,
+        start,
+        recon_from_camera,
+        held,
+        tracks,
+        noise,
+        refine_lens=True,
+        systematic=systematic,
+    )
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
