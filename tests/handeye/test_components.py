@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import jcr
 from jcr.geometry import retract, rotation_exp, step_between, transform
-from jcr.handeye.components import Equations, most_likely, over_sizes, posterior, solve
+from jcr.handeye.components import Equations, _cholesky, most_likely, over_sizes, posterior, solve
 from jcr.handeye.equation import residuals
 from jcr.handeye.robust import robust_fit
 from jcr.handeye.systematic import Region, arm_errors, smooth_errors
@@ -116,3 +117,58 @@ def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
         missed = error(problem, fit.gripper_from_camera, fit.scale)[:6]
         worst.append(np.abs(missed / np.sqrt(np.diag(fit.covariance)[:6])).max())
     assert max(worst) < 3.5 and (np.array(worst) > 3).sum() <= 1
+
+
+def test_a_matrix_without_full_rank_still_has_a_factor():
+    rng = np.random.default_rng(3)
+    wide = rng.normal(size=(8, 5)) * np.array([1e6, 1.0, 1e-6, 1.0, 1.0, 1e3, 1e-3, 1.0])[:, None]
+    for matrix in (wide @ wide.T, wide @ wide.T - 1e-9 * np.diag(np.diag(wide @ wide.T)), np.zeros((3, 3))):
+        factor, size = _cholesky(matrix), np.sqrt(np.diag(matrix)) + 1e-12
+        assert (factor == np.tril(factor)).all()
+        assert (np.abs((factor @ factor.T - matrix) / np.outer(size, size)) < 1e-8).all()
+
+
+def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
+    from jcr.handeye.arms import arm_named
+    from jcr.simulate.robots import bent_problem
+
+    problem = bent_problem(arm_named("panda"), "typical", 12, 1)
+    poses = problem.base_from_gripper, problem.recon_from_camera
+    known = jcr.solve_hand_eye(*poses, joints=problem.joints, robot="panda")
+    named = jcr.solve_hand_eye(*poses, robot="panda")
+    nothing = jcr.solve_hand_eye(*poses)
+    for solved in (known, named, nothing):
+        parts = solved.budget
+        assert parts is not None and solved.converged
+        whole = np.diag(parts.robot_random + parts.robot_systematic + parts.images)
+        assert np.allclose(whole, np.diag(solved.covariance), rtol=1e-9)
+        # Of a bent arm that repeats to 0.05 mm most of what is open is how it is bent; a smooth field does not bend so
+        # sharply, and counts a part of it as random.
+        if solved is not nothing:
+            assert (np.diag(parts.robot_systematic)[:6] > 4 * np.diag(parts.robot_random)[:6]).all()
+        assert 0.02 < np.degrees(solved.robot_noise.systematic) < 0.5
+    answers = [solved.gripper_from_camera for solved in (known, named, nothing)]
+    assert all(np.abs(one - other).max() > 1e-6 for one in answers for other in answers if one is not other)
+    # Another order is the same problem.
+    order = np.random.default_rng(0).permutation(12)
+    again = jcr.solve_hand_eye(
+        *(stack[order] for stack in poses), joints=problem.joints[order], robot="panda"
+    )
+    assert np.allclose(again.gripper_from_camera, known.gripper_from_camera, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("joints", "robot", "words"),
+    [
+        (np.zeros((8, 6)), None, "of which robot"),
+        (None, "ur99", "not known; choose one of"),
+        (np.zeros((8, 7)), "ur5e", r"8 poses of a ur5e need \(8, 6\)"),
+        (np.full((8, 6), np.nan), "ur5e", "NaN"),
+        (np.zeros((8, 6)), "ur5e", "disagree"),
+        (None, "so101", "poses do not fit a so101"),
+    ],
+)
+def test_poses_and_angles_that_are_not_of_the_robot_are_an_input_error(joints, robot, words):
+    problem = hand_eye_problem(np.random.default_rng(2), 8)
+    with pytest.raises(jcr.InputError, match=words):
+        jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, joints=joints, robot=robot)

@@ -43,6 +43,8 @@ MANY, TOO_MANY = 15, 80
 """Poses from which the sizes are known well enough for fewer levels, and for the mode alone."""
 COVERED = 0.99
 """By the ellipsoid that holds what it says."""
+JITTER = (0.0, 1e-14, 1e-12, 1e-10)
+"""Added to correlations whose least eigenvalue is lost in rounding."""
 SETTLED = 1e-4
 """Change of log sizes that no longer matters."""
 
@@ -149,12 +151,12 @@ class Posterior:
 
 
 def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
-    """Generalised least squares at given sizes; numpy.linalg.LinAlgError where they leave V singular."""
-    root = np.linalg.cholesky(equations.covariance(log_sizes))
+    """Generalised least squares at given sizes."""
+    root = _cholesky(equations.covariance(log_sizes))
     both = np.column_stack([equations.jacobian, equations.residual])
     whitened = solve_triangular(root, both, lower=True, check_finite=False)
     jacobian, residual = whitened[:, :-1], whitened[:, -1]
-    information_root = np.linalg.cholesky(jacobian.T @ jacobian + equations.prior_information)
+    information_root = _cholesky(jacobian.T @ jacobian + equations.prior_information)
     gradient = jacobian.T @ residual + equations.prior_gradient
     step = -cho_solve((information_root, True), gradient, check_finite=False)
     likelihood = (
@@ -168,6 +170,20 @@ def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
     return Solution(float(likelihood) + prior, step, root, information_root, gain)
 
 
+def _cholesky(matrix: Float[ndarray, "k k"]) -> Float[ndarray, "k k"]:
+    """Lower factor of a matrix that is positive definite but for rounding: of motions that show nothing it is not."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / size[:, None] / size
+    for rounding in JITTER:
+        try:
+            return size[:, None] * np.linalg.cholesky(scaled + rounding * np.eye(len(matrix)))
+        except np.linalg.LinAlgError:
+            continue
+    values, vectors = np.linalg.eigh(scaled)
+    r = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, JITTER[-1]))).T, mode="r"))
+    return size[:, None] * (r.T * np.sign(np.diag(r)))
+
+
 def most_likely(
     equations: Equations, start: LogSizes | None = None
 ) -> tuple[LogSizes, Float[ndarray, "c c"]]:
@@ -176,7 +192,7 @@ def most_likely(
     value, gradient, information = _score(equations, at)
     for _ in range(40):
         step = np.linalg.solve(information, gradient)
-        step *= min(1.0, 1.0 / float(np.abs(step).max()))
+        step /= max(1.0, float(np.abs(step).max()))
         while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > SETTLED:
             step = step / 2
         if scored[0] < value:
@@ -214,10 +230,7 @@ def over_sizes(
     """Posterior weights (their sum is 1) of log sizes about their mode, and the solution at each."""
     weights, sizes, solutions = [], [], []
     for at, log_volume in _grid(equations, log_sizes, information):
-        try:
-            solutions.append(solve(equations, at))
-        except np.linalg.LinAlgError:  # no sizes that the residuals could have
-            continue
+        solutions.append(solve(equations, at))
         sizes.append(at)
         weights.append(solutions[-1].log_posterior + log_volume)
     weight = np.exp(np.array(weights) - max(weights))
@@ -236,10 +249,7 @@ def _prior(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
 
 def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Float[ndarray, "c c"]]:
     """Log posterior of the sizes, its gradient, and the expected information."""
-    try:
-        solution = solve(equations, log_sizes)
-    except np.linalg.LinAlgError:
-        return -np.inf, np.zeros_like(log_sizes), np.eye(len(log_sizes))
+    solution = solve(equations, log_sizes)
     inverse = cho_solve((solution.root, True), np.eye(len(equations.residual)), check_finite=False)
     projection = inverse - inverse @ equations.jacobian @ solution.gain
     left = inverse @ (equations.residual + equations.jacobian @ solution.step)

@@ -6,6 +6,7 @@ over images (Rousseeuw 1984) starts a maximum-likelihood fit, which images join 
 knows how well it predicts each of them.
 """
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.stats import f as f_distribution
 
-from jcr.geometry import ARM, rotation_angle
+from jcr.geometry import ARM, rotation_angle, transform
 from jcr.handeye.closed_form import closed_form, initial_estimate, motions, sine_axis
 from jcr.handeye.equation import predict
 from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
@@ -41,8 +42,20 @@ def robust_fit(
     """The fit to the images that agree with each other, and which those are.
 
     With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of fit_poses.
+
+    Solved in a frame at the middle of the cameras and in their extent as unit: a frame far away makes a rotation about
+    its origin look like a translation.
     """
-    n = len(base_from_gripper)
+    n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
+    middle = centers.mean(0)
+    unit = float(np.sqrt(((centers - middle) ** 2).sum(1).mean()))
+    unit = unit if unit > 1e-12 * np.abs(centers).max() else 1.0
+    recon_from_camera = transform(recon_from_camera[:, :3, :3], (centers - middle) / unit)
+    if cues is not None and cues.scale is not None:
+        cues = replace(cues, scale=(unit * cues.scale[0], cues.scale[1]))
+    if camera_covariance is not None:
+        per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
+        camera_covariance = per_unit[:, None] * camera_covariance * per_unit
     given = (
         noise,
         cues,
@@ -66,7 +79,10 @@ def robust_fit(
             fitted(np.ones_like(trusted), averaged=False), fitted(trusted, averaged=False)
         ):
             trusted = np.ones_like(trusted)
-    return fitted(trusted, averaged=True), trusted
+    fit = fitted(trusted, averaged=True)
+    scale, z = fit.scale / unit, fit.base_from_recon
+    z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
+    return replace(fit, scale=scale, base_from_recon=z), trusted
 
 
 def _alike(everything: PoseFit, trusted: PoseFit) -> bool:
