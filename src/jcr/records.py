@@ -211,7 +211,7 @@ class Budget:
     robot_random: Float[ndarray, "7 7"]
     robot_systematic: Float[ndarray, "7 7"]
     images: Float[ndarray, "7 7"]
-    """Camera poses, features and estimated intrinsics."""
+    """Camera poses, features and estimated intrinsics; and what no motion shows."""
 
 
 @dataclass(frozen=True)

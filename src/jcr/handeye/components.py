@@ -363,7 +363,10 @@ def _budget(
     if equations.systematic is not None:
         systematic = equations.variances(log_sizes)[2] * gain @ equations.systematic @ gain.T
         systematic = systematic + _elsewhere(equations, solution, log_sizes, region)
-    cameras = none if equations.known is None else gain @ equations.known @ gain.T
+    # What neither robot nor cameras show: in bundle adjustment, how well images tell the intrinsics.
+    cameras = solution.covariance @ equations.prior_information @ solution.covariance
+    if equations.known is not None:
+        cameras = cameras + gain @ equations.known @ gain.T
     whole = np.sqrt(np.diag(covariance) / np.diag(random + systematic + cameras))
     share = np.outer(whole, whole)
     return Budget(*((part * share)[:7, :7] for part in (random, systematic, cameras)))
