@@ -37,6 +37,7 @@ CLEAR = 10.0
 POWER = 0.9
 SETTLED = 1e-9
 
+NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]
 
 
@@ -60,7 +61,7 @@ class Drift:
 def drift(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
-    new: tuple[Poses, Poses, Float[ndarray, "n 6 6"]],
+    new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     alpha: float,
 ) -> Drift:
     """The drift that new images show.
@@ -107,7 +108,7 @@ class _Moved:
 def _moved_by(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
-    new: tuple[Poses, Poses, Float[ndarray, "n 6 6"]],
+    new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     columns: slice,
 ) -> _Moved:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
