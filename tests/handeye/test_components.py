@@ -80,8 +80,7 @@ def test_the_budget_sums_to_the_covariance():
     model = equations(np.random.default_rng(6), 8, np.radians(0.1))
     sizes, information = most_likely(model)
     found = posterior(model, sizes, information, None)
-    parts = found.budget.random + found.budget.systematic + found.budget.cameras
-    np.testing.assert_allclose(np.diag(parts), np.diag(found.covariance), rtol=1e-9)
+    np.testing.assert_allclose(np.diag(sum(found.parts)), np.diag(found.covariance), rtol=1e-9)
 
 
 def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
