@@ -34,8 +34,8 @@ servo arms 1 to 2°."""
 GIVEN_SHARE = 0.3
 """Of a given noise, that a robot has beside it: the middle of the prior."""
 RATIO_STD = np.log(4.0)
-"""Of log(σ_t / (REACH · σ_r)) over robots. Tied more closely, by a factor of 2, three images of a robot whose rotations are
-six times better than its positions cover 80 to 90 %."""
+"""Of log(σ_t / (REACH · σ_r)) over robots. Tied more closely, by a factor of 2, three images of a robot whose rotations
+are six times better than its positions cover 80 to 90 %."""
 LEVELS, FARTHEST = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), 18.0
 """Standard deviations of the log sizes at which the posterior is evaluated, up to this squared distance from the
 mode. Rare errors come from rare sizes: up to a squared distance of 7, three images covered 81 % instead of 95 %, and two

@@ -158,12 +158,13 @@ def _doubts(hand_eye: HandEye):
 def _remarks(hand_eye: HandEye):
     """What a user should know of an answer that may still be trusted."""
     noise = hand_eye.robot_noise
+    metres, radians = _disagreement(hand_eye)
     if noise.given is not None and (
-        noise.translation > SURPRISE * noise.given[0] or noise.rotation > SURPRISE * noise.given[1]
+        metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         yield (
-            f"gripper poses and pictures disagree by {1e3 * noise.translation:.2g} mm and "
-            f"{np.degrees(noise.rotation):.2g}° per axis, more than the robot noise that was given "
+            f"gripper poses and pictures disagree by {1e3 * metres:.2g} mm and "
+            f"{np.degrees(radians):.2g}° per axis, more than the robot noise that was given "
             f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
         )
     held_out = hand_eye.held_out
@@ -176,6 +177,18 @@ def _remarks(hand_eye: HandEye):
             )
     if len(hand_eye.inliers) < FEW:
         yield f"{len(hand_eye.inliers)} images cannot outvote a wrong one; take 8 or more"
+
+
+def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
+    """Root mean square residual of the used images per axis (m, rad), made up for the 13 unknowns that were fitted."""
+    used = hand_eye.inliers
+    count = 6 * int(used.sum())
+    fitted = count / max(count - 13, 1)
+    metres, radians = (
+        float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
+        for residual in (hand_eye.translation_residual_m, hand_eye.rotation_residual_rad)
+    )
+    return metres, radians
 
 
 def _reasons(hand_eye: HandEye) -> tuple[str | None, ...]:
