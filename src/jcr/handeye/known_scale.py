@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import rotation_exp, transform
-from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, ROTATION, TRANSLATION, Poses, residuals
+from jcr.geometry import retract
+from jcr.handeye.equation import Poses, residuals
 
 FREE = np.r_[0:6, 7:13]
 """Columns of the 13 unknowns without scale."""
@@ -42,8 +42,7 @@ def fit_known_scale(
         rows = (weight[:, None] * jacobian[:, :, FREE]).reshape(-1, len(FREE))
         step[FREE] = -np.linalg.lstsq(rows, (weight * residual).ravel(), rcond=1e-9)[0]
         step *= min(1.0, 0.5 / max(np.abs(step[[3, 4, 5, 10, 11, 12]]).max(), 1e-300))
-        x = transform(rotation_exp(step[ROTATION]) @ x[:3, :3], x[:3, 3] + step[TRANSLATION])
-        z = transform(rotation_exp(step[BASE_ROTATION]) @ z[:3, :3], z[:3, 3] + step[BASE_TRANSLATION])
+        x, z = retract(x, step[:6]), retract(z, step[7:])
         if np.abs(step).max() < SETTLED:
             break
     return Fit(x, z, residuals(x, 1.0, z, base_from_gripper, recon_from_camera)[0])

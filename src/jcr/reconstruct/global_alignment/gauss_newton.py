@@ -1,7 +1,7 @@
 """Global alignment by Gauss-Newton on a few thousand pixels per image, the depths eliminated.
 
 It minimises what eq. 1 of the paper does, with three changes. Residuals are weighted by what they prove to
-be worth (`align_residuals`). The first view of a pair stands in its camera's own frame, as it was predicted,
+be worth (`pointmap_residuals`). The first view of a pair stands in its camera's own frame, as it was predicted,
 so that its rays give the focal length. And a pair's pose P_e, free in eq. 1, is its first camera's but for an
 error whose spread is measured over all pairs: where the network places second views well, pairs tie cameras
 firmly.
