@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import ARM, inverse, rotation_angle, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import ARM, inverse, retract, rotation_angle, rotation_exp, rotation_log, skew, transform
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian, unwrapped
 
 STARTS = 12
@@ -235,7 +235,5 @@ def _with_tool(
         step = (transposed @ own @ (error - (by_tool @ twist))[..., None])[..., 0]
         step /= np.abs(step).max(1, keepdims=True).clip(1.0)
         joints = np.clip(joints + step, *arm.limits.T)
-        flange_from_tool = transform(
-            rotation_exp(twist[3:]) @ flange_from_tool[:3, :3], flange_from_tool[:3, 3] + twist[:3]
-        )
+        flange_from_tool = retract(flange_from_tool, twist)
     return joints, flange_from_tool

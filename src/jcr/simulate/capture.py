@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
-from jcr.geometry import rotation_exp
+from jcr.geometry import retract
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, silent, steps
@@ -254,12 +254,9 @@ def with_robot_noise(
     rotation_deg: float,
     rng: np.random.Generator,
 ) -> Float[ndarray, "n 4 4"]:
-    """What a robot of that accuracy reports: x + dx and exp(dr)·R, independent Gaussians in every axis."""
-    reported = base_from_gripper.copy()
-    shift, turn = rng.normal(size=(len(reported), 2, 3)).swapaxes(0, 1)
-    reported[:, :3, 3] += 1e-3 * translation_mm * shift
-    reported[:, :3, :3] = rotation_exp(np.radians(rotation_deg) * turn) @ reported[:, :3, :3]
-    return reported
+    """What a robot of that accuracy reports: each pose after a step of independent Gaussians in every axis."""
+    sizes = np.repeat([1e-3 * translation_mm, np.radians(rotation_deg)], 3)
+    return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
 
 
 def _degraded(
