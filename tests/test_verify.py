@@ -117,7 +117,7 @@ def drifts(
     )
     fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD, bool))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
-    return drift(fit, reported[rows], places[rows], spread, 1e-3)
+    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), 1e-3)
 
 
 def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):

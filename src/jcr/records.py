@@ -192,6 +192,26 @@ class RobotNoise:
     estimated: bool
     given: tuple[float, float] | None = None
     """m, rad: what the user said of it; counted where the residuals say no more."""
+    systematic: float = 0.0
+    """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
+    systematic_left: tuple[float, float] = (0.0, 0.0)
+    """m, rad: systematic errors of these poses per axis, after the effective hand-eye transform took its part."""
+
+    @property
+    def together(self) -> tuple[float, float]:
+        """m, rad: random and systematic errors of a gripper pose per axis."""
+        metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
+        return float(metres), float(radians)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
+
+    robot_random: Float[ndarray, "7 7"]
+    robot_systematic: Float[ndarray, "7 7"]
+    images: Float[ndarray, "7 7"]
+    """Camera poses, features and estimated intrinsics; and what no motion shows."""
 
 
 @dataclass(frozen=True)
@@ -256,6 +276,8 @@ class HandEye:
     and in the covariance. None where nothing speaks against the lens."""
     refinement: "Refinement | None" = None
     """None where camera poses alone decided."""
+    budget: Budget | None = None
+    """Of the covariance, without what `lens_shift` adds to it."""
     excitation: Excitation | None = None
     """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
     next_poses: tuple[NextPose, ...] = ()

@@ -74,6 +74,23 @@ class Residuals(_Part):
     rotation: float
 
 
+class Share(_Part):
+    """One sigma per axis, root mean square over the axes: squares of shares add up to that of the whole."""
+
+    translation_mm: Spread
+    rotation_deg: Spread
+
+
+class UncertaintyBudget(_Part):
+    """What the uncertainty of the camera on the gripper comes from."""
+
+    robot_random: Share
+    robot_systematic: Share
+    intrinsics: Share
+    """Given ones that the images contradict; what is left open of estimated ones is the images'."""
+    images: Share
+
+
 class Uncertainty(_Part):
     """One-sigma uncertainty; axes of the gripper frame."""
 
@@ -84,6 +101,7 @@ class Uncertainty(_Part):
     order: Annotated[list[str], AfterValidator(_order)]
     worst: str
     """The least certain direction of the offset in words, and its size."""
+    budget: UncertaintyBudget | None = None
 
 
 class HeldOutError(_Part):
@@ -103,6 +121,16 @@ class Noise(_Part):
     translation_mm: float
     rotation_deg: float
     estimated: bool
+
+
+class RobotErrors(_Part):
+    """Systematic errors of the gripper poses, as estimated."""
+
+    systematic_deg: Spread
+    """Of joint offsets where the arm is known, else of the gripper's rotation."""
+    translation_mm: Spread
+    """What of them is left in the poses per axis, after the effective hand-eye transform took its part."""
+    rotation_deg: Spread
 
 
 class Image(_Part):
@@ -161,6 +189,7 @@ class CalibrationFile(_Part):
     version: str
     next_poses: list[Proposal] = []
     scale_check: NetworkScale | None = None
+    robot_errors: RobotErrors | None = None
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
 
@@ -223,6 +252,7 @@ def calibration_file(
             covariance=hand_eye.covariance.tolist(),
             order=list(COVARIANCE_ORDER),
             worst=worst_direction(hand_eye),
+            budget=_budget(hand_eye),
         ),
         held_out=None if held_out is None else HeldOutError(**vars(held_out)),
         observability=Observed(
@@ -248,6 +278,11 @@ def calibration_file(
             for pose in hand_eye.next_poses
         ],
         scale_check=None if check is None else NetworkScale(**vars(check)),
+        robot_errors=RobotErrors(
+            systematic_deg=float(np.degrees(hand_eye.robot_noise.systematic)),
+            translation_mm=1e3 * hand_eye.robot_noise.systematic_left[0],
+            rotation_deg=float(np.degrees(hand_eye.robot_noise.systematic_left[1])),
+        ),
         attempts=list(attempts),
     )
 
@@ -315,6 +350,23 @@ def image_verdicts(
         pixels = None if hand_eye.reprojection_px is None else float(hand_eye.reprojection_px[k])
         verdicts.append((verdict, None if pixels is None or np.isnan(pixels) else pixels))
     return verdicts
+
+
+def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
+    if (parts := hand_eye.budget) is None:
+        return None
+    shift = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
+    return UncertaintyBudget(
+        robot_random=_share(parts.robot_random),
+        robot_systematic=_share(parts.robot_systematic),
+        intrinsics=_share(np.outer(shift, shift)),
+        images=_share(parts.images),
+    )
+
+
+def _share(covariance: Float[ndarray, "7 7"]) -> Share:
+    metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1))
+    return Share(translation_mm=1e3 * float(metres), rotation_deg=float(np.degrees(radians)))
 
 
 def worst_direction(hand_eye: HandEye) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import LENS_STD, Adjusted, adjust, free_lens
+from jcr.calibration.bundle import ESTIMATED_STD, Adjusted, adjust, free_intrinsics
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
@@ -23,7 +23,7 @@ SURE = 5.0
 true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
 """Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
-OFF_CENTRE = LENS_STD["cx"]
+OFF_CENTRE = ESTIMATED_STD["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
@@ -45,6 +45,7 @@ def lens_doubt(
     held: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None,
+    systematic: Float[ndarray, "s s"],
     adjusted: Adjusted | None,
 ) -> LensDoubt | None:
     """What the used images say against the lens that was held; None where they say nothing.
@@ -55,7 +56,16 @@ def lens_doubt(
     if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
-    freed = adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, refine_lens=True)
+    freed = adjust(
+        base_from_gripper,
+        start,
+        recon_from_camera,
+        held,
+        tracks,
+        noise,
+        refine_lens=True,
+        systematic=systematic,
+    )
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
@@ -72,7 +82,7 @@ def lens_doubt(
 
 def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
     """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
-    found = free_lens(adjusted, held)
+    found = free_intrinsics(adjusted, held)
     if found is None:
         return []
     camera, covariance = found

@@ -8,7 +8,15 @@ from jcr.records import Attempt, HeldOut, ScaleCheck
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile, HeldOutError, NetworkScale
+    from jcr.calibration.calibration_json import (
+        CalibrationFile,
+        HeldOutError,
+        NetworkScale,
+        UncertaintyBudget,
+    )
+
+NOTHING = 0.02
+"""Of the largest part of a budget: its square is nothing beside that of the whole."""
 
 
 def summary(content: "CalibrationFile") -> str:
@@ -40,11 +48,34 @@ def found(content: "CalibrationFile") -> list[str]:
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
         f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
+    if uncertainty.budget is not None:
+        parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
+        lines.insert(-1, f"  of which: {parts}")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
     if (held_out := content.held_out) is not None:
         lines.append(f"held out: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
+
+
+def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
+    """What the uncertainty comes from, largest first, each with its size; negligible parts are left out."""
+    named = {
+        "random robot errors": budget.robot_random,
+        "systematic robot errors": budget.robot_systematic,
+        "intrinsics": budget.intrinsics,
+        "images": budget.images,
+    }
+    ranked = sorted(named.items(), key=lambda item: -item[1].translation_mm)
+    least_mm, least_deg = (
+        NOTHING * max(getattr(share, unit) for share in named.values())
+        for unit in ("translation_mm", "rotation_deg")
+    )
+    return {
+        name: f"{share.translation_mm:.2f} mm {share.rotation_deg:.3f}°"
+        for name, share in ranked
+        if share.translation_mm > least_mm or share.rotation_deg > least_deg
+    }
 
 
 def log(content: "CalibrationFile") -> str:
