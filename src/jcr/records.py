@@ -43,6 +43,8 @@ class Capture:
     """Width, height in pixels after EXIF rotation; the same for all images."""
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
+    intrinsics_std: Float[ndarray, "9"] | None = None
+    """Standard deviations of the given ones, in the order of camera.PARAMETERS; None: not stated."""
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
@@ -210,8 +212,10 @@ class Budget:
 
     robot_random: Float[ndarray, "7 7"]
     robot_systematic: Float[ndarray, "7 7"]
+    intrinsics: Float[ndarray, "7 7"]
+    """What would go if they were known."""
     images: Float[ndarray, "7 7"]
-    """Camera poses, features and estimated intrinsics; and what no motion shows."""
+    """Camera poses and features; and what no motion shows."""
 
 
 @dataclass(frozen=True)
@@ -264,6 +268,8 @@ class HandEye:
     warnings: tuple[str, ...] = ()
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
+    intrinsics_covariance: Float[ndarray, "9 9"] | None = None
+    """In the order of camera.PARAMETERS; None where they were not refined."""
     held_out: HeldOut | None = None
     reasons: tuple[str | None, ...] = ()
     """Per pose: why it was rejected, None when used."""

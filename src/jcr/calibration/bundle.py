@@ -15,7 +15,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project, with_parameters
+from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior
+from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, residuals
@@ -31,10 +32,11 @@ FAR_OFF = 6.0
 """Median residuals; seven sigma."""
 LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
-ESTIMATED_STD = {"f": 0.5, "cx": 0.02, "cy": 0.02, "k1": 0.3, "k2": 0.3}
-"""Prior of what a cheap camera may be: focal length relative, principal point relative to the width, distortion
-absolute."""
-MIN_OBSERVATIONS_FOR_LENS = 500
+CELLS = 8
+"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
+model leaves."""
+ENOUGH = 1e-5
+"""Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
 START_NOISE = (1e-3, np.radians(0.2))
 """m, rad; of gripper poses, until it is estimated."""
 
@@ -48,6 +50,16 @@ class Bundle:
     """Where the images say the gripper was, against the robot's word."""
     points_in_base: Float[ndarray, "p 3"]
     camera: Intrinsics
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """Errors of image observations."""
+
+    sigma_px: float
+    """Of one coordinate."""
+    inflation: float = 1.0
+    """Of the variance of what many observations say together, because neighbours share errors."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +82,9 @@ class Adjusted:
     """m, rad per axis: what of these is left in the poses."""
     given_noise: tuple[float, float] | None
     """As `adjust` was told it."""
-    sigma_px: float
+    intrinsics_covariance: Float[ndarray, "9 9"]
+    """In the order of camera.PARAMETERS."""
+    pixels: PixelErrors
     missed: Float[ndarray, "m 6"]
     """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment that does not use it."""
     log_sizes: Float[ndarray, "3"]
@@ -89,10 +103,9 @@ class _Problem:
     image: Int[ndarray, " k"]
     point: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
-    lens: Float[ndarray, "9 c"]
-    """Free parameters of the camera, which is start + lens · c in the order of camera.PARAMETERS."""
-    lens_start: Float[ndarray, "9"]
-    lens_std: Float[ndarray, " c"]
+    intrinsics: Intrinsics
+    """Where the camera's parameters start."""
+    free: IntrinsicsPrior
     rows_of_image: list[Int[ndarray, "..."]]
     systematic: Float[ndarray, "s s"]
     """Covariance of systematic errors of the gripper poses at 1 rad."""
@@ -129,29 +142,25 @@ def adjust(
     intrinsics: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None = None,
-    refine_lens: bool = False,
+    free: IntrinsicsPrior = HELD,
     systematic: Float[ndarray, "s s"] | None = None,
     max_iterations: int = 60,
 ) -> Adjusted:
     """Adjust from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
     `noise` is the robot's (m, rad), at least; it is estimated with the rest. `systematic` is the covariance of its
-    systematic errors at 1 rad; None: that of errors smooth over the poses. The intrinsics move only when `refine_lens`:
-    one focal length, principal point, two radial terms.
+    systematic errors at 1 rad; None: that of errors smooth over the poses. `free` is what is known of the intrinsics.
     """
     x, scale, z = start
     order = _usable(tracks)
     kept, point = np.unique(tracks.point[order], return_inverse=True)
-    enough = len(order) >= MIN_OBSERVATIONS_FOR_LENS
-    lens, lens_std = _free_lens(intrinsics, ESTIMATED_STD if refine_lens and enough else {})
     problem = _Problem(
         base_from_gripper,
         tracks.image[order],
         point,
         tracks.x_px[order],
-        lens,
-        parameters(intrinsics),
-        lens_std,
+        intrinsics,
+        free,
         [np.flatnonzero(tracks.image[order] == i) for i in range(len(base_from_gripper))],
         smooth_errors(base_from_gripper) if systematic is None else systematic,
         noise,
@@ -167,23 +176,23 @@ def adjust(
     )
     precision = np.diag(np.tile(np.repeat(noise or START_NOISE, 3) ** -2.0, len(base_from_gripper)))
     view = _view(bundle, problem)
-    sigma_px, log_sizes = _sigma_px(view, problem), None
+    pixels, log_sizes = _pixel_errors(view, problem), None
     damping, total = 1e-4, 0
     for _ in range(12):
-        before = sigma_px, log_sizes
-        weights = _weights(view, sigma_px)
+        before = pixels, log_sizes
+        weights = _weights(view, pixels)
         bundle, view, damping, used = _minimise(
             bundle, view, problem, weights, precision, damping, max_iterations
         )
         total += used
-        sigma_px = _sigma_px(view, problem)
-        equations, _ = _equations(bundle, view, problem, sigma_px, precision)
+        pixels = _pixel_errors(view, problem)
+        equations, _ = _equations(bundle, view, problem, pixels, precision)
         log_sizes, _ = most_likely(equations, log_sizes)
         precision = np.linalg.inv(replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
-        if max(change, abs(np.log(sigma_px / before[0]))) < 0.01:
+        if max(change, abs(np.log(pixels.sigma_px / before[0].sigma_px))) < 0.01:
             break
-    equations, region = _equations(bundle, view, problem, sigma_px, precision)
+    equations, region = _equations(bundle, view, problem, pixels, precision)
     log_sizes, information = most_likely(equations, log_sizes)
     found = posterior(equations, log_sizes, information, region)
     sigma_t, sigma_r, sigma_s = np.sqrt(equations.variances(log_sizes)).tolist()
@@ -199,7 +208,8 @@ def adjust(
         sigma_s,
         equations.systematic_left(log_sizes),
         noise,
-        sigma_px,
+        free.directions @ found.covariance[13:, 13:] @ free.directions.T,
+        pixels,
         missed,
         log_sizes,
         precision,
@@ -215,23 +225,6 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
     first = np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)]
     order = order[first]
     return order[np.bincount(tracks.point[order])[tracks.point[order]] >= 2]
-
-
-def _free_lens(
-    intrinsics: Intrinsics, std: dict[str, float]
-) -> tuple[Float[ndarray, "9 c"], Float[ndarray, " c"]]:
-    """Directions in which the camera's parameters may move, and their standard deviations."""
-    width = intrinsics.width
-    moves = {
-        "f": {"fx": intrinsics.fx, "fy": intrinsics.fy},
-        "cx": {"cx": width},
-        "cy": {"cy": width},
-    }
-    lens = np.zeros((len(PARAMETERS), len(std)))
-    for column, name in enumerate(std):
-        for parameter, unit in moves.get(name, {name: 1.0}).items():
-            lens[PARAMETERS.index(parameter), column] = unit
-    return lens, np.array(list(std.values()))
 
 
 def _minimise(
@@ -253,7 +246,7 @@ def _minimise(
         if new_cost <= cost:
             gained = cost - new_cost
             bundle, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
-            if gained < 1e-6 * cost + 1e-9:
+            if gained < ENOUGH:
                 return bundle, view, damping, iteration
         else:
             damping *= 10
@@ -273,19 +266,30 @@ def _view(bundle: Bundle, problem: _Problem) -> _View:
     return _View(in_gripper, in_camera, project(bundle.camera, in_camera) - problem.x_px)
 
 
-def _sigma_px(view: _View, problem: _Problem) -> float:
-    """Noise of an image coordinate, from the median point none of whose observations is far off."""
+def _pixel_errors(view: _View, problem: _Problem) -> PixelErrors:
+    """From the median point none of whose observations is far off, and from cells of the images.
+
+    Were errors independent, the squared sum over a cell of what each observation pulls would be, on average, the sum of
+    the squares; what it is times that is what the errors that neighbours share cost of the images' information (the
+    variance inflation of cluster sampling; Liang and Zeger, Biometrika 73, 1986).
+    """
     square = (view.residual**2).sum(1)
     far = square > FAR_OFF**2 * np.median(square)
     squares = np.bincount(problem.point, square) / problem.median_square
     clean = np.bincount(problem.point, far) == 0
-    return max(float(np.sqrt(np.median(squares[clean] if clean.any() else squares))), MIN_SIGMA_PX)
+    sigma_px = max(float(np.sqrt(np.median(squares[clean] if clean.any() else squares))), MIN_SIGMA_PX)
+    pull = _weights(view, PixelErrors(sigma_px))[:, None] * view.residual
+    column, row = (CELLS * problem.x_px / problem.intrinsics.width).astype(int).T
+    _, cell = np.unique(np.stack([problem.image, row, column]), axis=1, return_inverse=True)
+    sums = sum(np.bincount(cell, along) ** 2 for along in pull.T)
+    return PixelErrors(sigma_px, max(1.0, float(np.sum(sums) / (pull**2).sum())))
 
 
-def _weights(view: _View, sigma_px: float) -> Float[ndarray, " k"]:
+def _weights(view: _View, pixels: PixelErrors) -> Float[ndarray, " k"]:
     """Inverse variances under a Cauchy loss; points behind the camera count nothing."""
-    squared = (view.residual**2).sum(1) / sigma_px**2
-    return (view.in_camera[:, 2] > 1e-6) * loss_weight("cauchy", squared / LOSS_SCALE**2) / sigma_px**2
+    squared = (view.residual**2).sum(1) / pixels.sigma_px**2
+    weight = loss_weight("cauchy", squared / LOSS_SCALE**2) / (pixels.sigma_px**2 * pixels.inflation)
+    return (view.in_camera[:, 2] > 1e-6) * weight
 
 
 def _cost(
@@ -300,13 +304,15 @@ def _cost(
     return (
         seen
         + float(told @ precision @ told)
-        + float(((_lens_step(bundle, problem) / problem.lens_std) ** 2).sum())
+        + float(((_lens_step(bundle, problem) / problem.free.std) ** 2).sum())
     )
 
 
 def _lens_step(bundle: Bundle, problem: _Problem) -> Float[ndarray, " c"]:
     """How far the free lens parameters have moved from where they began."""
-    return np.linalg.pinv(problem.lens) @ (parameters(bundle.camera) - problem.lens_start)
+    return np.linalg.pinv(problem.free.directions) @ (
+        parameters(bundle.camera) - parameters(problem.intrinsics)
+    )
 
 
 def _normal_equations(
@@ -317,7 +323,7 @@ def _normal_equations(
     precision: Float[ndarray, "s s"],
     damping: float,
 ) -> _Normal:
-    m, c = len(bundle.base_from_gripper), problem.lens.shape[1]
+    m, c = len(bundle.base_from_gripper), len(problem.free.std)
     shared, size = 6 + c, 6 + c + 6 * m
     root = np.sqrt(weights)
     residual = view.residual * root[:, None]
@@ -331,7 +337,7 @@ def _normal_equations(
         by_gripper_axes, (view.in_gripper - bundle.gripper_from_camera[:3, 3])[:, None]
     )
     if c:
-        by_lens = by_parameters(bundle.camera, view.in_camera) @ problem.lens
+        by_lens = by_parameters(bundle.camera, view.in_camera) @ problem.free.directions
         common[:, :, 6:] = by_lens * root[:, None, None]
     own = np.empty((len(root), 2, 6))
 
@@ -348,8 +354,8 @@ def _normal_equations(
     diagonal = np.arange(size)
     hessian[shared:, shared:] += precision
     right[shared:] -= precision @ step_between(problem.reported, bundle.base_from_gripper).ravel()
-    hessian[diagonal[6:shared], diagonal[6:shared]] += problem.lens_std**-2.0
-    right[6:shared] -= _lens_step(bundle, problem) / problem.lens_std**2
+    hessian[diagonal[6:shared], diagonal[6:shared]] += problem.free.std**-2.0
+    right[6:shared] -= _lens_step(bundle, problem) / problem.free.std**2
     hessian[diagonal, diagonal] *= 1 + damping
 
     chunks = []
@@ -385,12 +391,12 @@ def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
     points = bundle.points_in_base.copy()
     for first, count, v, w, g in normal.point_steps:
         points[first : first + count] += np.linalg.solve(v, -(g + w @ step)[..., None])[..., 0]
-    c = problem.lens.shape[1]
+    c = len(problem.free.std)
     return Bundle(
         retract(bundle.gripper_from_camera, step[:6]),
         retract(bundle.base_from_gripper, step[6 + c :].reshape(-1, 6)),
         points,
-        with_parameters(bundle.camera, parameters(bundle.camera) + problem.lens @ step[6 : 6 + c]),
+        with_parameters(bundle.camera, parameters(bundle.camera) + problem.free.directions @ step[6 : 6 + c]),
     )
 
 
@@ -398,7 +404,7 @@ def _equations(
     bundle: Bundle,
     view: _View,
     problem: _Problem,
-    sigma_px: float,
+    pixels: PixelErrors,
     precision: Float[ndarray, "s s"],
 ) -> tuple[Equations, Region]:
     """What the images alone say of the cameras, as linear equations of X, a similarity and the intrinsics.
@@ -407,9 +413,9 @@ def _equations(
     then the free parameters of the camera. Images see cameras, not X and grippers apart: with X where it is, they say
     how each gripper would move, up to one similarity.
     """
-    normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), precision, 0.0)
+    normal = _normal_equations(bundle, view, problem, _weights(view, pixels), precision, 0.0)
     told = step_between(problem.reported, bundle.base_from_gripper).ravel()
-    c = problem.lens.shape[1]
+    c = len(problem.free.std)
     of_lens, of_poses = slice(6, 6 + c), slice(6 + c, None)
     seen = normal.schur[of_poses, of_poses] - precision
     by_images = normal.right[of_poses] + precision @ told
@@ -463,22 +469,19 @@ def _settled(
     return settled, float(scale), base_from_recon
 
 
-def free_intrinsics(
-    adjusted: Adjusted, intrinsics: Intrinsics
-) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
-    """The camera one Gauss-Newton step on, with its parameters free and before it at `intrinsics`, and the covariance.
+def freed_intrinsics(
+    adjusted: Adjusted, free: IntrinsicsPrior
+) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]]:
+    """The camera one Gauss-Newton step on, with another prior about where its parameters started, and the covariance.
 
-    In the order of camera.PARAMETERS. None where there are too few observations to free them.
+    In the order of camera.PARAMETERS.
     """
-    problem, bundle = adjusted.problem, adjusted.bundle
-    if len(problem.image) < MIN_OBSERVATIONS_FOR_LENS:
-        return None
-    lens, lens_std = _free_lens(intrinsics, ESTIMATED_STD)
-    problem = replace(problem, lens=lens, lens_std=lens_std)
-    equations, _ = _equations(bundle, _view(bundle, problem), problem, adjusted.sigma_px, adjusted.precision)
+    problem, bundle = replace(adjusted.problem, free=free), adjusted.bundle
+    view = _view(bundle, problem)
+    equations, _ = _equations(bundle, view, problem, adjusted.pixels, adjusted.precision)
     solution = solve(equations, adjusted.log_sizes)
-    covariance = lens @ solution.covariance[13:, 13:] @ lens.T
-    return parameters(bundle.camera) + lens @ solution.step[13:], covariance
+    covariance = free.directions @ solution.covariance[13:, 13:] @ free.directions.T
+    return parameters(bundle.camera) + free.directions @ solution.step[13:], covariance
 
 
 def median_reprojection(

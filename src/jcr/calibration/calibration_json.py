@@ -87,7 +87,6 @@ class UncertaintyBudget(_Part):
     robot_random: Share
     robot_systematic: Share
     intrinsics: Share
-    """Given ones that the images contradict; what is left open of estimated ones is the images'."""
     images: Share
 
 
@@ -356,10 +355,11 @@ def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
     if (parts := hand_eye.budget) is None:
         return None
     shift = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
+    by_intrinsics = parts.intrinsics + np.outer(shift, shift)
     return UncertaintyBudget(
         robot_random=_share(parts.robot_random),
         robot_systematic=_share(parts.robot_systematic),
-        intrinsics=_share(np.outer(shift, shift)),
+        intrinsics=_share(by_intrinsics),
         images=_share(parts.images),
     )
 

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import ESTIMATED_STD, Adjusted, adjust, free_intrinsics
+from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
+from jcr.calibration.intrinsics_prior import ESTIMATED, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
@@ -23,7 +24,7 @@ SURE = 5.0
 true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
 """Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
-OFF_CENTRE = ESTIMATED_STD["cx"]
+OFF_CENTRE = ESTIMATED["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
@@ -63,8 +64,8 @@ def lens_doubt(
         held,
         tracks,
         noise,
-        refine_lens=True,
-        systematic=systematic,
+        prior_of(held, ESTIMATED),
+        systematic,
     )
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
@@ -82,10 +83,7 @@ def lens_doubt(
 
 def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
     """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
-    found = free_intrinsics(adjusted, held)
-    if found is None:
-        return []
-    camera, covariance = found
+    camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED))
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))
     off = []

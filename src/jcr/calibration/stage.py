@@ -9,6 +9,7 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import scale_in_words
 from jcr.capture.urdf_chain import read_chain
@@ -28,6 +29,7 @@ from jcr.records import (
     Capture,
     HandEye,
     HeldOut,
+    Intrinsics,
     NextPose,
     PosePairs,
     Reconstruction,
@@ -152,8 +154,8 @@ def _calibrated(
             reconstruction.intrinsics,
             tracks,
             noise,
-            refine_lens=capture.intrinsics is None,
-            systematic=_of_poses(systematic, np.flatnonzero(used)),
+            _intrinsics_prior(capture, reconstruction.intrinsics),
+            _of_poses(systematic, np.flatnonzero(used)),
         )
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
@@ -285,6 +287,12 @@ def _of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> F
     return covariance[np.ix_(rows, rows)]
 
 
+def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
+    if capture.intrinsics is None:
+        return prior_of(found, ESTIMATED)
+    return prior_of(found, MEASURED if capture.intrinsics_std is None else capture.intrinsics_std)
+
+
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
     if options.robot_noise is None:
         return None
@@ -361,6 +369,7 @@ def _refined(
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=adjusted.bundle.camera,
+        intrinsics_covariance=adjusted.intrinsics_covariance,
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
         refinement=refinement,

@@ -10,7 +10,7 @@ distribution of its covariance: the covariance is scaled until its 99 % ellipsoi
 that is many standard deviations off is the worst fault.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -43,6 +43,8 @@ of 120 images that had not moved were called moved at p < 0.001."""
 FEW_LEVELS = (-3.2, -1.6, 0.0, 1.6, 3.2)
 MANY, TOO_MANY = 15, 80
 """Poses from which the sizes are known well enough for fewer levels, and for the mode alone."""
+POSES = 13
+"""Unknowns of equation.py; what follows them are intrinsics."""
 COVERED = 0.99
 """By the ellipsoid that holds what it says."""
 JITTER = (0.0, 1e-14, 1e-12, 1e-10)
@@ -146,15 +148,9 @@ class Posterior:
     step: Float[ndarray, " p"]
     covariance: Float[ndarray, "p p"]
     """Scaled so that its 99 % ellipsoid holds 99 %."""
-    parts: tuple[Float[ndarray, "p p"], Float[ndarray, "p p"], Float[ndarray, "p p"]]
-    """Of the covariance: random and systematic errors of the robot, and cameras with what no motion shows."""
+    budget: Budget
     log_sizes: LogSizes
     """At the mode."""
-
-    @property
-    def budget(self) -> Budget:
-        """The parts of the first seven unknowns, X and scale."""
-        return Budget(*(part[:7, :7] for part in self.parts))
 
 
 def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
@@ -227,8 +223,8 @@ def posterior(
     step = weight @ steps
     off = steps - step
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
-    covariance *= _widening(weight, off, each, covariance)
-    return Posterior(step, covariance, _parts(equations, log_sizes, region, covariance), log_sizes)
+    covariance *= _widening(weight, off[:, :POSES], each[:, :POSES, :POSES], covariance[:POSES, :POSES])
+    return Posterior(step, covariance, _budget(equations, log_sizes, region, covariance), log_sizes)
 
 
 def over_sizes(
@@ -308,10 +304,10 @@ def _grid(
 
 def _elsewhere(
     equations: Equations, solution: Solution, log_sizes: LogSizes, region: Region | None
-) -> Float[ndarray, "p p"] | float:
+) -> Float[ndarray, "p p"]:
     """Covariance of what the systematic part leaves open because the answer is asked for the region, not its poses."""
     if region is None or equations.systematic is None:
-        return 0.0
+        return np.zeros_like(solution.information_root)
     part = equations.variances(log_sizes)[2] * equations.systematic
     left = equations.residual + equations.jacobian @ solution.step
     expected = part @ cho_solve((solution.root, True), left, check_finite=False)
@@ -358,22 +354,33 @@ def _widening(
     return max(1.0, float(found) / normal)
 
 
-def _parts(
+def _budget(
     equations: Equations, log_sizes: LogSizes, region: Region | None, covariance: Float[ndarray, "p p"]
-) -> tuple[Float[ndarray, "p p"], Float[ndarray, "p p"], Float[ndarray, "p p"]]:
-    """The covariance by its causes, which share what the averaging over sizes added."""
-    solution = solve(equations, log_sizes)
+) -> Budget:
+    """The covariance of X and scale by its causes, which share what the averaging over sizes added.
+
+    What intrinsics add is what would go if they were known; the rest is divided as if they were.
+    """
+    exact = replace(
+        equations,
+        jacobian=equations.jacobian[:, :POSES],
+        prior_information=equations.prior_information[:POSES, :POSES],
+        prior_gradient=equations.prior_gradient[:POSES],
+    )
+    solution = solve(exact, log_sizes)
     gain = solution.gain
-    none = np.zeros_like(covariance)
-    random = (gain * equations.random(log_sizes)) @ gain.T
-    systematic = none
-    if equations.systematic is not None:
-        systematic = equations.variances(log_sizes)[2] * gain @ equations.systematic @ gain.T
-        systematic = systematic + _elsewhere(equations, solution, log_sizes, region)
-    # What neither robot nor cameras show: in bundle adjustment, how well images tell the intrinsics.
-    cameras = solution.covariance @ equations.prior_information @ solution.covariance
-    if equations.known is not None:
-        cameras = cameras + gain @ equations.known @ gain.T
-    whole = np.sqrt(np.diag(covariance) / np.diag(random + systematic + cameras))
+    random = (gain * exact.random(log_sizes)) @ gain.T
+    systematic = np.zeros_like(random)
+    if exact.systematic is not None:
+        systematic = exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
+    # What neither robot nor cameras show.
+    images = solution.covariance @ exact.prior_information @ solution.covariance
+    if exact.known is not None:
+        images = images + gain @ exact.known @ gain.T
+    free = solve(equations, log_sizes)
+    intrinsics = free.covariance[:POSES, :POSES] - solution.covariance
+    systematic = systematic + _elsewhere(equations, free, log_sizes, region)[:POSES, :POSES]
+    variance = np.diag(random + systematic + intrinsics + images)
+    whole = np.sqrt(np.diag(covariance)[:POSES] / variance)
     share = np.outer(whole, whole)
-    return random * share, systematic * share, cameras * share
+    return Budget(*((share * part)[:7, :7] for part in (random, systematic, intrinsics, images)))
