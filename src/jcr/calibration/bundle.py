@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior
+from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve
@@ -74,6 +74,8 @@ class Adjusted:
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     budget: Budget
     """Parts of it."""
+    by_intrinsics: Float[ndarray, "7"]
+    """How far the answer is from the one with the intrinsics where they started; in records.COVARIANCE_ORDER."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) of the random errors of gripper poses."""
     systematic: float
@@ -197,18 +199,23 @@ def adjust(
     found = posterior(equations, log_sizes, information, region)
     sigma_t, sigma_r, sigma_s = np.sqrt(equations.variances(log_sizes)).tolist()
     missed, _ = left_out(equations, solve(equations, log_sizes), (sigma_t, sigma_r))
+    by_intrinsics = _by_intrinsics(found.covariance)
+    off = off_by(free, intrinsics)
+    more = by_intrinsics @ off @ by_intrinsics.T
+    held = by_intrinsics @ _lens_step(bundle, problem)
     bundle, scale, base_from_recon = _settled(bundle, found.step, tracks.points_in_recon[kept])
     return Adjusted(
         bundle,
         scale,
         base_from_recon,
-        found.covariance[:7, :7],
-        found.budget,
+        found.covariance[:7, :7] + more,
+        replace(found.budget, intrinsics=found.budget.intrinsics + more),
+        held,
         (sigma_t, sigma_r),
         sigma_s,
         equations.systematic_left(log_sizes),
         noise,
-        free.directions @ found.covariance[13:, 13:] @ free.directions.T,
+        free.directions @ (found.covariance[13:, 13:] + off) @ free.directions.T,
         pixels,
         missed,
         log_sizes,
@@ -469,6 +476,11 @@ def _settled(
     return settled, float(scale), base_from_recon
 
 
+def _by_intrinsics(covariance: Float[ndarray, "p p"]) -> Float[ndarray, "7 c"]:
+    """How X and scale follow the intrinsics, from the joint covariance."""
+    return np.linalg.solve(covariance[13:, 13:], covariance[13:, :7]).T
+
+
 def freed_intrinsics(
     adjusted: Adjusted, free: IntrinsicsPrior
 ) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]]:
@@ -480,7 +492,8 @@ def freed_intrinsics(
     view = _view(bundle, problem)
     equations, _ = _equations(bundle, view, problem, adjusted.pixels, adjusted.precision)
     solution = solve(equations, adjusted.log_sizes)
-    covariance = free.directions @ solution.covariance[13:, 13:] @ free.directions.T
+    covariance = solution.covariance[13:, 13:] + off_by(free, problem.intrinsics)
+    covariance = free.directions @ covariance @ free.directions.T
     return parameters(bundle.camera) + free.directions @ solution.step[13:], covariance
 
 

@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 from scipy.optimize import root_scalar
 from scipy.stats import chi2, ncx2
 
 from jcr.geometry import retract, step_between
-from jcr.handeye.components import Equations, Solution, most_likely, over_sizes, solve
+from jcr.handeye.components import Equations, Solution, lower, most_likely, over_sizes, solve
 from jcr.handeye.equation import (
     PRIOR_STD,
     ROTATION,
@@ -130,7 +130,7 @@ def _moved_by(
         calibrated.given_noise,
     )
     log_sizes, information = most_likely(alone)
-    weight, sizes, solutions = over_sizes(alone, log_sizes, information)
+    known_sizes = over_sizes(alone, log_sizes, information)
 
     def together(moved: Float[ndarray, "4 4"]) -> Equations:
         place = (moved, scale, z) if of_x else (x, scale, moved)
@@ -159,26 +159,28 @@ def _moved_by(
         if float(np.abs(step).max()) < SETTLED:
             break
     joint, begun = together(moved), step_between(start, moved)
-    steps, covariances, misfits = [], [], []
-    for at, by_old in zip(sizes, solutions, strict=True):
-        solution = solve(joint, at)
-        steps.append(begun + solution.step[13:])
-        covariances.append(solution.covariance[13:, 13:])
-        misfits.append(max(_squares(joint, solution) - _squares(alone, by_old), 0.0))
-    offset, each = weight @ np.array(steps), np.array(covariances)
-    off = np.array(steps) - offset
-    distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, np.array(steps)[..., None])[..., 0])
+    weights, steps, covariances, misfits = [], [], [], []
+    for weight, sizes, by_old in known_sizes:
+        solution = solve(joint, sizes)
+        weights.append(weight)
+        steps.append(begun + solution.step[:, 13:])
+        covariances.append(solution.covariance[:, 13:, 13:])
+        misfits.append(np.maximum(_squares(joint, solution) - _squares(alone, by_old), 0.0))
+    weight, steps, each, misfits = (np.concatenate(x) for x in (weights, steps, covariances, misfits))
+    offset = weight @ steps
+    off = steps - offset
+    distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, steps[..., None])[..., 0])
     return _Moved(
         offset,
         np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
         float(weight @ chi2.sf(distances, 6)),
-        float(weight @ np.array(misfits)),
+        float(weight @ misfits),
         float(weight @ chi2.sf(misfits, n - 6)) if n > 6 else None,
     )
 
 
-def _squares(equations: Equations, solution: Solution) -> float:
+def _squares(equations: Equations, solution: Solution) -> Float[ndarray, " k"]:
     """Squared distance of the residuals from the fit."""
-    left = equations.residual + equations.jacobian @ solution.step
-    whitened = solve_triangular(solution.root, left, lower=True)
-    return float(whitened @ whitened + solution.step @ equations.prior_information @ solution.step)
+    left = equations.residual[:, None] + equations.jacobian @ solution.step[..., None]
+    prior = np.einsum("ki,ij,kj->k", solution.step, equations.prior_information, solution.step)
+    return (lower(solution.root, left) ** 2).sum((-1, -2)) + prior

@@ -14,7 +14,6 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.calibration.intrinsics_prior import ESTIMATED, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
-from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
@@ -36,7 +35,7 @@ class LensDoubt:
 
     text: str
     shift: Float[ndarray, "7"]
-    """By how much the calibration moves when the lens is freed; in records.COVARIANCE_ORDER."""
+    """By how much the calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
 
 
 def lens_doubt(
@@ -70,14 +69,10 @@ def lens_doubt(
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
-    shift = np.r_[
-        step_between(hand_eye.gripper_from_camera, freed.bundle.gripper_from_camera),
-        np.log(freed.scale / hand_eye.scale),
-    ]
     return LensDoubt(
         f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
         "(null) to have them estimated",
-        shift,
+        freed.by_intrinsics,
     )
 
 

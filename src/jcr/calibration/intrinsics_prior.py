@@ -33,6 +33,18 @@ ESTIMATED = {
     "p2": 3e-3,
 }
 """Of a cheap camera that nobody calibrated, about what the reconstruction found."""
+FROM_FEATURES = {
+    "f": 1.5e-3,
+    "aspect": 2e-4,
+    "cx": 2e-3,
+    "cy": 2e-3,
+    "k1": 0.003,
+    "k2": 0.003,
+    "p1": 5e-4,
+    "p2": 5e-4,
+}
+"""By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
+from other features of the same pictures differ by the square root of two times that (docs/results/real.md)."""
 LEAST = 1e-12
 """A standard deviation below it leaves a parameter as it is."""
 
@@ -65,6 +77,15 @@ def prior_of(
         for parameter, unit in moves.get(name, {name: 1.0}).items():
             directions[PARAMETERS.index(parameter), column] = unit
     return IntrinsicsPrior(directions, np.array(list(std.values())))
+
+
+def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c c"]:
+    """Covariance, in the directions of the prior, by which what images show is off; no more than the prior's own."""
+    features = prior_of(intrinsics, FROM_FEATURES)
+    spread = (features.directions * features.std**2) @ features.directions.T
+    to_prior = np.linalg.pinv(prior.directions)
+    information = np.linalg.inv(to_prior @ spread @ to_prior.T + LEAST * np.diag(prior.std**2))
+    return np.linalg.inv(information + np.diag(prior.std**-2.0))
 
 
 HELD = IntrinsicsPrior(np.zeros((len(PARAMETERS), 0)), np.zeros(0))

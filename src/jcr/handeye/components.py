@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.optimize import root_scalar
 from scipy.stats import chi2
 
@@ -36,13 +36,16 @@ GIVEN_SHARE = 0.3
 RATIO_STD = np.log(4.0)
 """Of log(σ_t / (REACH · σ_r)) over robots. Tied more closely, by a factor of 2, three images of a robot whose rotations
 are six times better than its positions cover 80 to 90 %."""
-LEVELS, FARTHEST = (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0), 18.0
-"""Standard deviations of the log sizes at which the posterior is evaluated, up to this squared distance from the
-mode. Rare errors come from rare sizes: up to a squared distance of 7, three images covered 81 % instead of 95 %, and two
-of 120 images that had not moved were called moved at p < 0.001."""
-FEW_LEVELS = (-3.2, -1.6, 0.0, 1.6, 3.2)
+LEVELS = tuple(1.5 * np.arange(-4, 5))
+"""Standard deviations of the log sizes at which the posterior is evaluated; for a normal one, the error of so coarse a
+sum is 3e-4."""
+FARTHEST, LESS_FAR = 21.0, 10.0
+"""Squared distance from the mode up to which. Rare errors come from rare sizes: up to 7, three images covered 81 %
+instead of 95 %, and two of 120 images that had not moved were called moved at p < 0.001."""
 MANY, TOO_MANY = 15, 80
-"""Poses from which the sizes are known well enough for fewer levels, and for the mode alone."""
+"""Poses from which the sizes are known well enough to go less far, and for the mode alone."""
+AT_ONCE = 4e6
+"""Numbers of one array of the solutions that are found together."""
 POSES = 13
 """Unknowns of equation.py; what follows them are intrinsics."""
 COVERED = 0.99
@@ -52,7 +55,8 @@ JITTER = (0.0, 1e-14, 1e-12, 1e-10)
 SETTLED = 1e-4
 """Change of log sizes that no longer matters."""
 
-LogSizes = Float[ndarray, " c"]
+LogSizes = Float[ndarray, "*k c"]
+"""Of σ_t, σ_r and, where there is a systematic part, σ_s."""
 
 
 @dataclass(frozen=True)
@@ -94,16 +98,16 @@ class Equations:
         """1 for residuals of position, 0 for those of rotation."""
         return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
 
-    def variances(self, log_sizes: LogSizes) -> Float[ndarray, " c"]:
+    def variances(self, log_sizes: LogSizes) -> Float[ndarray, "*k c"]:
         """σ_t², σ_r², σ_s²."""
         variances = np.exp(2 * log_sizes)
-        variances[:2] += self.least**2
+        variances[..., :2] += self.least**2
         return variances
 
-    def random(self, log_sizes: LogSizes) -> Float[ndarray, " s"]:
+    def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
         """Variance of each residual's random part."""
-        translation, rotation = self.variances(log_sizes)[:2]
-        return translation * self.of_position + rotation * (1 - self.of_position)
+        variances = self.variances(log_sizes)
+        return variances[..., :1] * self.of_position + variances[..., 1:2] * (1 - self.of_position)
 
     def systematic_left(self, log_sizes: LogSizes) -> tuple[float, float]:
         """Root mean square per axis (m, rad) of the systematic part of the residuals."""
@@ -113,32 +117,42 @@ class Equations:
         metres, radians = np.sqrt(variance)
         return float(metres), float(radians)
 
-    def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "s s"]:
+    def covariance(self, log_sizes: LogSizes) -> Float[ndarray, "*k s s"]:
         """V of the residuals."""
-        covariance = np.diag(self.random(log_sizes))
+        random = self.random(log_sizes)
+        covariance = np.zeros((*random.shape, random.shape[-1]))
         if self.systematic is not None:
-            covariance += self.variances(log_sizes)[2] * self.systematic
-        return covariance if self.known is None else covariance + self.known
+            covariance += self.variances(log_sizes)[..., 2, None, None] * self.systematic
+        if self.known is not None:
+            covariance += self.known
+        diagonal = np.arange(random.shape[-1])
+        covariance[..., diagonal, diagonal] += random
+        return covariance
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The unknowns at one value of the sizes."""
+    """The unknowns at one value of the sizes, or at k values."""
 
-    log_posterior: float
+    log_posterior: Float[ndarray, "*k"]
     """Of the sizes, up to a constant."""
-    step: Float[ndarray, " p"]
-    root: Float[ndarray, "s s"]
+    step: Float[ndarray, "*k p"]
+    root: Float[ndarray, "*k s s"]
     """Lower Cholesky factor of V."""
-    information_root: Float[ndarray, "p p"]
+    information_root: Float[ndarray, "*k p p"]
     """Lower Cholesky factor of JᵀV⁻¹J + prior."""
-    gain: Float[ndarray, "p s"]
-    """By which errors of the residuals pass into the unknowns, with the sign turned: C JᵀV⁻¹."""
+    weighed: Float[ndarray, "*k s p"]
+    """V⁻¹J."""
 
     @property
-    def covariance(self) -> Float[ndarray, "p p"]:
+    def gain(self) -> Float[ndarray, "*k p s"]:
+        """By which errors of the residuals pass into the unknowns, with the sign turned: C JᵀV⁻¹."""
+        return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
+
+    @property
+    def covariance(self) -> Float[ndarray, "*k p p"]:
         """C of the unknowns."""
-        return cho_solve((self.information_root, True), np.eye(len(self.step)))
+        return over(self.information_root, np.eye(self.step.shape[-1]))
 
 
 @dataclass(frozen=True)
@@ -157,31 +171,53 @@ def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
     """Generalised least squares at given sizes."""
     root = _cholesky(equations.covariance(log_sizes))
     both = np.column_stack([equations.jacobian, equations.residual])
-    whitened = solve_triangular(root, both, lower=True, check_finite=False)
-    jacobian, residual = whitened[:, :-1], whitened[:, -1]
-    information_root = _cholesky(jacobian.T @ jacobian + equations.prior_information)
-    gradient = jacobian.T @ residual + equations.prior_gradient
-    step = -cho_solve((information_root, True), gradient, check_finite=False)
-    likelihood = (
-        -np.log(np.diag(root)).sum()
-        - np.log(np.diag(information_root)).sum()
-        - (residual @ residual + gradient @ step) / 2
+    whitened = lower(root, both)
+    jacobian, residual = whitened[..., :-1], whitened[..., -1:]
+    transposed = np.swapaxes(jacobian, -1, -2)
+    information_root = _cholesky(transposed @ jacobian + equations.prior_information)
+    gradient = transposed @ residual + equations.prior_gradient[:, None]
+    step = -over(information_root, gradient)
+    squares = (residual**2).sum((-1, -2)) + (gradient * step).sum((-1, -2))
+    log_likelihood = -_log_diagonal(root) - _log_diagonal(information_root) - squares / 2
+    weighed = upper(root, jacobian)
+    return Solution(
+        log_likelihood + _log_prior(equations, log_sizes), step[..., 0], root, information_root, weighed
     )
-    weighed = solve_triangular(root, jacobian, lower=True, trans=1, check_finite=False)
-    gain = cho_solve((information_root, True), weighed.T, check_finite=False)
-    prior = _prior(equations, log_sizes)[0]
-    return Solution(float(likelihood) + prior, step, root, information_root, gain)
 
 
-def _cholesky(matrix: Float[ndarray, "k k"]) -> Float[ndarray, "k k"]:
+def _log_diagonal(root: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k"]:
+    return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
+
+
+def lower(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+    """L⁻¹ of a lower triangular factor L, times a matrix."""
+    if root.ndim == 2 and right.ndim == 2:
+        return solve_triangular(root, right, lower=True, check_finite=False)
+    return np.linalg.solve(root, right)
+
+
+def upper(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+    """L⁻ᵀ of a lower triangular factor L, times a matrix."""
+    if root.ndim == 2 and right.ndim == 2:
+        return solve_triangular(root, right, lower=True, trans=1, check_finite=False)
+    return np.linalg.solve(np.swapaxes(root, -1, -2), right)
+
+
+def over(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+    """(L Lᵀ)⁻¹ of a lower triangular factor L, times a matrix."""
+    return upper(root, lower(root, right))
+
+
+def _cholesky(matrix: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k n n"]:
     """Lower factor of a matrix that is positive definite but for rounding: of motions that show nothing it is not."""
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix / size[:, None] / size
+    size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
+    scaled = matrix / size[..., :, None] / size[..., None, :]
     for rounding in JITTER:
         try:
-            return size[:, None] * np.linalg.cholesky(scaled + rounding * np.eye(len(matrix)))
+            return size[..., None] * np.linalg.cholesky(scaled + rounding * np.eye(matrix.shape[-1]))
         except np.linalg.LinAlgError:
-            continue
+            if matrix.ndim > 2:
+                return np.array([_cholesky(each) for each in matrix])
     values, vectors = np.linalg.eigh(scaled)
     r = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, JITTER[-1]))).T, mode="r"))
     return size[:, None] * (r.T * np.sign(np.diag(r)))
@@ -212,14 +248,12 @@ def posterior(
     equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"], region: Region | None
 ) -> Posterior:
     """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
-    weight, sizes, solutions = over_sizes(equations, log_sizes, information)
-    steps = np.array([solution.step for solution in solutions])
-    each = np.array(
-        [
-            solution.covariance + _elsewhere(equations, solution, at, region)
-            for at, solution in zip(sizes, solutions, strict=True)
-        ]
-    )
+    weight, steps, each = [], [], []
+    for share, sizes, solution in over_sizes(equations, log_sizes, information):
+        weight.append(share)
+        steps.append(solution.step)
+        each.append(solution.covariance + _elsewhere(equations, solution, sizes, region))
+    weight, steps, each = (np.concatenate(parts) for parts in (weight, steps, each))
     step = weight @ steps
     off = steps - step
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
@@ -229,32 +263,40 @@ def posterior(
 
 def over_sizes(
     equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"]
-) -> tuple[Float[ndarray, " k"], list[LogSizes], list[Solution]]:
-    """Posterior weights (their sum is 1) of log sizes about their mode, and the solution at each."""
-    weights, sizes, solutions = [], [], []
-    for at, log_volume in _grid(equations, log_sizes, information):
-        solutions.append(solve(equations, at))
-        sizes.append(at)
-        weights.append(solutions[-1].log_posterior + log_volume)
-    weight = np.exp(np.array(weights) - max(weights))
-    return weight / weight.sum(), sizes, solutions
+) -> list[tuple[Float[ndarray, " k"], LogSizes, Solution]]:
+    """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
+    sizes, log_volumes = _grid(equations, log_sizes, information)
+    together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
+    groups = [sizes[at : at + together] for at in range(0, len(sizes), together)]
+    solutions = [solve(equations, group) for group in groups]
+    log_weight = np.concatenate([solution.log_posterior for solution in solutions]) + log_volumes
+    weight = np.exp(log_weight - log_weight.max())
+    shares = np.split(weight / weight.sum(), np.cumsum([len(group) for group in groups])[:-1])
+    return list(zip(shares, groups, solutions, strict=True))
 
 
-def _prior(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Float[ndarray, "c c"]]:
-    """Log density, gradient and negative Hessian of the weak priors of the sizes."""
-    std = FACTOR_STD[: len(log_sizes)]
+def _log_prior(equations: Equations, log_sizes: LogSizes) -> Float[ndarray, "*k"]:
+    """Log density of the weak priors of the sizes."""
+    z = (log_sizes - np.log(equations.typical)) / FACTOR_STD[: equations.count]
+    ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
+    return -((z**2).sum(-1) + ratio**2) / 2
+
+
+def _prior_slope(equations: Equations, log_sizes: LogSizes) -> tuple[LogSizes, Float[ndarray, "c c"]]:
+    """Its gradient and negative Hessian."""
+    std = FACTOR_STD[: equations.count]
     z = (log_sizes - np.log(equations.typical)) / std
     ratio = (log_sizes[0] - log_sizes[1] - np.log(REACH)) / RATIO_STD
-    apart = np.zeros(len(log_sizes))
+    apart = np.zeros(equations.count)
     apart[:2] = 1 / RATIO_STD, -1 / RATIO_STD
-    return -float(z @ z + ratio**2) / 2, -z / std - ratio * apart, np.diag(std**-2.0) + np.outer(apart, apart)
+    return -z / std - ratio * apart, np.diag(std**-2.0) + np.outer(apart, apart)
 
 
 def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Float[ndarray, "c c"]]:
     """Log posterior of the sizes, its gradient, and the expected information."""
     solution = solve(equations, log_sizes)
-    inverse = cho_solve((solution.root, True), np.eye(len(equations.residual)), check_finite=False)
-    projection = inverse - inverse @ equations.jacobian @ solution.gain
+    inverse = over(solution.root, np.eye(len(equations.residual)))
+    projection = inverse - solution.weighed @ solution.gain
     left = inverse @ (equations.residual + equations.jacobian @ solution.step)
     masks = (equations.of_position, 1 - equations.of_position)
     products = [projection * mask for mask in masks]
@@ -264,10 +306,10 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
         squares.append(left @ equations.systematic @ left)
     growth = np.exp(2 * log_sizes)
     traces = np.array([np.trace(product) for product in products])
-    _, gradient, information = _prior(equations, log_sizes)
+    gradient, information = _prior_slope(equations, log_sizes)
     pairs = np.array([[(one * other.T).sum() for other in products] for one in products])
     return (
-        solution.log_posterior,
+        float(solution.log_posterior),
         gradient + growth * (np.array(squares) - traces),
         information + 2 * np.outer(growth, growth) * pairs,
     )
@@ -275,7 +317,7 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
 
 def _grid(
     equations: Equations, mode: LogSizes, information: Float[ndarray, "c c"]
-) -> list[tuple[LogSizes, float]]:
+) -> tuple[Float[ndarray, "k c"], Float[ndarray, " k"]]:
     """Log sizes about their mode, and the log of the volume that each stands for.
 
     Along each axis of the information, either way, in steps of the standard deviation that the posterior has there,
@@ -283,44 +325,39 @@ def _grid(
     """
     poses = len(equations.residual) // 6
     if poses > TOO_MANY:
-        return [(mode, 0.0)]
+        return mode[None], np.zeros(1)
     values, vectors = np.linalg.eigh(information)
     axes = vectors / np.sqrt(values)
     top, probe = solve(equations, mode).log_posterior, 1.5
-    stretch = np.ones((len(mode), 2))
-    for k, axis in enumerate(axes.T):
-        for side, sign in enumerate((-1, 1)):
-            drop = top - solve(equations, mode + sign * probe * axis).log_posterior
-            stretch[k, side] = np.clip(probe / np.sqrt(max(2 * drop, 1e-3)), 0.3, 3.0)
-    levels = LEVELS if poses < MANY else FEW_LEVELS
-    grid = []
-    for z in product(levels, repeat=len(mode)):
-        if np.dot(z, z) > FARTHEST:
-            continue
-        lengths = np.where(np.array(z) < 0, *stretch.T)
-        grid.append((mode + axes @ (lengths * z), float(np.log(lengths).sum())))
-    return grid
+    beside = mode + probe * np.concatenate([-axes.T, axes.T])
+    drop = top - np.array([solve(equations, at).log_posterior for at in beside])
+    shorter, longer = np.clip(probe / np.sqrt(np.maximum(2 * drop, 1e-3)), 0.3, 3.0).reshape(2, -1)
+    z = np.array(list(product(LEVELS, repeat=len(mode))))
+    z = z[(z**2).sum(1) < (FARTHEST if poses < MANY else LESS_FAR)]
+    lengths = np.where(z < 0, shorter, longer)
+    return mode + (lengths * z) @ axes.T, np.log(lengths).sum(1)
 
 
 def _elsewhere(
     equations: Equations, solution: Solution, log_sizes: LogSizes, region: Region | None
-) -> Float[ndarray, "p p"]:
+) -> Float[ndarray, "*k p p"]:
     """Covariance of what the systematic part leaves open because the answer is asked for the region, not its poses."""
     if region is None or equations.systematic is None:
         return np.zeros_like(solution.information_root)
-    part = equations.variances(log_sizes)[2] * equations.systematic
-    left = equations.residual + equations.jacobian @ solution.step
-    expected = part @ cho_solve((solution.root, True), left, check_finite=False)
-    shown = solve_triangular(solution.root, part, lower=True, check_finite=False)
-    fitted = equations.jacobian.T @ cho_solve((solution.root, True), part, check_finite=False)
-    fitted = solve_triangular(solution.information_root, fitted, lower=True, check_finite=False)
-    m = len(left) // 6
+    part = equations.variances(log_sizes)[..., 2, None, None] * equations.systematic
+    left = equations.residual[:, None] + equations.jacobian @ solution.step[..., None]
+    expected = part @ over(solution.root, left)
+    shown = lower(solution.root, part)
+    fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ part)
+    m = len(equations.residual) // 6
     blocks = np.arange(m)
-    own = part.reshape(m, 6, m, 6)[blocks, :, blocks]
-    own = own - np.einsum("kma,kmb->mab", shown.reshape(-1, m, 6), shown.reshape(-1, m, 6))
-    own = own + np.einsum("kma,kmb->mab", fitted.reshape(-1, m, 6), fitted.reshape(-1, m, 6))
-    expected = expected.reshape(m, 6)
-    return region.spread(own + expected[:, :, None] * expected[:, None])
+    own = part.reshape(*part.shape[:-2], m, 6, m, 6)[..., blocks, :, blocks, :]
+    own = np.moveaxis(own, 0, -3)
+    for sign, root in ((-1, shown), (1, fitted)):
+        columns = np.moveaxis(root.reshape(*root.shape[:-1], m, 6), -2, -3)
+        own = own + sign * np.swapaxes(columns, -1, -2) @ columns
+    expected = expected.reshape(*expected.shape[:-2], m, 6)
+    return region.spread(own + expected[..., :, None] * expected[..., None, :])
 
 
 def _widening(

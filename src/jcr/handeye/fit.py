@@ -111,7 +111,7 @@ def fit_poses(
         step = solution.step * min(
             1.0, LARGEST_TURN / max(np.abs(solution.step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300)
         )
-        settled = float(((solution.information_root.T @ step) ** 2).sum()) < 1e-14
+        settled = float(((solution.information_root.T @ step) ** 2).sum()) < (1e-14 if averaged else 1e-6)
         unknowns = _moved(*unknowns, step)
         if settled:
             break
@@ -241,7 +241,7 @@ def left_out(
     sigma, m = np.repeat(noise, 3), len(equations.residual) // 6
     weight = cho_solve((solution.root, True), np.eye(6 * m))
     left = weight @ (equations.residual + equations.jacobian @ solution.step)
-    projection = weight - weight @ equations.jacobian @ solution.gain
+    projection = weight - solution.weighed @ solution.gain
     own = projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
     without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
     missed = sigma * np.einsum("mij,mj->mi", without, sigma * left.reshape(m, 6))

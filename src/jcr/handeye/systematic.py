@@ -10,6 +10,7 @@ what is left of e after that fit, A = (JᵀWJ)⁻¹JᵀW.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -99,21 +100,26 @@ class Region:
         keep = np.eye(len(self.by_unknown)) - self.by_unknown @ self.fit
         return keep @ systematic @ keep.T
 
-    def spread(self, second_moment: Float[ndarray, "m 6 6"]) -> Float[ndarray, "p p"]:
+    def spread(self, second_moment: Float[ndarray, "*k m 6 6"]) -> Float[ndarray, "*k p p"]:
         """Covariance (p,p) of the unknowns for other poses of the same region, from E[e'e'ᵀ] of each of m used poses.
 
         The poses of the capture are a sample of the region: a regression on them differs from one on the region by
         what their residuals tell, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
         1985, "HC3").
         """
-        m = len(second_moment)
+        own, m = self._corrected, second_moment.shape[-3]
+        spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
+        out = np.zeros((*spread.shape[:-2], self.unknowns, self.unknowns))
+        rows = np.delete(np.arange(13), SCALE)
+        out[..., rows[:, None], rows] = spread
+        return out
+
+    @cached_property
+    def _corrected(self) -> Float[ndarray, "m 12 6"]:
+        """By which each pose's residuals pass into the unknowns, as if its own leverage were none."""
+        m = len(self.by_unknown) // 6
         own = self.fit.reshape(12, m, 6).swapaxes(0, 1)
         leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, 12) @ own) / EFFECTIVE_WEIGHT
         values, vectors = np.linalg.eigh((leverage + leverage.swapaxes(1, 2)) / 2)
         vectors = vectors / EFFECTIVE_WEIGHT[:, None]
-        corrected = vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors)
-        own = own @ corrected
-        out = np.zeros((self.unknowns, self.unknowns))
-        rows = np.delete(np.arange(13), SCALE)
-        out[np.ix_(rows, rows)] = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(0)
-        return out
+        return own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))
