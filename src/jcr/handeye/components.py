@@ -57,6 +57,7 @@ SETTLED = 1e-4
 
 LogSizes = Float[ndarray, "*k c"]
 """Of σ_t, σ_r and, where there is a systematic part, σ_s."""
+Each = Float[ndarray, "*k"] | np.floating
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Equations:
 class Solution:
     """The unknowns at one value of the sizes, or at k values."""
 
-    log_posterior: Float[ndarray, "*k"]
+    log_posterior: Each
     """Of the sizes, up to a constant."""
     step: Float[ndarray, "*k p"]
     root: Float[ndarray, "*k s s"]
@@ -185,25 +186,25 @@ def solve(equations: Equations, log_sizes: LogSizes) -> Solution:
     )
 
 
-def _log_diagonal(root: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k"]:
+def _log_diagonal(root: Float[ndarray, "*k n n"]) -> Each:
     return np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
 
 
-def lower(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+def lower(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:
     """L⁻¹ of a lower triangular factor L, times a matrix."""
     if root.ndim == 2 and right.ndim == 2:
         return solve_triangular(root, right, lower=True, check_finite=False)
     return np.linalg.solve(root, right)
 
 
-def upper(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+def upper(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:
     """L⁻ᵀ of a lower triangular factor L, times a matrix."""
     if root.ndim == 2 and right.ndim == 2:
         return solve_triangular(root, right, lower=True, trans=1, check_finite=False)
     return np.linalg.solve(np.swapaxes(root, -1, -2), right)
 
 
-def over(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*k n r"]) -> Float[ndarray, "*k n r"]:
+def over(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:
     """(L Lᵀ)⁻¹ of a lower triangular factor L, times a matrix."""
     return upper(root, lower(root, right))
 
@@ -263,7 +264,7 @@ def posterior(
 
 def over_sizes(
     equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"]
-) -> list[tuple[Float[ndarray, " k"], LogSizes, Solution]]:
+) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]:
     """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
     sizes, log_volumes = _grid(equations, log_sizes, information)
     together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
@@ -275,7 +276,7 @@ def over_sizes(
     return list(zip(shares, groups, solutions, strict=True))
 
 
-def _log_prior(equations: Equations, log_sizes: LogSizes) -> Float[ndarray, "*k"]:
+def _log_prior(equations: Equations, log_sizes: LogSizes) -> Each:
     """Log density of the weak priors of the sizes."""
     z = (log_sizes - np.log(equations.typical)) / FACTOR_STD[: equations.count]
     ratio = (log_sizes[..., 0] - log_sizes[..., 1] - np.log(REACH)) / RATIO_STD
