@@ -74,8 +74,6 @@ class Adjusted:
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
     budget: Budget
     """Parts of it."""
-    by_intrinsics: Float[ndarray, "7"]
-    """How far the answer is from the one with the intrinsics where they started; in records.COVARIANCE_ORDER."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) of the random errors of gripper poses."""
     systematic: float
@@ -202,7 +200,6 @@ def adjust(
     by_intrinsics = _by_intrinsics(found.covariance)
     off = off_by(free, intrinsics)
     more = by_intrinsics @ off @ by_intrinsics.T
-    held = by_intrinsics @ _lens_step(bundle, problem)
     bundle, scale, base_from_recon = _settled(bundle, found.step, tracks.points_in_recon[kept])
     return Adjusted(
         bundle,
@@ -210,7 +207,6 @@ def adjust(
         base_from_recon,
         found.covariance[:7, :7] + more,
         replace(found.budget, intrinsics=found.budget.intrinsics + more),
-        held,
         (sigma_t, sigma_r),
         sigma_s,
         equations.systematic_left(log_sizes),

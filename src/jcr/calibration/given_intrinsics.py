@@ -12,8 +12,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
-from jcr.calibration.intrinsics_prior import ESTIMATED, prior_of
+from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
+from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
@@ -56,23 +57,20 @@ def lens_doubt(
     if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
-    freed = adjust(
-        base_from_gripper,
-        start,
-        recon_from_camera,
-        held,
-        tracks,
-        noise,
-        prior_of(held, ESTIMATED),
-        systematic,
-    )
+
+    def adjusted_with(free: IntrinsicsPrior) -> Adjusted:
+        return adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, free, systematic)
+
+    freed = adjusted_with(prior_of(held, ESTIMATED))
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
+    as_given = adjusted_with(HELD)
+    shift = step_between(as_given.bundle.gripper_from_camera, freed.bundle.gripper_from_camera)
     return LensDoubt(
         f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
         "(null) to have them estimated",
-        freed.by_intrinsics,
+        np.append(shift, np.log(freed.scale / as_given.scale)),
     )
 
 
