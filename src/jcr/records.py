@@ -207,6 +207,17 @@ class RobotNoise:
 
 
 @dataclass(frozen=True)
+class JointOffsets:
+    """By how much each joint of the arm seems off."""
+
+    offset: Float[ndarray, " dof"]
+    """rad: true angle less the reported one."""
+    std: Float[ndarray, " dof"]
+    prior_std: float
+    """rad: of any joint, before its own poses are asked."""
+
+
+@dataclass(frozen=True)
 class Budget:
     """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
 
@@ -282,6 +293,13 @@ class HandEye:
     and in the covariance. None where nothing speaks against the lens."""
     refinement: "Refinement | None" = None
     """None where camera poses alone decided."""
+    systematic_p: float | None = None
+    """Chance of residuals like these where the robot's errors are random alone."""
+    joint_offsets: JointOffsets | None = None
+    """None where the arm is not known."""
+    angle_ratio: tuple[float, float] | None = None
+    """Rotation angles between cameras over those between grippers, 1 whatever gripper_from_camera is, and its standard
+    deviation."""
     budget: Budget | None = None
     """Of the covariance, without what `lens_shift` adds to it."""
     excitation: Excitation | None = None

@@ -19,12 +19,13 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.fit import Cues, exceeds
+from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import excitation
-from jcr.handeye.residuals import paper_residuals
-from jcr.handeye.robots import Arm
+from jcr.handeye.residuals import angle_ratio, paper_residuals
+from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.solve import judged, solve_hand_eye
-from jcr.handeye.systematic import systematic_errors
+from jcr.handeye.systematic import arm_errors, posed, systematic_errors
 from jcr.records import (
     Capture,
     HandEye,
@@ -43,6 +44,8 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+MIN_EXAMINED = 4
+"""Images from which something may be said of the robot's own errors."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
@@ -59,9 +62,19 @@ def calibrate(
     its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
-    systematic, unused = _systematic(capture, options := options or CalibrateOptions())
+    systematic, posed_arm, unused = _systematic(capture, options := options or CalibrateOptions())
     systematic = _of_poses(systematic, reconstruction.image_index)
     hand_eye = _calibrated(capture, reconstruction, options, systematic)
+    if posed_arm is not None:
+        arm, joints = posed_arm
+        posed_arm = arm, joints[reconstruction.image_index]
+    hand_eye = _robot_examined(
+        hand_eye,
+        capture.base_from_gripper[reconstruction.image_index],
+        reconstruction.recon_from_camera,
+        systematic,
+        posed_arm,
+    )
     if unused is not None:
         hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, unused))
     # A unit that somebody vouches for was used for the scale, and is no check of it.
@@ -256,8 +269,35 @@ def is_one(hand_eye: HandEye) -> bool:
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
 
 
-def _systematic(capture: Capture, options: CalibrateOptions) -> tuple[Float[ndarray, "r r"], str | None]:
-    """Covariance of the systematic errors of the capture's gripper poses, and why its arm is not used.
+def _robot_examined(
+    hand_eye: HandEye,
+    gripper: Float[ndarray, "m 4 4"],
+    camera: Float[ndarray, "m 4 4"],
+    systematic: Float[ndarray, "r r"],
+    posed_arm: tuple[Arm, Joints] | None,
+) -> HandEye:
+    """With what the used poses tell of the robot itself."""
+    used = np.flatnonzero(hand_eye.inliers)
+    if len(used) < MIN_EXAMINED or not hand_eye.observability.observable:
+        return hand_eye
+    before = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
+    of_used = before, gripper[used], camera[used], _of_poses(systematic, used)
+    hand_eye = replace(
+        hand_eye,
+        systematic_p=systematic_p_value(*of_used),
+        angle_ratio=angle_ratio(gripper[used], camera[used]),
+    )
+    if posed_arm is None:
+        return hand_eye
+    arm, joints = posed_arm
+    return replace(hand_eye, joint_offsets=joint_offsets(*of_used, arm, joints[used]))
+
+
+def _systematic(
+    capture: Capture, options: CalibrateOptions
+) -> tuple[Float[ndarray, "r r"], tuple[Arm, Joints] | None, str | None]:
+    """Covariance of the systematic errors of the capture's gripper poses, the arm with its tool and joint angles, and
+    why an arm is not used.
 
     InputError where the poses are not those of the arm that the user named; what a capture says of itself is only
     doubted.
@@ -265,11 +305,14 @@ def _systematic(capture: Capture, options: CalibrateOptions) -> tuple[Float[ndar
     gripper = capture.base_from_gripper
     try:
         arm = _arm(capture, options)
-        return systematic_errors(gripper, arm, None if arm is None else capture.joints), None
+        if arm is None:
+            return systematic_errors(gripper), None, None
+        posed_arm = posed(arm, capture.joints, gripper)
+        return arm_errors(*posed_arm), posed_arm, None
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None
-        return systematic_errors(gripper), f"the capture's robot is not used: {error}"
+        return systematic_errors(gripper), None, f"the capture's robot is not used: {error}"
 
 
 def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:

@@ -262,6 +262,11 @@ def posterior(
     return Posterior(step, covariance, _budget(equations, log_sizes, region, covariance), log_sizes)
 
 
+def restricted_log_likelihood(equations: Equations, log_sizes: LogSizes) -> float:
+    """Of the sizes, without their prior; up to a constant that all sizes and all models of these residuals share."""
+    return float(solve(equations, log_sizes).log_posterior - _log_prior(equations, log_sizes))
+
+
 def over_sizes(
     equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"]
 ) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]:

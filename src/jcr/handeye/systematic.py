@@ -43,10 +43,18 @@ def systematic_errors(
     """
     if arm is None:
         return smooth_errors(base_from_gripper)
+    return arm_errors(*posed(arm, joints, base_from_gripper))
+
+
+def posed(arm: Arm, joints: Joints | None, base_from_gripper: Poses) -> tuple[Arm, Joints]:
+    """The arm with the tool that it carries, and its joint angles at the poses.
+
+    InputError where poses, joints and arm do not fit.
+    """
     if joints is not None:
-        return arm_errors(mounted_arm(arm, joints, base_from_gripper), joints)
+        return mounted_arm(arm, joints, base_from_gripper), joints
     posture = required_posture(arm, base_from_gripper)
-    return arm_errors(with_tool(arm, posture.flange_from_tool), posture.joints)
+    return with_tool(arm, posture.flange_from_tool), posture.joints
 
 
 def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
