@@ -198,7 +198,9 @@ def easy_handeye2(mount: CameraMount, name: str) -> str:
     return _yaml(mount, content, flow=False)
 
 
-def joint_offsets(offset_and_std_deg: Sequence[tuple[float, float]], p: float | None) -> str:
+def joint_offsets(
+    offset_and_std_deg: Sequence[tuple[float, float]], p: float | None, doubt: str | None = None
+) -> str:
     """YAML of what to add to each reported joint angle (rad), with its standard deviation, from the base on.
 
     `p` is the chance of the residuals without any systematic error.
@@ -211,6 +213,8 @@ def joint_offsets(offset_and_std_deg: Sequence[tuple[float, float]], p: float | 
     about = (
         "true joint angle = reported + offset; what no pose shows keeps the standard deviation of any joint"
     )
+    if doubt is not None:
+        about += f"\n# NOT TO BE TRUSTED: {doubt}"
     return f"# {about}\n{yaml.safe_dump(content, sort_keys=False)}"
 
 
