@@ -235,9 +235,8 @@ def _joint_offsets(run: Run, path: Path) -> None:
         raise InputError(
             f"{run.arguments.out}: no joint offsets were estimated; name the arm (--robot, or robot in capture.json)"
         )
-    write_text(
-        path, ros.joint_offsets([(joint.offset_deg, joint.std_deg) for joint in errors.joints], errors.p)
-    )
+    offsets = [(joint.offset_deg, joint.std_deg) for joint in errors.joints]
+    write_text(path, ros.joint_offsets(offsets, errors.p, run.doubt))
 
 
 def _ply(run: Run, path: Path) -> None:

@@ -13,9 +13,9 @@ from jcr.cli.output import Output
 class Arguments:
     """The error in task space: points touched with a calibrated tip, against the same points of the map.
 
-    OUT is the folder of a run, POINTS a CSV with a line per point: image, x_px, y_px (the pixel of an image of the run that
-    shows the point) and x_m, y_m, z_m (the tip in the base frame as it touches it). Three points or more, spread over
-    the scene; corners and printed marks are best. Exit status 3 when the errors are more than the reported
+    OUT is the folder of a run, POINTS a CSV with a line per point: image, x_px, y_px (the pixel of an image of the run
+    that shows the point) and x_m, y_m, z_m (the tip in the base frame as it touches it). Three points or more, spread
+    over the scene; corners and printed marks are best. Exit status 3 when the errors are more than the reported
     uncertainty explains.
 
     examples:
