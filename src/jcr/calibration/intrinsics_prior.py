@@ -34,12 +34,12 @@ ESTIMATED = {
 }
 """Of a cheap camera that nobody calibrated, about what the reconstruction found."""
 FROM_FEATURES = {
-    "f": 1.5e-3,
+    "f": 2e-3,
     "aspect": 2e-4,
-    "cx": 2e-3,
-    "cy": 2e-3,
-    "k1": 0.003,
-    "k2": 0.003,
+    "cx": 3e-3,
+    "cy": 3e-3,
+    "k1": 0.005,
+    "k2": 0.005,
     "p1": 5e-4,
     "p2": 5e-4,
 }
