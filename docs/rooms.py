@@ -10,11 +10,10 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("cli/", "one module a command, imported when it is asked for", 1),),
     (("view/", "a run in the browser", 1),),
     (("batch.py", "many captures", 1), ("verify.py", "has the camera moved?", 1)),
-    (("pipeline.py", "the stages in order, each timed", 1),),
+    (("live/", "take a capture", 1), ("pipeline.py", "the stages in order, each timed", 2)),
     (("mapping.py", "the map stage", 1), ("report/", "the page a person reads", 1)),
     (
         ("check.py", "judge a capture", 1),
-        ("live/", "take a capture", 1),
         ("attempts.py", "choose a back end", 1),
         ("run_folder.py", "files and state", 1),
         ("results.py", "options, result", 1),

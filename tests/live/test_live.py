@@ -24,6 +24,7 @@ from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
 from jcr.live.line_server import MAX_LINE, Listen, bound, served_poses
 from jcr.live.look import picture
+from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
 from jcr.simulate.ur import SimulatedUr
 from places import ROOT
@@ -57,9 +58,13 @@ def video(path: Path, tabletop: Path, images: range, rest_s: int = 1) -> Path:
 
 def taken(folder: Path, camera: Path, asks: Iterator[Ask], **options) -> list[dict]:
     answers: list[dict] = []
-    with opened(str(camera)) as frames:
+    with opened(str(camera)) as opened_camera:
         collect(
-            LiveFolder(folder), frames, asks, CollectOptions(**options), lambda a, lines: answers.append(a)
+            LiveFolder(folder),
+            opened_camera,
+            asks,
+            CollectOptions(**options),
+            lambda a, lines: answers.append(a),
         )
     return answers
 
@@ -97,7 +102,8 @@ def test_each_pose_gets_the_picture_that_was_still_there_and_a_stopped_capture_g
         assert np.allclose(capture.base_from_gripper[k], pose[k])
         assert (capture.folder / LiveFolder.thumbnail(name)).is_file()
     page = (tmp_path / "c" / "live.html").read_text()
-    assert "5 pictures of 5" in page and page.count("<img") == 5 and "best next" in page
+    assert "5 pictures of 5" in page and page.count('<img src="thumbnails/') == 5 and "Next pose" in page
+    assert (tmp_path / "c" / "live" / "now.jpg").is_file()
 
 
 def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_told(tmp_path: Path, tabletop: Path):
@@ -226,11 +232,13 @@ def test_silence_ends_the_wait():
 @pytest.mark.parametrize("length", [812, 1060, 1220])
 def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
     goals = np.array(poses(tabletop)[:3])
-    with SimulatedUr(goals, length) as robot:
-        asks = ur.ur_poses("127.0.0.1", robot.port, lambda text: None)
-        for goal in goals:
+    angles = np.linspace(-1, 1, 18).reshape(3, 6)
+    with SimulatedUr(goals, length, angles) as robot:
+        asks = asks_at_rest(lambda: ur.states("127.0.0.1", robot.port))
+        for goal, joints in zip(goals, angles, strict=True):
             ask = next(asks)
             assert np.allclose(ask.base_from_gripper, goal, atol=1e-9)
+            assert ask.joints is not None and np.allclose(ask.joints, joints)
             ask.answer({"accepted": True})
         assert ask.current is not None and np.allclose(ask.current(), goals[2], atol=1e-9)
 
