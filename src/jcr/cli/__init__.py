@@ -19,6 +19,7 @@ from types import ModuleType
 from jcr.errors import InputError, NotTrustedError
 
 COMMANDS = {
+    "board": "a calibration board to print, for those who want one",
     "capture": "a capture taken live, with advice while one works",
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
