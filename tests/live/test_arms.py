@@ -118,7 +118,7 @@ FILMED = """
     import record_realsense
     from jcr.live.camera import opened
     with opened("realsense:" + sys.argv[1]) as camera:
-        frames = list(camera.source)
+        frames = list(camera.frames)
     rays = [rs.rs2_deproject_pixel_to_point(record_realsense.lens(rs), x, 1.0) for x in json.loads(sys.argv[2])]
     depth = np.unique(frames[0].depth_mm).tolist()
     print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics, rays]))

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,8 +113,10 @@ class Recorded:
 class Camera:
     """A camera that is open."""
 
-    source: Newest | Recorded
-    """Gives frames: of a device or stream what it sees when it is asked, never what waited in a buffer."""
+    frames: Iterable[Frame]
+    """Of a device or stream what it sees when it is asked, never what waited in a buffer."""
+    latest: Callable[[], Frame | None]
+    """The newest frame that is there."""
     intrinsics: dict[str, Any] | None = None
     """As capture.json has them, where the camera's maker stored them in it."""
 
@@ -155,11 +157,12 @@ def opened(source: str, options: CameraOptions | None = None) -> Iterator[Camera
                     "them in the camera, and leave the options out"
                 )
             if is_file:
-                yield Camera(Recorded(_of_file(video)))
+                recorded = Recorded(_of_file(video))
+                yield Camera(recorded, recorded.latest)
             else:
                 newest = Newest(lambda: _read(video), source)
                 try:
-                    yield Camera(newest)
+                    yield Camera(newest, newest.latest)
                 finally:
                     newest.close()
         finally:

@@ -50,8 +50,8 @@ def collect(
     kept = [_as_kept(live, name) for name in live.names]
     found = coverage(live, reach, words)
     write_page(live, found, f"{len(live.names)} pictures of {options.images}", options.wanted)
-    frames = iter(camera.source)
-    with Window(live, camera.source.latest):
+    frames = iter(camera.frames)
+    with Window(live, camera.latest):
         for ask in asks if len(live.names) < options.images else ():
             try:
                 taken = _taken(live, frames, kept, ask, options.patience)

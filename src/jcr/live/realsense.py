@@ -79,7 +79,7 @@ def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
         source = Recorded(iter(read, None)) if is_file else Newest(read, name)
         try:
-            yield Camera(source, lens_of_realsense(rs, stored))
+            yield Camera(source, source.latest, lens_of_realsense(rs, stored))
         finally:
             if isinstance(source, Newest):
                 source.close()
