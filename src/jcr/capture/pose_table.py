@@ -1,6 +1,6 @@
 """A table of gripper poses: columns by their names, TUM and ethz-asl trajectories, or a controller's rows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -46,6 +46,8 @@ class PoseTable:
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """The poses of a table; InputError naming the row or column at fault, or the option that it needs."""
     cells = read_cells(file)
+    if options.pose_convention == "auto":
+        options = replace(options, pose_convention=cells.convention)
     if cells.names is None:
         columns = _unnamed(file, cells, options)
     else:

@@ -14,6 +14,7 @@ from jcr.capture.plain_files import read_json, read_yaml
 from jcr.capture.table import find_table
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
+from jcr.geometry import inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 
@@ -90,6 +91,8 @@ def read_source(
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
         found = reader(path, options)
+        if options.pose_inverted:
+            found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
         if isinstance(found, Capture):
             require_frames(len(found), str(path), at_least)
         return found
@@ -111,6 +114,8 @@ def _extracted(path: Path, options: ReadOptions, into: Path, reader: Any, progre
     ]
     if not (into / capture_json.FILE).is_file() or _content(into).get("made_from") != made_from:
         capture = reader(path, options, into, progress)
+        if options.pose_inverted:
+            capture = replace(capture, base_from_gripper=inverse(capture.base_from_gripper))
         capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
     return replace(capture_json.read(into), notes=tuple(_content(into)["notes"]))
 

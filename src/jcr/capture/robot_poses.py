@@ -125,6 +125,13 @@ def poses_from_numbers(
         matrices = numbers.reshape(-1, 4, 4)
         if convention == "franka":
             matrices = np.swapaxes(matrices, 1, 2)
+        elif np.allclose(matrices[:, :, 3], [0, 0, 0, 1], atol=1e-9) and not np.allclose(
+            matrices[:, 3], [0, 0, 0, 1], atol=1e-9
+        ):
+            raise InputError(
+                f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
+                "--pose-convention franka"
+            )
         matrices = matrices.copy()
         matrices[:, :3, 3] *= position_unit
         _check_position(matrices[:, :3, 3], position_unit, units, where)
@@ -155,7 +162,7 @@ def _check_quaternion(quaternion: Float[ndarray, "n 4"], where: str) -> None:
         row = int(off.argmax())
         raise InputError(
             f"{where}: the quaternion of pose {row + 1} has length {length[row]:.4g}, not 1; check which columns "
-            "are the quaternion (--pose-convention)"
+            "are the quaternion, and say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
         )
 
 
