@@ -4,17 +4,37 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+LensModel = Literal["pinhole", "rational", "fisheye"]
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Of each distortion, in OpenCV's order; ROS calls them plumb_bob, rational_polynomial and equidistant."""
+Coefficients = (
+    tuple[float, float, float, float]
+    | tuple[float, float, float, float, float]
+    | tuple[float, float, float, float, float, float, float, float]
+)
+
+
+def coefficients_of(values: Iterable[float]) -> Coefficients:
+    """Four, five or eight numbers as a lens has them."""
+    return cast(Coefficients, tuple(float(value) for value in values))
+
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera with OpenCV's five-coefficient distortion, in pixels of a `width` x `height` image."""
+    """A camera with one of OpenCV's distortions, in pixels of a `width` x `height` image."""
 
     fx: float
     fy: float
@@ -22,8 +42,9 @@ class Intrinsics:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3."""
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """As many coefficients as COEFFICIENTS has names for the model."""
+    model: LensModel = "pinhole"
 
     @property
     def matrix(self) -> Float[ndarray, "3 3"]:

@@ -16,6 +16,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.camera_info import lens_of_ros
+from jcr.capture.capture_json import lens_as_json
 from jcr.capture.ros_image import picture_of
 from jcr.errors import InputError
 from jcr.export.ros import CameraMount, camera_mount
@@ -116,7 +117,7 @@ class Session:
             list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"
         )
         if lens is not None:
-            self.lens = {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
+            self.lens = lens_as_json(lens)
 
     def start(self) -> None:
         """Begin to take samples, in a thread of its own."""

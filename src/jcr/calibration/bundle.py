@@ -72,9 +72,9 @@ class _Problem:
     image: Int[ndarray, " k"]
     point: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
-    lens: Float[ndarray, "9 c"]
-    """Free parameters of the camera, which is start + lens · c in the order of camera.PARAMETERS."""
-    lens_start: Float[ndarray, "9"]
+    lens: Float[ndarray, "q c"]
+    """Free parameters of the camera, which is start + lens · c in the order of camera.parameters."""
+    lens_start: Float[ndarray, " q"]
     lens_std: Float[ndarray, " c"]
     rows_of_image: list[Int[ndarray, "..."]]
     median_square: Float[ndarray, " p"]
@@ -169,14 +169,15 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
     return order[np.bincount(tracks.point[order])[tracks.point[order]] >= 2]
 
 
-def _free_lens(intrinsics: Intrinsics, refine: bool) -> tuple[Float[ndarray, "9 c"], Float[ndarray, " c"]]:
+def _free_lens(intrinsics: Intrinsics, refine: bool) -> tuple[Float[ndarray, "q c"], Float[ndarray, " c"]]:
+    count = len(parameters(intrinsics))
     if not refine:
-        return np.zeros((9, 0)), np.zeros(0)
+        return np.zeros((count, 0)), np.zeros(0)
     width = intrinsics.width
     # One focal length moves by a share of itself.
     moves = {"fx": (0, intrinsics.fx), "fy": (0, intrinsics.fy), "cx": (1, width), "cy": (2, width)}
     moves |= {"k1": (3, 1.0), "k2": (4, 1.0)}
-    lens = np.zeros((len(PARAMETERS), 5))
+    lens = np.zeros((count, 5))
     for name, (column, unit) in moves.items():
         lens[PARAMETERS.index(name), column] = unit
     return lens, np.array([0.5, LENS_STD["cx"], LENS_STD["cy"], LENS_STD["k1"], LENS_STD["k2"]])
@@ -432,7 +433,7 @@ def _passed_on(
 
 def free_lens(
     adjusted: Adjusted, intrinsics: Intrinsics
-) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
+) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]] | None:
     """The camera one Gauss-Newton step on, with its lens free and before it at `intrinsics`, and the covariance.
 
     In the order of camera.PARAMETERS; the covariance is widened for an estimated noise. None where there

@@ -15,14 +15,17 @@ from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import HUGE, require_rigid
 from jcr.records import (
+    COEFFICIENTS,
     COVARIANCE_ORDER,
     Attempt,
     Capture,
     HandEye,
     ImageVerdict,
     Intrinsics,
+    LensModel,
     PosePairs,
     Reconstruction,
+    coefficients_of,
 )
 from jcr.rounding import significant
 
@@ -119,9 +122,18 @@ class Lens(_Part):
     fy: Positive
     cx: float
     cy: float
-    distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
+    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
     width: Pixels
     height: Pixels
+    model: LensModel = "pinhole"
+
+    @model_validator(mode="after")
+    def _as_many_as_the_model_has(self) -> "Lens":
+        if len(self.distortion) != len(COEFFICIENTS[self.model]):
+            raise ValueError(
+                f"{len(self.distortion)} coefficients, but a {self.model} lens has {COEFFICIENTS[self.model]}"
+            )
+        return self
 
 
 class NetworkScale(_Part):
@@ -420,5 +432,13 @@ def _lens(intrinsics: Intrinsics | None) -> Lens | None:
 
 def intrinsics_of(lens: Lens) -> Intrinsics:
     """The record of a file's lens."""
-    k1, k2, p1, p2, k3 = lens.distortion
-    return Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, (k1, k2, p1, p2, k3))
+    return Intrinsics(
+        lens.fx,
+        lens.fy,
+        lens.cx,
+        lens.cy,
+        lens.width,
+        lens.height,
+        coefficients_of(lens.distortion),
+        lens.model,
+    )

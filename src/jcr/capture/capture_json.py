@@ -15,7 +15,7 @@ from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics
 
 FILE, URDF = "capture.json", "robot.urdf"
 MOST_TURNS = 6 * np.pi + 0.01
@@ -65,8 +65,17 @@ def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None
     if not isinstance(lens, dict) or not {"fx", "fy", "cx", "cy"} <= lens.keys():
         raise InputError(f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null")
     focal_and_centre = [lens[key] for key in ("fx", "fy", "cx", "cy")]
-    distortion = lens.get("distortion") or [0.0] * 5
-    return checked_lens(focal_and_centre, distortion, size, where)
+    model = lens.get("model", "pinhole")
+    if model not in COEFFICIENTS:
+        raise InputError(f"{where}: lens model {model!r} is not known; give one of {', '.join(COEFFICIENTS)}")
+    distortion = lens.get("distortion") or [0.0] * len(COEFFICIENTS[model])
+    return checked_lens(focal_and_centre, distortion, size, where, model)
+
+
+def lens_as_json(lens: Intrinsics) -> dict[str, Any]:
+    """The "intrinsics" of a capture.json."""
+    model = {} if lens.model == "pinhole" else {"model": lens.model}
+    return model | {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
@@ -84,9 +93,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         if capture.urdf.resolve() != (folder / URDF).resolve():
             write_bytes(folder / URDF, capture.urdf.read_bytes())
         arm["urdf"] = URDF
-    lens = None
-    if capture.intrinsics is not None:
-        lens = {key: getattr(capture.intrinsics, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
+    lens = None if capture.intrinsics is None else lens_as_json(capture.intrinsics)
     write_text(
         folder / FILE, json.dumps({"frames": frames, "intrinsics": lens} | arm | remarks, indent=1) + "\n"
     )

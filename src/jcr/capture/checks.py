@@ -14,7 +14,7 @@ from jcr.capture.options import MIN_FRAMES
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel, coefficients_of
 
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
@@ -47,18 +47,26 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def checked_lens(
-    focal_and_centre: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int], where: str
+    focal_and_centre: Sequence[Any],
+    distortion: Sequence[Any],
+    size: tuple[int, int],
+    where: str,
+    model: LensModel = "pinhole",
 ) -> Intrinsics:
-    """Intrinsics of images of `size` from fx, fy, cx, cy and k1, k2, p1, p2, k3; InputError if they cannot be."""
+    """Intrinsics of images of `size` from fx, fy, cx, cy and the model's coefficients; InputError if they cannot be."""
+    names = COEFFICIENTS[model]
     try:
         fx, fy, cx, cy = (float(value) for value in focal_and_centre)
         coefficients = [float(k) for k in distortion]
     except (TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null"
+            f"{where}: need numbers fx, fy, cx, cy and distortion [{','.join(names)}], or null"
         ) from None
-    if len(coefficients) != 5:
-        raise InputError(f"{where}: distortion has {len(coefficients)} numbers, not the five k1,k2,p1,p2,k3")
+    if len(coefficients) != len(names):
+        raise InputError(
+            f"{where}: distortion has {len(coefficients)} numbers, not the {len(names)} of a {model} lens, "
+            f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
+        )
     if not np.isfinite([fx, fy, cx, cy, *coefficients]).all() or fx <= 0 or fy <= 0:
         raise InputError(
             f"{where}: fx and fy must be positive and all numbers finite; or give null to estimate them"
@@ -69,8 +77,7 @@ def checked_lens(
             f"{where}: the principal point ({cx:.4g}, {cy:.4g}) lies outside the {width}x{height} images; "
             "scale the intrinsics to this resolution"
         )
-    k1, k2, p1, p2, k3 = coefficients
-    return Intrinsics(fx, fy, cx, cy, width, height, (k1, k2, p1, p2, k3))
+    return Intrinsics(fx, fy, cx, cy, width, height, coefficients_of(coefficients), model)
 
 
 def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:

@@ -62,7 +62,7 @@ def structure_from_motion(
             raise NotTrustedError(_why_not_registered(database, len(images), model))
         _adjust_robustly(model, hold_lens=known)
         lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), []
-        if fold_distance_px(lens) is not None:
+        if not known and fold_distance_px(lens) is not None:
             notes.append("the views do not determine the lens distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
             _adjust_robustly(model, hold_lens=True)
@@ -268,8 +268,11 @@ def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     centre = [lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL]
     if not known:
         name, params = "RADIAL", [lens.fx, *centre, 0.0, 0.0]
+    elif lens.model == "fisheye":
+        name, params = "OPENCV_FISHEYE", [lens.fx, lens.fy, *centre, *lens.distortion]
     elif any(lens.distortion):
-        name, params = "FULL_OPENCV", [lens.fx, lens.fy, *centre, *lens.distortion, 0.0, 0.0, 0.0]
+        eight = [*lens.distortion, 0.0, 0.0, 0.0][:8]
+        name, params = "FULL_OPENCV", [lens.fx, lens.fy, *centre, *eight]
     else:
         name, params = "PINHOLE", [lens.fx, lens.fy, *centre]
     camera = pycolmap.Camera(model=name, width=lens.width, height=lens.height, params=params, camera_id=1)
