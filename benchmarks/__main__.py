@@ -56,6 +56,7 @@ BENCHES = {
     "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
     "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
     "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
+    "first_day": Bench("what a new user types and sees, from files as robots write them to a URDF", True),
     "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
 }
 """In the order of the README's claims."""

@@ -16,7 +16,6 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.extras import is_installed
 from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
@@ -61,15 +60,14 @@ def calibrate(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does.
+    """Reconstruction, calibration and report of a capture in the folder `out`; raises as `run` does.
 
-    Without torch there is no dense depth, which only a later map needs.
+    There is no dense depth: only a map needs it, and `build_map` makes it where it is missing.
     """
-    options = _with_backend(options, backend, capture)
-    if not is_installed("torch"):
-        options = _with_dense(options, False)
+    options = _with_dense(_with_backend(options, backend, capture), False)
     with held(Path(out)) as folder:
-        return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
+        calibrated = _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
+        return _report(calibrated, folder, options, progress or silent)
 
 
 def calibrate_poses(
