@@ -16,7 +16,7 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.extras import DISTRIBUTION
+from jcr.extras import DISTRIBUTION, is_installed
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ BENCHES = {
     "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
     "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
     "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
+    "samples": Bench("metric samples of a marker beside OpenCV's five methods"),
     "first_day": Bench("what a new user types and sees, from files as robots write them to a URDF", True),
     "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
 }
@@ -174,7 +175,8 @@ def heading(arguments: Arguments) -> str:
 def machine() -> str:
     """Processor, cores and versions in a sentence."""
     names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
-    versions = ", ".join(f"{name} {version(name)}" for name in names)
+    there = [name for name in names if name == DISTRIBUTION or is_installed(name)]
+    versions = ", ".join(f"{name} {version(name)}" for name in there)
     return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
 
 

@@ -9,6 +9,8 @@ class CalibrateOptions:
 
     robot_noise: tuple[float, float] | None = None
     """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    scale: float | None = None
+    """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
     known_height: float | None = None
     """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
     known_length: tuple[str, float, float, float, float, float] | None = None

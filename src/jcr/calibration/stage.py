@@ -199,11 +199,15 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
-    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
-    if pairs.is_metric and not hand_eye.observability.observable:
-        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues((1.0, METRIC_STD), offset))
-        remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
-        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
+    scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
+    hand_eye = free
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
+    if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
+        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset), scale=scale)
+        if not free.observability.observable and scale == 1.0:
+            remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
+            return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     if pairs.is_metric and not is_one(hand_eye):

@@ -20,6 +20,8 @@ MAX_NOISE = (0.02, np.radians(3.0))
 MAX_STD = (0.02, np.radians(3.0), 0.05)
 """m, rad, relative scale: an answer less certain than this is none."""
 MIN_SHARE_USED = 0.6
+SCALE_STD = 0.002
+"""Relative; of a printed marker's size."""
 FEW = 5
 """Images, below which a wrong one cannot be outvoted and the robot's noise is hardly known."""
 SURPRISE = 1.5
@@ -33,15 +35,21 @@ def solve_hand_eye(
     robot_noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
+    scale: float | None = None,
+    scale_std: float = SCALE_STD,
 ) -> HandEye:
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
     Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
     the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
     (m, rad), at least: the residuals may say more. `camera_covariance` (6n,6n) is that of the camera poses where
-    they are not exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
-    counts that cannot be poses; motion that shows too little is an answer (`observability`, `converged`), not an
-    exception.
+    they are not exact beside the gripper's, as records.CameraEvidence defines it.
+
+    `scale` (metres per unit of the camera poses, 1 where these are metric) is known to `scale_std` (relative); without
+    it the scale is found.
+
+    Raises InputError on shapes, values or counts that cannot be poses; motion that shows too little is an answer
+    (`observability`, `converged`), not an exception.
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
@@ -52,6 +60,12 @@ def solve_hand_eye(
         )
     if n < 2:
         raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    if scale is not None:
+        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+            raise InputError(
+                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
+            )
+        cues = replace(cues or Cues(), scale=(scale, scale_std))
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
 
