@@ -95,7 +95,7 @@ def board_sheet(spec: str, paper: str = "a4") -> Sheet:
             3.2,
             f"Both rulers are {ruler:g} mm. If yours measure R mm, multiply the lengths in --board by R/{ruler:g}.",
         ),
-        Text(MARGIN_MM + 4.0, top + ruler, 3.2, f"{ruler:g} mm", upright=False),
+        Text(MARGIN_MM + 2.0, top + ruler, 3.2, f"{ruler:g} mm", upright=False),
     )
     return Sheet(page, np.vstack([placed, np.array(rulers)]), texts)
 
