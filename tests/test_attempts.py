@@ -184,7 +184,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert colmap["why_not"].startswith("not to be trusted: ") and direct["why_not"] is None
     assert (colmap["reconstruct_s"], direct["reconstruct_s"]) == (20.0, 400.0)
     assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
-    assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0}
+    assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0, "report": 0.0}
     assert result.calibration.model_dump()["attempts"] == content["attempts"]
     told = (tmp_path / "log.txt").read_text().splitlines()
     assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (not to be trusted: ")
@@ -197,7 +197,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     again = RunFolder(tmp_path).calibration()
     assert made == ["colmap", "direct"]
     assert again.model_dump()["attempts"] == content["attempts"]
-    assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0}
+    assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
 
 
 def test_where_nothing_is_found_each_attempt_says_why(
