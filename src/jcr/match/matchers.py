@@ -1,0 +1,88 @@
+"""The kinds of features as matchers for `stage`: SIFT through COLMAP's database, networks through their own matchers."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.match.stage import Geometries, Key
+from jcr.match.verify import (
+    matched,
+    read_geometries,
+    read_keypoints,
+    verification,
+    write_keypoints,
+)
+from jcr.records import Intrinsics
+
+FeatureName = Literal["sift", "xfeat", "aliked"]
+
+
+class SiftMatcher:
+    """SIFT that was extracted into a database; it does not mind how images are turned."""
+
+    minds_roll = False
+
+    def __init__(self, database: Path, count: int, seed: int) -> None:
+        self._database, self._seed = database, seed
+        self.x_px = read_keypoints(database, count)
+
+    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
+        """Matched by COLMAP, on all cores."""
+        asked = set(pairs)
+        lines = "".join(f"{i:05d}.png {j:05d}.png\n" for i, j in pairs)
+        with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:
+            listed.write(lines)
+            listed.flush()
+            pairing = pycolmap.ImportedPairingOptions()
+            pairing.match_list_path = listed.name
+            pycolmap.match_image_pairs(
+                self._database,
+                pairing_options=pairing,
+                verification_options=verification(self._seed),
+                device=pycolmap.Device.cpu,
+            )
+        return {key: found for key, found in read_geometries(self._database).items() if key in asked}
+
+
+class LearnedMatcher:
+    """Features of a network, in a database from which COLMAP maps."""
+
+    minds_roll = True
+
+    def __init__(
+        self,
+        kind: Literal["xfeat", "aliked"],
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        database: Path,
+        camera: pycolmap.Camera,
+        lens: Intrinsics,
+        known: bool,
+        seed: int,
+        report: Callable[[str, float], None],
+    ) -> None:
+        from jcr.match.learned import LearnedFeatures
+
+        self._features = LearnedFeatures(kind, images)
+        self._features.extract(lambda fraction: report("features", fraction))
+        height, width = images[0].shape[:2]
+        scale = np.array([lens.width / width, lens.height / height])
+        self.x_px = [(x + 0.5) * scale - 0.5 for x in self._features.x_px]
+        write_keypoints(database, self.x_px)
+        self._camera, self._known, self._seed, self._report = camera, known, seed, report
+
+    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
+        """Matched pair by pair."""
+        found = {}
+        for k, ((i, j), (roll_i, roll_j)) in enumerate(zip(pairs, rolls, strict=True)):
+            self._report("matching", k / len(pairs))
+            rows = self._features.match(i, j, roll_i, roll_j)
+            geometry = matched(self.x_px, self._camera, i, j, rows, self._seed, self._known)
+            if geometry is not None:
+                found[i, j] = geometry
+        return found

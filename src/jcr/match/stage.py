@@ -1,0 +1,238 @@
+"""Which images see the same: matches that the robot checks, for every kind of features.
+
+Pairs that the gripper turns little against each other are matched as they are; those that the robot confirms give X's
+rotation, and with it every image is turned upright before the others are matched. While too few agree, quarter turns
+are guessed.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import rotation_angle
+from jcr.match import gate as robot
+from jcr.match.focal import focal_by_robot
+from jcr.match.gate import Gate, Pair
+from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
+from jcr.match.verify import View, pair_of
+from jcr.records import Intrinsics
+
+Key = tuple[int, int]
+Geometries = dict[Key, pycolmap.TwoViewGeometry]
+
+EVERY_PAIR = 24
+"""Captures of so many images have all their pairs matched; of more, the number of pairs grows with the images."""
+AS_TAKEN = math.radians(50)
+"""Networks match images that are turned against each other by up to this; no rotation is larger than its angle."""
+GUESSED_AT_ONCE = 6
+"""Pairs whose quarter turns are guessed before the robot is asked again."""
+GUESSED_AT_MOST = 30
+
+
+class Matcher(Protocol):
+    """Features of a capture's images, of any kind."""
+
+    x_px: Sequence[Float[ndarray, "k 2"]]
+    """Keypoints at the working size; pixel centres are whole numbers."""
+    minds_roll: bool
+    """Whether images must be turned upright for it."""
+
+    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
+        """Verified two-view geometries of pairs, their images turned (rad) before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What matching found."""
+
+    geometries: Geometries
+    """Those that a mapper may believe."""
+    gate: Gate | None
+    """None where the robot had no say."""
+    lens: Intrinsics
+    """At the working size: given, or as the robot and the images have it."""
+    pairs_tried: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Search:
+    """What is known while pairs are matched."""
+
+    matcher: Matcher
+    motion: Float[ndarray, "n n 4 4"]
+    view: View
+    known: bool
+    """Whether the lens is given."""
+    geometries: Geometries = field(default_factory=dict)
+    pairs: dict[Key, Pair] = field(default_factory=dict)
+    tried: set[tuple[int, int, int]] = field(default_factory=set)
+    """Pairs, and the turn between them in whole degrees."""
+
+    @property
+    def systematic(self) -> float:
+        return robot.SYSTEMATIC if self.known else robot.SYSTEMATIC_OF_GUESS
+
+    def match(
+        self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None, guess: float = 0.0
+    ) -> None:
+        """Match pairs with images turned by `rolls`, or the second of each by a guess; the better of two is kept."""
+        todo, turns = [], []
+        for i, j in pairs:
+            turn = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
+            if not self.matcher.minds_roll:
+                turn = (0.0, 0.0)
+            between = round(math.degrees(turn[1] - turn[0])) % 360
+            if any((i, j, (between + near) % 360) in self.tried for near in range(-8, 9)):
+                continue
+            self.tried.add((i, j, between))
+            todo.append((i, j))
+            turns.append(turn)
+        if not todo:
+            return
+        for key, geometry in self.matcher.geometries(todo, np.array(turns)).items():
+            pair = pair_of(self.view, *key, geometry)
+            if key not in self.geometries or self._better(pair, self.pairs[key]):
+                self.geometries[key], self.pairs[key] = geometry, pair
+
+    def gate(self, known: Gate | None = None) -> Gate:
+        """The robot's judgement of all pairs so far."""
+        of_x = None if known is None else known.of_x
+        return robot.judge(list(self.pairs.values()), self.motion, self.systematic, of_x)
+
+    def _better(self, new: Pair, old: Pair) -> bool:
+        """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
+        first, second = (self._agrees(pair) for pair in (new, old))
+        return first if first != second else len(new.rows) > len(old.rows)
+
+    def _agrees(self, pair: Pair) -> bool:
+        angle = float(rotation_angle(self.motion[pair.key][:3, :3]))
+        return any(
+            abs(float(rotation_angle(r.rotation)) - angle)
+            < robot.angle_tolerance(angle, r.angle_std(), self.systematic)
+            for r in pair.readings
+        )
+
+
+def match_with_robot(
+    matcher: Matcher,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    lens: Intrinsics,
+    known: bool,
+    names: Sequence[str],
+    report: Callable[[float], None] = lambda fraction: None,
+) -> Matched:
+    """The pairs of images that match and that the robot does not contradict.
+
+    `lens` is at the working size, and a first guess unless `known`. Where X's rotation cannot be found from the pairs,
+    the robot has no say: its poses may be of another convention, or too few pairs match.
+    """
+    n = len(base_from_gripper)
+    motion = robot.gripper_motions(base_from_gripper)
+    angle = rotation_angle(motion[..., :3, :3])
+    search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
+    everything = all_pairs(n) if n <= EVERY_PAIR else near_pairs(motion)
+    first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]
+    search.match(first)
+    report(0.3)
+    found = _with_lens(search, lens)
+    if found.of_x is None and matcher.minds_roll:
+        found = _guessed(search, everything, angle, found)
+    report(0.5)
+    if found.of_x is None:
+        search.match(everything)
+        found = _with_lens(search, lens)
+    if found.of_x is None:
+        return Matched(search.geometries, None, search.view.lens, len(search.tried))
+    upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
+    confirmed = {pair.key for pair in found.confirmed}
+    search.match([key for key in everything if key not in confirmed], upright)
+    found = search.gate(found)
+    report(0.8)
+    if n > EVERY_PAIR:
+        search.match(seen_in_common(search.view, found, motion, upright), upright)
+        found = search.gate(found)
+    stale = _contradicted_by_all(found, motion)
+    believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
+    believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
+    if known:
+        # Of a pair that cannot say how it turns, only what the known rotation explains would be right.
+        believed -= {pair.key for pair in found.undecided}
+    report(1.0)
+    kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
+    return Matched(kept, found, search.view.lens, len(search.tried), _notes(found, stale, names))
+
+
+def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
+    """The gate through the lens that is known, or else through the one by which most pairs agree with the robot."""
+    if search.known:
+        return search.gate()
+    size = guess.width, guess.height
+    lens = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
+    if lens is not None:
+        search.view = View.of(search.matcher.x_px, lens)
+        search.pairs = {key: pair_of(search.view, *key, found) for key, found in search.geometries.items()}
+    return search.gate()
+
+
+def _guessed(search: _Search, pairs: Sequence[Key], angle: Float[ndarray, "n n"], found: Gate) -> Gate:
+    """The gate after quarter turns of further pairs, the least turned first, until X's rotation is known."""
+    confirmed = {pair.key for pair in found.confirmed}
+    left = sorted((key for key in pairs if key not in confirmed), key=lambda key: float(angle[key]))
+    for start in range(0, min(len(left), GUESSED_AT_MOST), GUESSED_AT_ONCE):
+        for quarter in range(4):
+            search.match(left[start : start + GUESSED_AT_ONCE], guess=quarter * math.pi / 2)
+        found = search.gate()
+        if found.of_x is not None:
+            break
+    return found
+
+
+def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
+    """Images whose pairs agree with each other and contradict their gripper pose: the pose is wrong, not the matches."""
+    assert found.of_x is not None
+    x = found.of_x.rotation
+    confirmed = {row for pair in found.confirmed for row in pair.key}
+    suspects = {row for pair in found.contradicted for row in pair.key} - confirmed
+    stale = set()
+    for row in sorted(suspects):
+        # By how much the gripper would have to be turned for each pair; sound pairs ask for the same.
+        corrections = []
+        for pair in found.contradicted:
+            if row not in pair.key or not (set(pair.key) - {row}) & confirmed:
+                continue
+            of_gripper = motion[pair.key][:3, :3]
+            camera = x @ pair.readings[0].rotation @ x.T
+            corrections.append(of_gripper.T @ camera if pair.j == row else of_gripper @ camera.T)
+        if len(corrections) < 3:
+            continue
+        together = rotation_angle(
+            np.swapaxes(np.array(corrections), 1, 2)[:, None] @ np.array(corrections)[None]
+        )
+        if np.median(together) < math.radians(3):
+            stale.add(row)
+    return stale
+
+
+def _notes(found: Gate, stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
+    """What the robot changed, in one line each."""
+    notes = []
+    if found.contradicted:
+        count = len(found.contradicted)
+        total = count + len(found.confirmed)
+        notes.append(
+            f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out"
+        )
+    if stale:
+        listed = ", ".join(names[row] for row in sorted(stale))
+        notes.append(
+            f"the matches of {listed} agree with each other and contradict the reported gripper rotation"
+        )
+    return tuple(notes)
