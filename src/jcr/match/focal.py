@@ -30,7 +30,7 @@ def focal_by_robot(
 ) -> Intrinsics | None:
     """An undistorted lens with square pixels and its centre in the middle; None where too few pairs agree on one."""
     width, height = size
-    angle = rotation_angle(motion[..., :3, :3])
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     known = [item for item in geometries if angle[item[0]] > math.radians(8)]
     best, support = None, LEAST_SUPPORT
     for factor in LADDER:
@@ -61,5 +61,5 @@ def _angles(
         rays = np.concatenate([view.rays[0], np.ones((len(rows), 1))], 1)
         found += [rotations[k] for k in range(count) if np.mean(rays @ normals[k][:, 0] > 0) > 0.9]
     elif essential is not None:
-        found.append(cv2.recoverPose(essential, *view.rays, np.eye(3), distanceThresh=1e6)[1])
+        found.append(cv2.recoverPose(essential, view.rays[0], view.rays[1], np.eye(3), distanceThresh=1e6)[1])
     return [float(rotation_angle(rotation)) for rotation in found]

@@ -81,12 +81,12 @@ def judge(
 ) -> Gate:
     """The pairs by what the gripper's motions say of them.
 
-    First by angle alone; among those that pass, X's rotation is sought; with it, every reading of every pair is judged by
-    its whole rotation. `known` is X's rotation where more pairs than these have spoken.
+    First by angle alone; among those that pass, X's rotation is sought; with it, every reading of every pair is judged
+    by its whole rotation. `known` is X's rotation where more pairs than these have spoken.
     """
     undecided = tuple(pair for pair in pairs if not any(_sure(reading) for reading in pair.readings))
     judged = [pair for pair in pairs if any(_sure(reading) for reading in pair.readings)]
-    angle = rotation_angle(motion[..., :3, :3])
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     passing: list[tuple[Pair, Reading, float]] = []
     for pair in judged:
         of_gripper = float(angle[pair.key])
@@ -170,7 +170,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     # Of a quaternion: 2 atan2(q_z, q_w), which is atan2 of twice these (Shepperd 1978).
     twist = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
     # Most images as they are, for turning costs sharpness.
-    common = np.exp(1j * (twist[:, None] - twist)).real
+    common = np.cos(twist[:, None] - twist)
     return twist - twist[int(np.argmax(np.maximum(common - 0.9, 0).sum(1)))]
 
 

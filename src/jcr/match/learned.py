@@ -22,7 +22,7 @@ from jcr.match.lightglue import LightGlue
 
 LONG_SIDE_PX = 1024
 """Larger images are reduced to this."""
-KEYPOINTS = {"xfeat": 2048, "aliked": 1024}
+KEYPOINTS = {"xfeat": 1280, "aliked": 1024}
 """Of an image at most. ALIKED's matcher is ten times slower than XFeat's."""
 UPRIGHT_ENOUGH = math.radians(15)
 """An image is turned by whole quarters where that leaves no more than this, for it costs no resampling."""

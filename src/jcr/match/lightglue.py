@@ -54,6 +54,11 @@ class _Layer(nn.Module):
         super().__init__()
         self.self_attn, self.cross_attn = _SelfAttention(width, heads), _CrossAttention(width, heads)
 
+    def forward(
+        self, x0: Tensor, x1: Tensor, turn0: tuple[Tensor, Tensor], turn1: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        return self.cross_attn(self.self_attn(x0, *turn0), self.self_attn(x1, *turn1))
+
 
 class _Assignment(nn.Module):
     def __init__(self, width: int) -> None:
@@ -71,6 +76,9 @@ class _Confidence(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.token = nn.Sequential(nn.Linear(width, 1), nn.Sigmoid())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.token(x)
 
 
 class _Position(nn.Module):
@@ -108,10 +116,11 @@ class LightGlue(nn.Module):
         turn0, turn1 = self._encoding(x0_px, size0), self._encoding(x1_px, size1)
         last, layers = 0, len(self.transformers)
         for last, layer in enumerate(self.transformers):
-            x0, x1 = layer.cross_attn(layer.self_attn(x0, *turn0), layer.self_attn(x1, *turn1))
+            x0, x1 = layer(x0, x1, turn0, turn1)
             if early and last < layers - 1:
-                token = self.token_confidence[last].token
-                sure = torch.cat([token(x0), token(x1)]) >= 0.8 + 0.1 * math.exp(-4 * last / layers)
+                sure = self.token_confidence[last](torch.cat([x0, x1])) >= 0.8 + 0.1 * math.exp(
+                    -4 * last / layers
+                )
                 if sure.float().mean() > CONFIDENT:
                     break
         score, match = (assignment := self.log_assignment[last](x0, x1)).max(1)

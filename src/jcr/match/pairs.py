@@ -32,7 +32,7 @@ def all_pairs(n: int) -> list[Key]:
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int = NEIGHBOURS) -> list[Key]:
     """The nearest neighbours of every image by the gripper's way; in proportion to n."""
-    angle = rotation_angle(motion[..., :3, :3])
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     way = np.hypot(ARM_M * angle, np.linalg.norm(motion[..., :3, 3], axis=-1))
     return _best(-way, neighbours)
 

@@ -1,7 +1,7 @@
 """X's rotation from relative rotations of cameras, some of which are wrong: AX = XB over pairs of images.
 
-Whatever X is, a pair of cameras turns by the angle of its grippers (the screw congruence of Chen 1991); R_A R_X = R_X R_B
-says the rest. Hypotheses come from two pairs each, as in RANSAC; the best is refined on all pairs that agree with it.
+Whatever X is, a pair of cameras turns by the angle of its grippers (the screw congruence of Chen 1991), and R_A R_X =
+R_X R_B. Hypotheses come from two pairs each, as in RANSAC; the best is refined on all pairs that agree with it.
 """
 
 from dataclasses import dataclass

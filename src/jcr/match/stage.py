@@ -38,10 +38,15 @@ GUESSED_AT_MOST = 30
 class Matcher(Protocol):
     """Features of a capture's images, of any kind."""
 
-    x_px: Sequence[Float[ndarray, "k 2"]]
-    """Keypoints at the working size; pixel centres are whole numbers."""
-    minds_roll: bool
-    """Whether images must be turned upright for it."""
+    @property
+    def x_px(self) -> Sequence[Float[ndarray, "k 2"]]:
+        """Keypoints at the working size; pixel centres are whole numbers."""
+        ...
+
+    @property
+    def minds_roll(self) -> bool:
+        """Whether images must be turned upright for it."""
+        ...
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
         """Verified two-view geometries of pairs, their images turned (rad) before."""
@@ -136,7 +141,7 @@ def match_with_robot(
     """
     n = len(base_from_gripper)
     motion = robot.gripper_motions(base_from_gripper)
-    angle = rotation_angle(motion[..., :3, :3])
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
     everything = all_pairs(n) if n <= EVERY_PAIR else near_pairs(motion)
     first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]

@@ -117,7 +117,7 @@ def _refined(
     """Gauss-Newton over five numbers under a Cauchy loss."""
     if len(ray_i) < 8:
         return None
-    damping = 1e-3
+    damping, sigma, information = 1e-3, LEAST_SIGMA_PX, np.eye(5)
     residual = sampson_px(rotation, direction, ray_i, ray_j, focal_px)
     for _ in range(STEPS):
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
