@@ -2,12 +2,13 @@
 
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.match.stage import Geometries, Key
@@ -27,10 +28,14 @@ class SiftMatcher:
     """SIFT that was extracted into a database; it does not mind how images are turned."""
 
     minds_roll = False
+    every_pair = 24
 
     def __init__(self, database: Path, count: int, seed: int) -> None:
         self._database, self._seed = database, seed
         self.x_px = read_keypoints(database, count)
+        self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
+        with closing(pycolmap.Database.open(database)) as db:
+            self._camera = db.read_camera(1)
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
         """Matched by COLMAP, on all cores."""
@@ -47,13 +52,29 @@ class SiftMatcher:
                 verification_options=verification(self._seed),
                 device=pycolmap.Device.cpu,
             )
+        with closing(pycolmap.Database.open(self._database)) as db:
+            for i, j in pairs:
+                if db.exists_matches(i + 1, j + 1):
+                    self.raw[i, j] = np.asarray(db.read_matches(i + 1, j + 1), dtype=int)
         return {key: found for key, found in read_geometries(self._database).items() if key in asked}
+
+    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
+        """The geometry of some of a pair's matches."""
+        known = self._camera.has_prior_focal_length
+        return matched(self.x_px, self._camera, *key, rows, self._seed, known)
+
+    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
+        """Of unit length; the roll changes nothing."""
+        with closing(pycolmap.Database.open(self._database)) as db:
+            data = np.asarray(db.read_descriptors(row + 1).data, dtype=np.float32)
+        return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-9)
 
 
 class LearnedMatcher:
     """Features of a network, in a database from which COLMAP maps."""
 
     minds_roll = True
+    every_pair = 12
 
     def __init__(
         self,
@@ -75,6 +96,7 @@ class LearnedMatcher:
         self.x_px = [(x + 0.5) * scale - 0.5 for x in self._features.x_px]
         write_keypoints(database, self.x_px)
         self._camera, self._known, self._seed, self._report = camera, known, seed, report
+        self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
         """Matched pair by pair."""
@@ -82,7 +104,16 @@ class LearnedMatcher:
         for k, ((i, j), (roll_i, roll_j)) in enumerate(zip(pairs, rolls, strict=True)):
             self._report("matching", k / len(pairs))
             rows = self._features.match(i, j, roll_i, roll_j)
-            geometry = matched(self.x_px, self._camera, i, j, rows, self._seed, self._known)
+            self.raw[i, j] = rows
+            geometry = self.verified((i, j), rows)
             if geometry is not None:
                 found[i, j] = geometry
         return found
+
+    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
+        """The geometry of some of a pair's matches."""
+        return matched(self.x_px, self._camera, *key, rows, self._seed, self._known)
+
+    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
+        """Of unit length, the image turned by an angle (rad)."""
+        return self._features.descriptors(row, roll)

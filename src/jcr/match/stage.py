@@ -6,30 +6,35 @@ are guessed.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle
 from jcr.match import gate as robot
+from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
 from jcr.match.gate import Gate, Pair
+from jcr.match.moved import in_words as moved_in_words
+from jcr.match.moved import moved_things, second_motions
 from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
+from jcr.match.still import hidden, still_cells
+from jcr.match.still import in_words as still_in_words
 from jcr.match.verify import View, pair_of
 from jcr.records import Intrinsics
 
 Key = tuple[int, int]
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
-EVERY_PAIR = 24
-"""Captures of so many images have all their pairs matched; of more, the number of pairs grows with the images."""
 AS_TAKEN = math.radians(50)
 """Networks match images that are turned against each other by up to this; no rotation is larger than its angle."""
+STILL = (5e-3, math.radians(1))
+"""m, rad: a gripper that moved by this moves the whole image."""
 GUESSED_AT_ONCE = 6
 """Pairs whose quarter turns are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
@@ -48,6 +53,24 @@ class Matcher(Protocol):
         """Whether images must be turned upright for it."""
         ...
 
+    @property
+    def raw(self) -> Mapping[Key, Int[ndarray, "m 2"]]:
+        """All matches of the pairs that were tried last, right or wrong."""
+        ...
+
+    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
+        """The geometry of some of a pair's matches; None where too few agree on one."""
+        ...
+
+    @property
+    def every_pair(self) -> int:
+        """Captures of up to so many images have all pairs matched; of more, pairs grow in proportion to the images."""
+        ...
+
+    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
+        """Unit descriptors of an image's keypoints, the image turned (rad) before."""
+        ...
+
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
         """Verified two-view geometries of pairs, their images turned (rad) before."""
         ...
@@ -64,6 +87,8 @@ class Matched:
     lens: Intrinsics
     """At the working size: given, or as the robot and the images have it."""
     pairs_tried: int
+    upright: Float[ndarray, " n"] | None = None
+    """Angles (rad) by which the images were turned, once X's rotation was known."""
     notes: tuple[str, ...] = ()
 
 
@@ -78,6 +103,8 @@ class _Search:
     """Whether the lens is given."""
     geometries: Geometries = field(default_factory=dict)
     pairs: dict[Key, Pair] = field(default_factory=dict)
+    still: Bool[ndarray, "r c"] | None = None
+    """Parts of the image that do not move."""
     tried: set[tuple[int, int, int]] = field(default_factory=set)
     """Pairs, and the turn between them in whole degrees."""
 
@@ -103,9 +130,63 @@ class _Search:
         if not todo:
             return
         for key, geometry in self.matcher.geometries(todo, np.array(turns)).items():
-            pair = pair_of(self.view, *key, geometry)
+            clean = self._seen(key, geometry)
+            if clean is None:
+                continue
+            pair = pair_of(self.view, *key, clean)
             if key not in self.geometries or self._better(pair, self.pairs[key]):
-                self.geometries[key], self.pairs[key] = geometry, pair
+                self.geometries[key], self.pairs[key] = clean, pair
+
+    def hide_still_parts(self) -> None:
+        """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
+        angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
+        way = np.linalg.norm(self.motion[..., :3, 3], axis=-1)
+        moving = [key for key in self.matcher.raw if angle[key] > STILL[1] or way[key] > STILL[0]]
+        size = self.view.lens.width, self.view.lens.height
+        still = still_cells(self.matcher.x_px, self.matcher.raw, size, moving)
+        if not still.any():
+            return
+        self.still = still
+        for key, geometry in list(self.geometries.items()):
+            clean = self._seen(key, geometry)
+            if clean is None:
+                del self.geometries[key], self.pairs[key]
+            elif clean is not geometry:
+                self.geometries[key], self.pairs[key] = clean, pair_of(self.view, *key, clean)
+
+    def without_first_motion(self, pairs: Sequence[Pair]) -> dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]]:
+        """What else moves in pairs beside their first geometry."""
+        found = {}
+        for pair in pairs:
+            raw = self._visible(pair.key, self.matcher.raw.get(pair.key, np.zeros((0, 2), dtype=int)))
+            taken = {(int(a), int(b)) for a, b in pair.rows}
+            left = np.array([row for row in raw if (int(row[0]), int(row[1])) not in taken], dtype=int)
+            if len(left) and (geometry := self.matcher.verified(pair.key, left)) is not None:
+                found[pair.key] = pair_of(self.view, *pair.key, geometry), geometry
+        return found
+
+    def second_motions_confirmed(self, found: Gate) -> Gate:
+        """The gate after contradicted pairs were asked for a second geometry: the first may be of a thing that moved."""
+        others = self.without_first_motion(found.contradicted)
+        judged = robot.judge([pair for pair, _ in others.values()], self.motion, self.systematic, found.of_x)
+        for pair in judged.confirmed:
+            self.geometries[pair.key], self.pairs[pair.key] = others[pair.key][1], pair
+        return self.gate(found) if judged.confirmed else found
+
+    def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "m 2"]:
+        """Without matches in parts of the image that do not move."""
+        if self.still is None or not len(rows):
+            return rows
+        i, j = key
+        dark = hidden(self.matcher.x_px[i][rows[:, 0]], self.still)
+        return rows[~(dark | hidden(self.matcher.x_px[j][rows[:, 1]], self.still))]
+
+    def _seen(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
+        """The geometry, verified again where some of its matches lie in parts that do not move."""
+        inside = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
+        if len(self._visible(key, inside)) == len(inside):
+            return geometry
+        return self.matcher.verified(key, self._visible(key, self.matcher.raw[key]))
 
     def gate(self, known: Gate | None = None) -> Gate:
         """The robot's judgement of all pairs so far."""
@@ -132,20 +213,23 @@ def match_with_robot(
     lens: Intrinsics,
     known: bool,
     names: Sequence[str],
+    original: tuple[int, int],
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Matched:
     """The pairs of images that match and that the robot does not contradict.
 
-    `lens` is at the working size, and a first guess unless `known`. Where X's rotation cannot be found from the pairs,
-    the robot has no say: its poses may be of another convention, or too few pairs match.
+    `original` is the size of the images as they were taken, for notes. `lens` is at the working size, and a first guess
+    unless `known`. Where X's rotation cannot be found from the pairs, the robot has no say: its poses may be of another
+    convention, or too few pairs match.
     """
     n = len(base_from_gripper)
     motion = robot.gripper_motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
-    everything = all_pairs(n) if n <= EVERY_PAIR else near_pairs(motion)
+    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)
     first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]
     search.match(first)
+    search.hide_still_parts()
     report(0.3)
     found = _with_lens(search, lens)
     if found.of_x is None and matcher.minds_roll:
@@ -155,15 +239,17 @@ def match_with_robot(
         search.match(everything)
         found = _with_lens(search, lens)
     if found.of_x is None:
-        return Matched(search.geometries, None, search.view.lens, len(search.tried))
+        notes = _beside(search, found, names, original)
+        return Matched(search.geometries, None, search.view.lens, len(search.tried), None, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     confirmed = {pair.key for pair in found.confirmed}
     search.match([key for key in everything if key not in confirmed], upright)
     found = search.gate(found)
     report(0.8)
-    if n > EVERY_PAIR:
+    if n > matcher.every_pair:
         search.match(seen_in_common(search.view, found, motion, upright), upright)
         found = search.gate(found)
+    found = search.second_motions_confirmed(found)
     stale = _contradicted_by_all(found, motion)
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
     believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
@@ -172,7 +258,8 @@ def match_with_robot(
         believed -= {pair.key for pair in found.undecided}
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
-    return Matched(kept, found, search.view.lens, len(search.tried), _notes(found, stale, names))
+    notes = (*_notes(found, stale, names), *_beside(search, found, names, original))
+    return Matched(kept, found, search.view.lens, len(search.tried), upright, notes)
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
@@ -240,4 +327,24 @@ def _notes(found: Gate, stale: set[int], names: Sequence[str]) -> tuple[str, ...
         notes.append(
             f"the matches of {listed} agree with each other and contradict the reported gripper rotation"
         )
+    return tuple(notes)
+
+
+def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:
+    """What is left out of the matches because it does not move with the scene."""
+    notes, size = [], (search.view.lens.width, search.view.lens.height)
+    if search.still is not None:
+        place = still_in_words(search.still, size, original)
+        notes.append(
+            f"a part of the image does not move while the gripper does, fingers or a logo: {place} px: left out"
+        )
+    x = translation_of_x(found, search.motion)
+    if x is not None:
+        confirmed = {pair.key: pair for pair in found.confirmed}
+        others = {key: pair for key, (pair, _) in search.without_first_motion(found.confirmed).items()}
+        second = second_motions(search.view, confirmed, others, search.motion, x)
+        moved = moved_things(search.view, second, len(search.motion))
+        if moved is not None:
+            place = moved_in_words(moved, names, original[0] / size[0])
+            notes.append(f"something stands elsewhere than in the other images in {place}: left out")
     return tuple(notes)

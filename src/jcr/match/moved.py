@@ -1,0 +1,94 @@
+"""Things that moved in the scene between images: matches that agree with each other and that the robot contradicts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.match.epipolar import RoughX, distance_px
+from jcr.match.gate import Pair
+from jcr.match.verify import View
+
+Key = tuple[int, int]
+
+LEAST_OFF_PX = 6.0
+TIMES_FARTHER = 3.0
+"""From the predicted epipolar lines than the matches that the robot confirms."""
+LEAST_PAIRS = 3
+LARGEST_SHARE = 0.5
+"""Of the images: which half moved nobody can say."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Images in which a thing was elsewhere than in the rest, and where it is seen in them."""
+
+    rows: tuple[int, ...]
+    regions: tuple[tuple[int, int, int, int], ...]
+    """Left, top, right, bottom (px, working size) for each."""
+
+
+def second_motions(
+    view: View,
+    confirmed: Mapping[Key, Pair],
+    others: Mapping[Key, Pair],
+    motion: Float[ndarray, "n n 4 4"],
+    x: RoughX,
+) -> dict[Key, Pair]:
+    """Of the `others`, matches beside the confirmed ones of a pair, those that lie off the predicted lines."""
+    found = {}
+    for key, other in others.items():
+        of_scene = np.median(distance_px(view, confirmed[key], motion, x.gripper_from_camera))
+        off = np.median(distance_px(view, other, motion, x.gripper_from_camera))
+        if off > max(LEAST_OFF_PX, TIMES_FARTHER * of_scene):
+            found[key] = other
+    return found
+
+
+def moved_things(view: View, second: Mapping[Key, Pair], count: int) -> Moved | None:
+    """The smaller group of images between which and the rest something moved; None where nothing did.
+
+    A pair of one image of each group shows two motions, a pair within a group one: the groups are the two sides of a
+    graph, found image by image from the one with most such pairs.
+    """
+    edges = np.zeros((count, count), dtype=bool)
+    for i, j in second:
+        edges[i, j] = edges[j, i] = True
+    degree = edges.sum(1)
+    if len(second) < LEAST_PAIRS:
+        return None
+    side = np.zeros(count, dtype=int)
+    order = [int(np.argmax(degree))]
+    side[order[0]] = 1
+    for _ in range(count):
+        pull = np.where(side == 0, (edges @ side).astype(float), 0.0)
+        row = int(np.argmax(np.abs(pull)))
+        if pull[row] == 0:
+            break
+        side[row] = -int(np.sign(pull[row]))
+    groups = [tuple(np.flatnonzero(side == sign).tolist()) for sign in (1, -1)]
+    # Images without such a pair stand with the larger group.
+    smaller = min(groups, key=len)
+    if not smaller or len(smaller) > LARGEST_SHARE * count:
+        return None
+    regions = []
+    for row in smaller:
+        points = [
+            view.x_px[row][pair.rows[:, 0 if pair.i == row else 1]]
+            for key, pair in second.items()
+            if row in key
+        ]
+        low, high = np.quantile(np.concatenate(points), [0.05, 0.95], axis=0).round().astype(int)
+        regions.append((int(low[0]), int(low[1]), int(high[0]), int(high[1])))
+    return Moved(smaller, tuple(regions))
+
+
+def in_words(moved: Moved, names: Sequence[str], scale: float) -> str:
+    """Images and regions, in pixels of the original images."""
+    return "; ".join(
+        f"{names[row]} (x {round(scale * left)} to {round(scale * right)}, y {round(scale * top)} to "
+        f"{round(scale * bottom)})"
+        for row, (left, top, right, bottom) in zip(moved.rows, moved.regions, strict=True)
+    )
