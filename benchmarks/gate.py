@@ -99,8 +99,8 @@ def table(verdicts: Sequence[Verdict]) -> str:
             [
                 head,
                 "",
-                f"{IMAGES} images of 640x480, robot noise {ROBOT_NOISE[0]} mm and {ROBOT_NOISE[1]}°, {SEEDS} draws each. Right: "
-                f"trusted and not wrong; wrong: trusted, over {WRONG_MM:.0f} mm or {WRONG_DEG:.0f}° off and beyond "
+                f"{IMAGES} images of 640x480, robot noise {ROBOT_NOISE[0]} mm and {ROBOT_NOISE[1]}°, {SEEDS} draws each. "
+                f"Right: trusted and not wrong; wrong: trusted, over {WRONG_MM:.0f} mm or {WRONG_DEG:.0f}° off and beyond "
                 f"{WRONG_SIGMAS:.0f} of its own σ. Off: median distance from the truth, trusted or not.",
                 "",
                 "| scene | features | gate: right / trusted / wrong | images registered | off, mm | s "

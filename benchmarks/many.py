@@ -30,11 +30,11 @@ def run() -> str:
             found.append(json.loads(done.stdout.splitlines()[-1]))
     seconds = {one["images"]: one["cpu_s"] for one in found}
     lines = [
-        f"> From 50 to 200 images processor time grows {seconds[200] / seconds[50]:.1f} times, the number of pairs matched "
-        "in proportion to the images.",
+        f"> From 50 to 200 images processor time grows {seconds[200] / seconds[50]:.1f} times, the number of pairs "
+        "matched in proportion to the images.",
         "",
-        "Simulated tables, 640x480, SIFT, the robot's gate on; reconstruction without dense depth, and calibration, in a "
-        "process of its own each. Processor seconds are of all threads.",
+        "Simulated tables, 640x480, SIFT, the robot's gate on; reconstruction without dense depth, and calibration, in "
+        "a process of its own each. Processor seconds are of all threads.",
         "",
         "| images | registered | reconstruct, s | calibrate, s | processor, s | peak memory, GB | off, mm |",
         "|---" * 7 + "|",

@@ -62,8 +62,8 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
     lines = [
         f"> Real captures, {len(folders)}: trusted calibrations from images alone: {told}.",
         "",
-        "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any axis "
-        "in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense depth and "
+        "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
+        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense depth and "
         "calibration.",
         "",
         "| capture | features | gate | images registered | off: mm | ° | in σ | ±σ: mm | ° | trusted | s |",

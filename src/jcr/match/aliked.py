@@ -129,9 +129,11 @@ class Aliked(nn.Module):
 
 
 @torch.inference_mode()
-def detect(network: Aliked, image: Float[Tensor, "3 h w"], count: int) -> Float[Tensor, "k 2"]:
-    """The `count` best keypoints of values in 0..1; pixel centres are whole numbers."""
-    _, scores = network(image[None])
+def detect(
+    network: Aliked, image: Float[Tensor, "3 h w"], count: int
+) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 128"]]:
+    """The `count` best keypoints of values in 0..1, and their unit descriptors; pixel centres are whole numbers."""
+    features, scores = network(image[None])
     kept = _local_maxima(scores)
     edge = NMS_RADIUS
     kept[..., :edge, :] = kept[..., -edge:, :] = kept[..., :edge] = kept[..., -edge:] = 0
@@ -143,15 +145,8 @@ def detect(network: Aliked, image: Float[Tensor, "3 h w"], count: int) -> Float[
     weight = ((patch - patch.amax((1, 2), keepdim=True)) / TEMPERATURE).exp()
     weight = weight / weight.sum((1, 2), keepdim=True)
     dx, dy = (weight * near).sum((1, 2)), (weight * near[:, None]).sum((1, 2))
-    return torch.stack([x + dx, y + dy], -1)
-
-
-@torch.inference_mode()
-def describe(
-    network: Aliked, image: Float[Tensor, "3 h w"], x_px: Float[Tensor, "k 2"]
-) -> Float[Tensor, "k 128"]:
-    """Unit descriptors of an image at these pixels."""
-    return network.desc_head(network(image[None])[0][0], x_px)
+    x_px = torch.stack([x + dx, y + dy], -1)
+    return x_px, network.desc_head(features[0], x_px)
 
 
 def _local_maxima(scores: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:

@@ -29,6 +29,8 @@ LARGEST_STD = math.radians(3)
 """A pair that knows its rotation less well neither confirms nor contradicts."""
 SURE_STD = math.radians(2.5)
 """X's rotation counts as known from here on."""
+UPRIGHT_ENOUGH = math.radians(15)
+"""An image is turned by whole quarters where that leaves no more than this, for it costs no resampling."""
 LEAST_PAIRS = 4
 """That must agree about it: three wrong ones can agree by chance."""
 
@@ -172,6 +174,13 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     # Most images as they are, for turning costs sharpness.
     common = np.cos(twist[:, None] - twist)
     return twist - twist[int(np.argmax(np.maximum(common - 0.9, 0).sum(1)))]
+
+
+def by_quarters(roll: float) -> float:
+    """The angle, or the whole quarters of a turn that are near it; in [0, 2π), to a degree."""
+    quarters = round(roll / (math.pi / 2)) * math.pi / 2
+    nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
+    return nearest % (2 * math.pi)
 
 
 def predicted(

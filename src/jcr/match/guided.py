@@ -42,8 +42,10 @@ def guided(
 
     `std_rad` is the uncertainty of the predicted directions.
     """
-    described = matcher.descriptors(i, float(upright[i])), matcher.descriptors(j, float(upright[j]))
-    rows = guided_rows(view, i, j, *described, i_from_j, band_px(view.lens.fx, std_rad))
+    (start_i, of_i), (start_j, of_j) = (matcher.descriptors(k, float(upright[k])) for k in (i, j))
+    at = [slice(start, start + len(of)) for start, of in ((start_i, of_i), (start_j, of_j))]
+    some = View.of([view.x_px[k][rows] for k, rows in zip((i, j), at, strict=True)], view.lens)
+    rows = guided_rows(some, 0, 1, of_i, of_j, i_from_j, band_px(view.lens.fx, std_rad)) + [start_i, start_j]
     found = matched(view.x_px, camera, i, j, rows, seed, known)
     if found is None or len(found.inlier_matches) < LEAST_RIGHT * len(rows):
         return None

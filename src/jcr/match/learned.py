@@ -1,13 +1,12 @@
-"""Features by networks: keypoints of every image once, descriptors of the image turned by any angle about its axis.
+"""Features by networks, found in images that are turned about the viewing axis first.
 
-The networks are not made for images that are turned against each other. The keypoints stay those of the image as it
-was taken, so that tracks run through all pairs; what is turned is the image in which they are described.
+The networks are not made for images that are turned against each other.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -18,71 +17,77 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.match import aliked, weights, xfeat
+from jcr.match.gate import by_quarters
 from jcr.match.lightglue import LightGlue
 
 LONG_SIDE_PX = 1024
 """Larger images are reduced to this."""
 KEYPOINTS = {"xfeat": 1280, "aliked": 1024}
 """Of an image at most. ALIKED's matcher is ten times slower than XFeat's."""
-UPRIGHT_ENOUGH = math.radians(15)
-"""An image is turned by whole quarters where that leaves no more than this, for it costs no resampling."""
 MULTIPLE = 32
 
 
-@dataclass
+@dataclass(frozen=True)
+class _Set:
+    """Keypoints found in an image that was turned."""
+
+    start: int
+    """Row of the first among all keypoints of the image."""
+    x_px: Float[Tensor, "k 2"]
+    """In the turned image."""
+    descriptor: Float[Tensor, "k d"]
+    size: tuple[int, int]
+    """Of the turned image: width, height."""
+
+
 class LearnedFeatures:
-    """Keypoints of a capture's images, and a matcher that turns the images as it is told."""
+    """Keypoints of a capture's images, and a matcher that turns the images as it is told.
 
-    kind: Literal["xfeat", "aliked"]
-    images: Sequence[UInt8[ndarray, "h w 3"]]
-    x_px: list[Float[ndarray, "k 2"]] = field(init=False)
-    """In the given images; pixel centres are whole numbers."""
-    _network: xfeat.XFeat | aliked.Aliked = field(init=False)
-    _matcher: LightGlue = field(init=False)
-    _described: dict[tuple[int, int], tuple[Tensor, Tensor, tuple[int, int]]] = field(init=False)
+    What the networks find does not turn with the image (of a thousand keypoints chance finds as many again): every angle
+    has keypoints of its own, and `x_px` grows as angles are asked for.
+    """
 
-    def __post_init__(self) -> None:
-        self._network, self._matcher = _networks(self.kind)
-        self._described = {}
-        self.x_px = []
-
-    def extract(self, step: Callable[[float], None] = lambda fraction: None) -> None:
-        """The keypoints of every image."""
-        detect = xfeat.detect if self.kind == "xfeat" else aliked.detect
-        for k, image in enumerate(self.images):
-            step(k / len(self.images))
-            pixels, original_from_working = _prepared(image, 0.0)
-            with _one_thread():
-                found = detect(self._network, pixels, KEYPOINTS[self.kind])  # pyright: ignore[reportArgumentType]
-            self.x_px.append(_mapped(found.double().numpy(), original_from_working))
-        step(1.0)
+    def __init__(self, kind: Literal["xfeat", "aliked"], images: Sequence[UInt8[ndarray, "h w 3"]]) -> None:
+        self._kind, self._images = kind, images
+        self._network, self._matcher = _networks(kind)
+        self._sets: dict[tuple[int, int], _Set] = {}
+        self.x_px: list[Float[ndarray, "k 2"]] = [np.zeros((0, 2)) for _ in images]
+        """Of every image, all angles together; pixel centres are whole numbers."""
 
     def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
         """Rows of the keypoints of images i and j that match, the images turned by these angles (rad) before."""
-        x_i, descriptor_i, size_i = self._describe(i, roll_i)
-        x_j, descriptor_j, size_j = self._describe(j, roll_j)
+        first, second = self._found(i, roll_i), self._found(j, roll_j)
         with _one_thread():
-            early = self.kind == "aliked"  # XFeat's matcher was trained without
-            rows, _ = self._matcher(x_i, x_j, descriptor_i, descriptor_j, size_i, size_j, early)
-        return rows.numpy()
+            early = self._kind == "aliked"  # XFeat's matcher was trained without
+            rows, _ = self._matcher(
+                first.x_px, second.x_px, first.descriptor, second.descriptor, first.size, second.size, early
+            )
+        return rows.numpy() + [first.start, second.start]
 
-    def descriptors(self, image: int, roll: float) -> Float[ndarray, "k d"]:
-        """Unit descriptors of an image's keypoints, the image turned by an angle (rad) before."""
-        return self._describe(image, roll)[1].numpy()
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
+        found = self._found(row, roll)
+        return found.start, found.descriptor.numpy()
 
-    def _describe(self, row: int, roll: float) -> tuple[Tensor, Tensor, tuple[int, int]]:
-        """Keypoints in the turned image, their descriptors, and its size."""
-        roll = _by_quarters(roll)
+    def _found(self, row: int, roll: float) -> _Set:
+        roll = by_quarters(roll)
         key = row, round(math.degrees(roll))
-        if key not in self._described:
-            pixels, original_from_turned = _prepared(self.images[row], roll)
-            x_px = _mapped(self.x_px[row], np.linalg.inv(original_from_turned))
-            at = torch.from_numpy(x_px).float()
-            describe = xfeat.describe if self.kind == "xfeat" else aliked.describe
+        if key not in self._sets:
+            pixels, given_from_turned = _prepared(self._images[row], roll)
+            count = KEYPOINTS[self._kind]
             with _one_thread():
-                found = describe(self._network, pixels, at)  # pyright: ignore[reportArgumentType]
-            self._described[key] = at, found, (pixels.shape[-1], pixels.shape[-2])
-        return self._described[key]
+                if isinstance(self._network, xfeat.XFeat):
+                    x_px, descriptor = xfeat.detect(self._network, pixels, count)
+                else:
+                    x_px, descriptor = aliked.detect(self._network, pixels, count)
+            given = _mapped(x_px.double().numpy(), given_from_turned)
+            height, width = self._images[row].shape[:2]
+            inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in what fills the corners
+            kept = torch.from_numpy(inside)
+            start = len(self.x_px[row])
+            self.x_px[row] = np.concatenate([self.x_px[row], given[inside]])
+            self._sets[key] = _Set(start, x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]))
+        return self._sets[key]
 
 
 def _networks(kind: str) -> tuple[xfeat.XFeat | aliked.Aliked, LightGlue]:
@@ -105,13 +110,6 @@ def _networks(kind: str) -> tuple[xfeat.XFeat | aliked.Aliked, LightGlue]:
     network.load_state_dict(of_network)
     matcher.load_state_dict(of_matcher)
     return network.eval(), matcher.eval()
-
-
-def _by_quarters(roll: float) -> float:
-    """The angle, or the whole quarters of a turn that are near it; in [0, 2π), to a degree."""
-    quarters = round(roll / (math.pi / 2)) * math.pi / 2
-    nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
-    return nearest % (2 * math.pi)
 
 
 def _prepared(

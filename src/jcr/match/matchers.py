@@ -63,11 +63,11 @@ class SiftMatcher:
         known = self._camera.has_prior_focal_length
         return matched(self.x_px, self._camera, *key, rows, self._seed, known)
 
-    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
-        """Of unit length; the roll changes nothing."""
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """0, and the unit descriptors of all keypoints; the roll changes nothing."""
         with closing(pycolmap.Database.open(self._database)) as db:
             data = np.asarray(db.read_descriptors(row + 1).data, dtype=np.float32)
-        return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-9)
+        return 0, data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-9)
 
 
 class LearnedMatcher:
@@ -90,13 +90,16 @@ class LearnedMatcher:
         from jcr.match.learned import LearnedFeatures
 
         self._features = LearnedFeatures(kind, images)
-        self._features.extract(lambda fraction: report("features", fraction))
         height, width = images[0].shape[:2]
-        scale = np.array([lens.width / width, lens.height / height])
-        self.x_px = [(x + 0.5) * scale - 0.5 for x in self._features.x_px]
-        write_keypoints(database, self.x_px)
+        self._scale = np.array([lens.width / width, lens.height / height])
+        self._database = database
         self._camera, self._known, self._seed, self._report = camera, known, seed, report
         self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
+
+    @property
+    def x_px(self) -> list[Float[ndarray, "k 2"]]:
+        """Keypoints found so far, at the working size; more come with every angle by which an image is turned."""
+        return [(x + 0.5) * self._scale - 0.5 for x in self._features.x_px]
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
         """Matched pair by pair."""
@@ -108,12 +111,13 @@ class LearnedMatcher:
             geometry = self.verified((i, j), rows)
             if geometry is not None:
                 found[i, j] = geometry
+        write_keypoints(self._database, self.x_px)
         return found
 
     def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
         """The geometry of some of a pair's matches."""
         return matched(self.x_px, self._camera, *key, rows, self._seed, self._known)
 
-    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
-        """Of unit length, the image turned by an angle (rad)."""
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """Row of the first keypoint, and unit descriptors from there on, the image turned by an angle (rad)."""
         return self._features.descriptors(row, roll)

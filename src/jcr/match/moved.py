@@ -1,10 +1,11 @@
 """Things that moved in the scene between images: matches that agree with each other and that the robot contradicts."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.match.epipolar import RoughX, distance_px
@@ -13,10 +14,17 @@ from jcr.match.verify import View
 
 Key = tuple[int, int]
 
+LEAST_MATCHES = 12
+"""Of a thing in two images."""
+PLANE_PX = 3.0
 LEAST_OFF_PX = 6.0
 TIMES_FARTHER = 3.0
 """From the predicted epipolar lines than the matches that the robot confirms."""
 LEAST_PAIRS = 3
+LARGEST_AREA = 0.3
+"""Of the image."""
+SCENE_INSIDE = 0.3
+"""Matches of the scene where the thing is seen, beside its own."""
 LARGEST_SHARE = 0.5
 """Of the images: which half moved nobody can say."""
 
@@ -32,22 +40,52 @@ class Moved:
 
 def second_motions(
     view: View,
-    confirmed: Mapping[Key, Pair],
-    others: Mapping[Key, Pair],
+    confirmed: Sequence[Pair],
+    raw: Mapping[Key, Int[ndarray, "m 2"]],
     motion: Float[ndarray, "n n 4 4"],
     x: RoughX,
-) -> dict[Key, Pair]:
-    """Of the `others`, matches beside the confirmed ones of a pair, those that lie off the predicted lines."""
+) -> dict[Key, Int[ndarray, "m 2"]]:
+    """Matches of confirmed pairs that lie off the predicted epipolar lines and on one plane's image in both.
+
+    A face of a thing is plane enough; an essential matrix would take in whatever is left over.
+    """
     found = {}
-    for key, other in others.items():
-        of_scene = np.median(distance_px(view, confirmed[key], motion, x.gripper_from_camera))
-        off = np.median(distance_px(view, other, motion, x.gripper_from_camera))
-        if off > max(LEAST_OFF_PX, TIMES_FARTHER * of_scene):
-            found[key] = other
+    for pair in confirmed:
+        rows = raw.get(pair.key)
+        if rows is None or len(rows) < LEAST_MATCHES:
+            continue
+        of_scene = float(np.median(distance_px(view, pair, motion, x.gripper_from_camera)))
+        away = distance_px(view, replace(pair, rows=rows), motion, x.gripper_from_camera)
+        rows = rows[away > max(LEAST_OFF_PX, TIMES_FARTHER * of_scene)]
+        if len(rows) < LEAST_MATCHES:
+            continue
+        x_i, x_j = view.x_px[pair.i][rows[:, 0]], view.x_px[pair.j][rows[:, 1]]
+        inside = cv2.findHomography(x_i, x_j, cv2.RANSAC, PLANE_PX)[1]
+        if inside is None or inside.sum() < LEAST_MATCHES:
+            continue
+        rows = rows[inside[:, 0].astype(bool)]
+        if _has_place_of_its_own(view, rows, pair):
+            found[pair.key] = rows
     return found
 
 
-def moved_things(view: View, second: Mapping[Key, Pair], count: int) -> Moved | None:
+def _has_place_of_its_own(view: View, rows: Int[ndarray, "m 2"], of_scene: Pair) -> bool:
+    """Whether a second motion fills a small part of both images, where the scene's own motion has few matches.
+
+    A repeated pattern has a second motion, too, all over the scene.
+    """
+    for side, row in enumerate(of_scene.key):
+        mine, its = (view.x_px[row][of[:, side]] for of in (rows, of_scene.rows))
+        low, high = np.quantile(mine, [0.05, 0.95], axis=0)
+        if (high - low).prod() > LARGEST_AREA * view.lens.width * view.lens.height:
+            return False
+        inside = ((its > low) & (its < high)).all(1).sum()
+        if inside > SCENE_INSIDE * len(mine):
+            return False
+    return True
+
+
+def moved_things(view: View, second: Mapping[Key, Int[ndarray, "m 2"]], count: int) -> Moved | None:
     """The smaller group of images between which and the rest something moved; None where nothing did.
 
     A pair of one image of each group shows two motions, a pair within a group one: the groups are the two sides of a

@@ -67,8 +67,8 @@ class Matcher(Protocol):
         """Captures of up to so many images have all pairs matched; of more, pairs grow in proportion to the images."""
         ...
 
-    def descriptors(self, row: int, roll: float) -> Float[ndarray, "k d"]:
-        """Unit descriptors of an image's keypoints, the image turned (rad) before."""
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
         ...
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
@@ -105,8 +105,8 @@ class _Search:
     pairs: dict[Key, Pair] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
-    tried: set[tuple[int, int, int]] = field(default_factory=set)
-    """Pairs, and the turn between them in whole degrees."""
+    tried: set[tuple[int, int, int, int]] = field(default_factory=set)
+    """Pairs, and the angles (degrees) by which their images were turned."""
 
     @property
     def systematic(self) -> float:
@@ -121,15 +121,20 @@ class _Search:
             turn = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
             if not self.matcher.minds_roll:
                 turn = (0.0, 0.0)
-            between = round(math.degrees(turn[1] - turn[0])) % 360
-            if any((i, j, (between + near) % 360) in self.tried for near in range(-8, 9)):
+            turn = robot.by_quarters(turn[0]), robot.by_quarters(turn[1])
+            how = (i, j, round(math.degrees(turn[0])), round(math.degrees(turn[1])))
+            if how in self.tried:
                 continue
-            self.tried.add((i, j, between))
+            self.tried.add(how)
             todo.append((i, j))
             turns.append(turn)
         if not todo:
             return
-        for key, geometry in self.matcher.geometries(todo, np.array(turns)).items():
+        found = self.matcher.geometries(todo, np.array(turns))
+        self.view = View.of(
+            self.matcher.x_px, self.view.lens
+        )  # an image that is turned brings keypoints of its own
+        for key, geometry in found.items():
             clean = self._seen(key, geometry)
             if clean is None:
                 continue
@@ -173,6 +178,10 @@ class _Search:
             self.geometries[pair.key], self.pairs[pair.key] = others[pair.key][1], pair
         return self.gate(found) if judged.confirmed else found
 
+    def visible_matches(self) -> dict[Key, Int[ndarray, "m 2"]]:
+        """All matches of the pairs, right or wrong, outside of parts of the image that do not move."""
+        return {key: self._visible(key, rows) for key, rows in self.matcher.raw.items()}
+
     def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "m 2"]:
         """Without matches in parts of the image that do not move."""
         if self.still is None or not len(rows):
@@ -196,7 +205,8 @@ class _Search:
     def _better(self, new: Pair, old: Pair) -> bool:
         """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
         first, second = (self._agrees(pair) for pair in (new, old))
-        return first if first != second else len(new.rows) > len(old.rows)
+        # The later one is of images turned upright, whose keypoints all pairs share.
+        return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def _agrees(self, pair: Pair) -> bool:
         angle = float(rotation_angle(self.motion[pair.key][:3, :3]))
@@ -242,8 +252,8 @@ def match_with_robot(
         notes = _beside(search, found, names, original)
         return Matched(search.geometries, None, search.view.lens, len(search.tried), None, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
-    confirmed = {pair.key for pair in found.confirmed}
-    search.match([key for key in everything if key not in confirmed], upright)
+    if matcher.minds_roll:
+        search.match(everything, upright)
     found = search.gate(found)
     report(0.8)
     if n > matcher.every_pair:
@@ -340,9 +350,7 @@ def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[
         )
     x = translation_of_x(found, search.motion)
     if x is not None:
-        confirmed = {pair.key: pair for pair in found.confirmed}
-        others = {key: pair for key, (pair, _) in search.without_first_motion(found.confirmed).items()}
-        second = second_motions(search.view, confirmed, others, search.motion, x)
+        second = second_motions(search.view, found.confirmed, search.visible_matches(), search.motion, x)
         moved = moved_things(search.view, second, len(search.motion))
         if moved is not None:
             place = moved_in_words(moved, names, original[0] / size[0])

@@ -127,10 +127,11 @@ def read_keypoints(database: Path, count: int) -> list[Float[ndarray, "k 2"]]:
 
 
 def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "k 2"]]) -> None:
-    """Into a database that has the images already."""
+    """Into a database that has the images already; of those that it had, the first stay what they were."""
     with closing(pycolmap.Database.open(database)) as db:
         for row, x in enumerate(x_px):
-            db.write_keypoints(row + 1, (x + HALF_PIXEL).astype(np.float32))
+            write = db.update_keypoints if db.exists_keypoints(row + 1) else db.write_keypoints
+            write(row + 1, (x + HALF_PIXEL).astype(np.float32))
 
 
 def read_geometries(database: Path) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:

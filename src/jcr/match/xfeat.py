@@ -70,13 +70,15 @@ class XFeat(nn.Module):
 
 
 @torch.inference_mode()
-def detect(network: XFeat, image: Float[Tensor, "3 h w"], count: int) -> Float[Tensor, "k 2"]:
-    """The `count` best keypoints of values in 0..1; pixel centres are whole numbers.
+def detect(
+    network: XFeat, image: Float[Tensor, "3 h w"], count: int
+) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 64"]]:
+    """The `count` best keypoints of values in 0..1, and their unit descriptors; pixel centres are whole numbers.
 
     Published keypoints are whole pixels; here each is moved to the centre of its 3x3 neighbourhood in the heat map,
     for calibration needs fractions of a pixel.
     """
-    _, logits, reliability = network(image[None])
+    features, logits, reliability = network(image[None])
     heat = F.pixel_shuffle(F.softmax(logits, 1)[:, : CELL**2], CELL)
     is_peak = (heat == F.max_pool2d(heat, 5, stride=1, padding=2)) & (heat > LEAST_SCORE)
     is_peak[..., :2, :] = is_peak[..., -2:, :] = is_peak[..., :2] = is_peak[..., -2:] = False
@@ -89,17 +91,8 @@ def detect(network: XFeat, image: Float[Tensor, "3 h w"], count: int) -> Float[T
     patch = heat[0, 0, y[:, None, None] + near[:, None], x[:, None, None] + near]
     weight = patch / patch.sum((1, 2), keepdim=True)
     dx, dy = (weight * near).sum((1, 2)), (weight * near[:, None]).sum((1, 2))
-    return torch.stack([x + dx, y + dy], -1)
-
-
-@torch.inference_mode()
-def describe(
-    network: XFeat, image: Float[Tensor, "3 h w"], x_px: Float[Tensor, "k 2"]
-) -> Float[Tensor, "k 64"]:
-    """Unit descriptors of an image at these pixels."""
-    features = F.normalize(network(image[None])[0], dim=1)
-    at = F.grid_sample(features, _grid(x_px, image), mode="bicubic", align_corners=False)
-    return F.normalize(at[0, :, 0].T, dim=-1)
+    at = F.grid_sample(F.normalize(features, dim=1), grid[:, :, best], mode="bicubic", align_corners=False)
+    return torch.stack([x + dx, y + dy], -1), F.normalize(at[0, :, 0].T, dim=-1)
 
 
 def _grid(x_px: Float[Tensor, "k 2"] | Int[Tensor, "k 2"], image: Tensor) -> Float[Tensor, "1 1 k 2"]:
