@@ -114,9 +114,7 @@ def moved_things(view: View, second: Mapping[Key, Int[ndarray, "m 2"]], count: i
     regions = []
     for row in smaller:
         points = [
-            view.x_px[row][pair.rows[:, 0 if pair.i == row else 1]]
-            for key, pair in second.items()
-            if row in key
+            view.x_px[row][rows[:, 0 if key[0] == row else 1]] for key, rows in second.items() if row in key
         ]
         low, high = np.quantile(np.concatenate(points), [0.05, 0.95], axis=0).round().astype(int)
         regions.append((int(low[0]), int(low[1]), int(high[0]), int(high[1])))
