@@ -54,17 +54,22 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
     folders = sorted(path.parent for path in captures.glob("*/reference.json"))
     if not folders:
         raise InputError(f"{captures}: no folder below it holds a reference.json beside its capture.json")
-    rows = [row_of(folder, features, gate) for folder in folders for features, gate in WAYS]
-    best = {way: sum(row.trusted for row in rows if (row.features, row.gate) == way) for way in WAYS}
-    told = ", ".join(
-        f"{count} with {features}{'' if gate else ' and no gate'}" for (features, gate), count in best.items()
-    )
+    return table([row_of(folder, features, gate) for folder in folders for features, gate in WAYS])
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown of the rows."""
+    told = []
+    for features, gate in WAYS:
+        some = [row for row in rows if (row.features, row.gate) == (features, gate)]
+        how = features + ("" if gate else " and no gate")
+        told += [f"{sum(row.trusted for row in some)} of {len(some)} with {how}"] if some else []
     lines = [
-        f"> Real captures, {len(folders)}: trusted calibrations from images alone: {told}.",
+        f"> Real captures, {len({row.capture for row in rows})}: trusted calibrations from images alone: {', '.join(told)}.",
         "",
         "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
-        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense depth and "
-        "calibration.",
+        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense depth "
+        "and calibration.",
         "",
         "| capture | features | gate | images registered | off: mm | ° | in σ | ±σ: mm | ° | trusted | s |",
         "|---" * 11 + "|",
