@@ -100,8 +100,8 @@ def table(verdicts: Sequence[Verdict]) -> str:
                 "",
                 f"{IMAGES} images of 640x480, robot noise {ROBOT_NOISE[0]} mm and {ROBOT_NOISE[1]}°; "
                 f"{', '.join(f'{count} of each with {name}' for name, count in SEEDS.items())}. "
-                f"Wrong: over {WRONG_MM:.0f} mm or {WRONG_DEG:.0f}° off and beyond {WRONG_SIGMAS:.0f} of its own σ; right: "
-                "trusted and not wrong. Off: median distance from the truth, trusted or not.",
+                f"Wrong: over {WRONG_MM:.0f} mm or {WRONG_DEG:.0f}° off and beyond {WRONG_SIGMAS:.0f} of its own σ; "
+                "right: trusted and not wrong. Off: median distance from the truth, trusted or not.",
                 "",
                 "| scene | features | gate: right / trusted / wrong | images registered | off, mm | s "
                 "| no gate: right / trusted / wrong | images registered | off, mm | s |",

@@ -65,11 +65,12 @@ def table(rows: Sequence[Row]) -> str:
         how = features + ("" if gate else " and no gate")
         told += [f"{sum(row.trusted for row in some)} of {len(some)} with {how}"] if some else []
     lines = [
-        f"> Real captures, {len({row.capture for row in rows})}: trusted calibrations from images alone: {', '.join(told)}.",
+        f"> Real captures, {len({row.capture for row in rows})}: trusted calibrations from images alone: "
+        f"{', '.join(told)}.",
         "",
         "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
-        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense depth "
-        "and calibration.",
+        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense "
+        "depth and calibration.",
         "",
         "| capture | features | gate | images registered | off: mm | ° | in σ | ±σ: mm | ° | trusted | s |",
         "|---" * 11 + "|",

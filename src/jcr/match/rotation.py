@@ -108,8 +108,8 @@ def _refined(
 
 def _gap(
     x: Float[ndarray, "*batch 3 3"], gripper: Float[ndarray, "p 3 3"], camera: Float[ndarray, "p 3 3"]
-) -> Float[ndarray, "*batch p"]:
-    """Angle (rad) by which each pair contradicts R_X."""
+) -> Float[ndarray, "..."]:
+    """Angle (rad; batch by p) by which each pair contradicts R_X."""
     trace = np.einsum("...ij,...ij->...", gripper @ x, x @ camera)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
