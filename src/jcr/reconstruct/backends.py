@@ -243,8 +243,8 @@ class ReconstructOptions:
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
     """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
     features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
-    """What COLMAP matches between images: SIFT, or learned features for scenes with little texture, whose weights come
-    with the extra match; auto tries SIFT, then xfeat where that is installed and the first result is rejected."""
+    """What is matched between images; selects the back end colmap. SIFT, or learned features for little texture, whose
+    weights come with the extra match; auto tries sift, then xfeat where it is installed and the first is rejected."""
     board: str | None = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
