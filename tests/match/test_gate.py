@@ -164,11 +164,13 @@ def test_the_smaller_group_of_images_moved():
     rows = np.column_stack([np.arange(20)] * 2)
     second = {(i, j): rows for i in (0, 3) for j in (1, 2, 4, 5)}
     second = {(min(key), max(key)): value for key, value in second.items()}
-    moved = moved_things(view, second, 8)
+    moved = moved_things(view, second, list(second), 8)
     assert moved is not None and moved.rows == (0, 3)
+    many = [(i, j) for i in range(8) for j in range(i + 1, 8)]
+    assert moved_things(view, dict(list(second.items())[:4]), many, 8) is None  # as prints that look alike
     left, top, right, bottom = moved.regions[0]
     assert 95 < left < right < 155 and 195 < top < bottom < 265
-    assert moved_things(view, dict(list(second.items())[:2]), 8) is None
+    assert moved_things(view, dict(list(second.items())[:2]), list(second), 8) is None
 
 
 def test_predicted_epipolar_lines_go_through_the_matches():

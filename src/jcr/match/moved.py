@@ -20,7 +20,10 @@ PLANE_PX = 3.0
 LEAST_OFF_PX = 6.0
 TIMES_FARTHER = 3.0
 """From the predicted epipolar lines than the matches that the robot confirms."""
-LEAST_PAIRS = 3
+LEAST_PAIRS = 4
+LEAST_SHARE = 0.4
+"""Of the confirmed pairs between the two groups, those that show two motions. Prints that look alike on several things
+show a few, too."""
 LARGEST_AREA = 0.3
 """Of the image."""
 SCENE_INSIDE = 0.3
@@ -85,7 +88,9 @@ def _has_place_of_its_own(view: View, rows: Int[ndarray, "m 2"], of_scene: Pair)
     return True
 
 
-def moved_things(view: View, second: Mapping[Key, Int[ndarray, "m 2"]], count: int) -> Moved | None:
+def moved_things(
+    view: View, second: Mapping[Key, Int[ndarray, "m 2"]], confirmed: Sequence[Key], count: int
+) -> Moved | None:
     """The smaller group of images between which and the rest something moved; None where nothing did.
 
     A pair of one image of each group shows two motions, a pair within a group one: the groups are the two sides of a
@@ -110,6 +115,9 @@ def moved_things(view: View, second: Mapping[Key, Int[ndarray, "m 2"]], count: i
     # Images without such a pair stand with the larger group.
     smaller = min(groups, key=len)
     if not smaller or len(smaller) > LARGEST_SHARE * count:
+        return None
+    between = [key for key in confirmed if (key[0] in smaller) != (key[1] in smaller)]
+    if sum(key in second for key in between) < max(LEAST_PAIRS, LEAST_SHARE * len(between)):
         return None
     regions = []
     for row in smaller:

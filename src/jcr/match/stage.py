@@ -351,8 +351,8 @@ def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[
     x = translation_of_x(found, search.motion)
     if x is not None:
         second = second_motions(search.view, found.confirmed, search.visible_matches(), search.motion, x)
-        moved = moved_things(search.view, second, len(search.motion))
+        moved = moved_things(search.view, second, [p.key for p in found.confirmed], len(search.motion))
         if moved is not None:
             place = moved_in_words(moved, names, original[0] / size[0])
-            notes.append(f"something stands elsewhere than in the other images in {place}: left out")
+            notes.append(f"something seems to stand elsewhere than in the other images in {place}: left out")
     return tuple(notes)
