@@ -61,10 +61,16 @@ class IntrinsicsPrior:
 def prior_of(
     intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, "9"] = MEASURED
 ) -> IntrinsicsPrior:
-    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS."""
+    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS.
+
+    One that is not a number is that of MEASURED.
+    """
     if not isinstance(std, dict):
-        free = np.flatnonzero(np.asarray(std) > LEAST)
-        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], np.asarray(std)[free])
+        usual = prior_of(intrinsics)
+        spread = np.sqrt(usual.directions**2 @ usual.std**2)
+        std = np.where(np.isnan(std), spread, std)
+        free = np.flatnonzero(std > LEAST)
+        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {
         "f": {"fx": fx, "fy": fy},
