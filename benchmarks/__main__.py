@@ -36,6 +36,13 @@ BENCHES = {
     "run": Bench("the whole job on the bundled capture: error, time and memory", True),
     "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
     "real": Bench("real captures in DIR, against the references stored beside them", True, of_captures=True),
+    "matching": Bench(
+        "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
+        True,
+        of_captures=True,
+    ),
+    "gate": Bench("scenes that mislead matching, with the robot's gate and without", True),
+    "many": Bench("from 8 to 200 images: seconds and peak memory", True),
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
     ),

@@ -27,6 +27,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
+    (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (("camera.py", "projection, distortion, derivatives", 1), ("least_squares.py", "damped Gauss-Newton", 1)),

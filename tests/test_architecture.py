@@ -18,6 +18,7 @@ LAYERS = [
     {"camera", "least_squares"},
     {"handeye"},
     {"capture"},
+    {"match"},
     {"reconstruct"},
     {"calibration"},
     {"represent", "segment"},
@@ -34,7 +35,7 @@ LAYERS = [
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-TORCH_ROOMS = {"reconstruct", "represent", "segment"}
+TORCH_ROOMS = {"match", "reconstruct", "represent", "segment"}
 BACK_ENDS = ["backends", "from_pairs", "colmap", "mapanything", "marker", "predictions"]
 SOLVERS = [
     "least_squares",

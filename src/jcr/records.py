@@ -330,6 +330,8 @@ class Attempt:
     """0 where there was nothing to calibrate."""
     why_not: str | None
     """Why the run does not go on with it; None where it does."""
+    features: str | None = None
+    """What was matched between images, where the back end has a choice."""
 
 
 @dataclass(frozen=True)
