@@ -138,9 +138,9 @@ class Reconstruction:
     notes: tuple[str, ...] = ()
     """What the user should know: images not registered, distortion dropped."""
     reason: UInt8[ndarray, "m h w"] | None = None
-    """What a pixel's depth rests on: NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
+    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
     depth_std: Float[ndarray, "m h w"] | None = None
-    """One sigma of the depth (z) at the pixels, in recon units; None: not known."""
+    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
     evidence: CameraEvidence | None = None
     """In the same frame, where the robot's poses had a say in `recon_from_camera` or cameras err beside them."""
 

@@ -1,8 +1,8 @@
 """New images of a calibrated camera: their pointmaps, and what they contradict in the older ones.
 
-The camera's place follows from the gripper's, so that nothing is calibrated again. Depth is matched,
-whichever back end made the reconstruction, and no plane is assumed. A scene changes between images; what a later one sees through,
-or sees in the way of an older ray, is taken from the older pointmaps.
+The camera's place follows from the gripper's, so that nothing is calibrated again. Depth is matched, whichever back end
+made the reconstruction, and no plane is assumed. A scene changes between images; what a later one sees through, or sees
+in the way of an older ray, is taken from the older pointmaps.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Reconst
 NEIGHBOURS = 6
 """Images that a new one is compared with; at most half of them are other new ones."""
 REACH = 1.5
-"""The planes that span the search reach so much more than the known points: a new thing may be taller than all others."""
+"""The planes that span the search reach so much farther than known points: a new thing may be taller than all others."""
 CONTRADICTION = 0.015
 """Relative difference of depths by which one surface lies before another, beyond noise of depth and poses."""
 LEAST_SHARE = 0.005

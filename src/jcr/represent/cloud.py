@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
-from jcr.records import PRIOR, Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import MATCHED, Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions
 
 
@@ -26,14 +26,12 @@ def point_cloud(
     options = options or CloudOptions()
     confidence = reconstruction.confidence
     keep = confidence > 0
-    # Priors have passed tests of their own; their confidence is not one of matching.
-    prior = np.zeros_like(keep) if reconstruction.reason is None else keep & (reconstruction.reason == PRIOR)
-    matched = keep & ~prior
+    # Depths on a plane have passed tests of their own, and hardly any is wrong.
+    alone = keep if reconstruction.reason is None else keep & (reconstruction.reason == MATCHED)
     if options.confidence_threshold is not None:
         keep &= confidence >= options.confidence_threshold
-    elif matched.any():
-        least = np.percentile(confidence[matched], options.confidence_percentile)
-        keep = prior | (matched & (confidence >= least))
+    elif alone.any():
+        keep &= ~alone | (confidence >= np.percentile(confidence[alone], options.confidence_percentile))
     pixel = np.flatnonzero(keep)
     if len(pixel) == 0:
         best = float(confidence.max()) if confidence.size else 0.0

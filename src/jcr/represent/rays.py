@@ -87,8 +87,8 @@ def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.
         near = b.x + cell * (CLEARANCE + NEAR * uniform(len(b.x)).square()) * b.ahead
         far = a.x + (CLEARANCE * cell + a.reach * uniform(len(a.x))) * a.ahead
         positives, negatives = [rays.x, behind], [near, far, anywhere(n // 8)]
-        # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends all the
-        # same: what it says there counts only where the seen grid was crossed.
+        # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends
+        # all the same: what it says there counts only where the seen grid was crossed.
         free_far = torch.maximum(a.measured, ((seen.at(far) & CROSSED) != 0).float())
         weights = [
             rays.weight,

@@ -31,8 +31,8 @@ _COARSE = (0.2, 0.1, 0.05, 0.025)
 _FINE = (0.01, 0.003)
 """Per pass at half and at full resolution: relative change of inverse depth that is tried."""
 _COARSE_TRIES, _FINE_TRIES = 3, 2
-_PEAK = (0.003, 0.001)
-"""Relative changes of inverse depth, to either side, by which the peak is found in the end."""
+_PEAK = 0.003
+"""Relative change of inverse depth, to either side, by which the peak is found in the end."""
 LEAST = 0.25
 """Of the nearest inverse depth that tracks tell, the least that is searched."""
 
@@ -117,8 +117,7 @@ def match_depth(
             if level is half:
                 asked = best_neighbours(found, ASKED, padded, near.others, *window, near.a, near.b, k)
             else:
-                for step in _PEAK:
-                    to_the_peak(found, score, *views, step)
+                to_the_peak(found, score, *views, _PEAK)
         return np.maximum(inverse_depths(found, k), np.float32(0.5 * lowest)), score
 
     depths, scores = [], []

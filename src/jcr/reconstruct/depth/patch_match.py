@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.reconstruct.depth.compiled import compiled
+from jcr.reconstruct.depth.compiled import compiled, random_state, uniform
 
 REACH, STRIDE = 2, 2
 """The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""
@@ -196,19 +196,19 @@ def random_planes(family, lowest, highest, k, h, w, seed):
 
     The inverse depth of these lies between `lowest` and `highest`.
     """
-    np.random.seed(seed)
+    state = random_state(seed)
     planes = np.empty((h, w, 3), np.float32)
     for v in range(h):
         for u in range(w):
             rx, ry = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
-            t = np.random.random()
+            t = uniform(state)
             planes[v, u] = (1 - t) * family[0] + t * family[1]
             if (
-                np.random.random() < 0.5
+                uniform(state) < 0.5
                 or planes[v, u, 0] * rx + planes[v, u, 1] * ry + planes[v, u, 2] <= lowest
             ):
-                inverse_depth = lowest + (highest - lowest) * np.random.random()
-                n0, n1, n2 = 2 * np.random.random() - 1, 2 * np.random.random() - 1, 1.0
+                inverse_depth = lowest + (highest - lowest) * uniform(state)
+                n0, n1, n2 = 2 * uniform(state) - 1, 2 * uniform(state) - 1, 1.0
                 facing = n0 * rx + n1 * ry + n2
                 if facing < 0.3:
                     n0, n1, facing = 0.0, 0.0, 1.0
@@ -254,7 +254,7 @@ def spread_planes(
     Passes alternate in direction (Bleyer et al. 2011, section 3.2). `size` is the relative change of inverse depth
     that is tried, and of the normal; it halves from try to try.
     """
-    np.random.seed(seed)
+    state = random_state(seed)
     h, w = score.shape
     towards = 1 if backward else -1
     for row in range(h):
@@ -278,11 +278,11 @@ def spread_planes(
                 p0, p1, p2 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
                 inverse_depth = p0 * rx + p1 * ry + p2
                 scale = size * 0.5**t
-                moved = inverse_depth * (1 + scale * (2 * np.random.random() - 1))
+                moved = inverse_depth * (1 + scale * (2 * uniform(state) - 1))
                 moved = min(max(moved, lowest), highest)
                 tilt = min(8 * scale, 0.5) * inverse_depth
-                q0 = p0 + tilt * (2 * np.random.random() - 1)
-                q1 = p1 + tilt * (2 * np.random.random() - 1)
+                q0 = p0 + tilt * (2 * uniform(state) - 1)
+                q1 = p1 + tilt * (2 * uniform(state) - 1)
                 q2 = moved - q0 * rx - q1 * ry
                 if not _faces(q0, q1, q2, rx, ry):
                     continue
@@ -311,7 +311,7 @@ def spread_planes(
 @compiled
 @no_type_check
 def to_the_peak(planes, score, greys, others, asked, weight, weighted, moments, a, b, k, step):
-    """Move each plane to the peak of the parabola through its score and those at inverse depths `step` (relative) off."""
+    """Move each plane to the peak of the parabola through its score and those `step` (relative, of inverse depth) off."""
     h, w = score.shape
     for v in range(h):
         for u in range(w):

@@ -53,6 +53,10 @@ class Prior:
     inverse_depth: Float[ndarray, "h w"]
     holds: Bool[ndarray, "h w"]
     """Colours agree with it and nothing sees through it."""
+    confirms: Bool[ndarray, "h w"]
+    """It holds, or the one other image that looks there agrees: enough where the pixel's own match lies on it."""
+    shown: UInt8[ndarray, "h w"]
+    """Images that show the plane's point in the pixel's colour."""
     contradicts: Bool[ndarray, "h w"]
     """Matched pixels that a well-carried plane shows to be wrong."""
     std: Float[ndarray, "h w"]
@@ -174,6 +178,9 @@ def planar_prior(
         SAME_COLOUR,
     )
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
+    # Where one image alone looks besides this one, it must agree, and the depth must rest on more than a colour.
+    alone = asked & (same == 1) & (unlike == 0) & (through == 0)
+    holds |= alone & on_support[label]
     # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
     held_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
     holds &= ~(lonely & (held_share < WHOLE))[label]
@@ -182,6 +189,8 @@ def planar_prior(
     return Prior(
         inverse_depth=predicted,
         holds=holds,
+        confirms=holds | alone,
+        shown=same,
         contradicts=strong & matched[i] & off,
         std=(rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))).astype(
             np.float32

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.reconstruct.depth.compiled import compiled
+from jcr.reconstruct.depth.compiled import compiled, random_state, uniform
 
 SCALE = 0.35
 """k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1: the larger, the larger the regions."""
@@ -87,7 +87,7 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
     is that plane in the camera's coordinates; it wins where it carries nearly as many pixels as the best. `tolerance`
     is relative, of inverse depth.
     """
-    np.random.seed(seed)
+    state = random_state(seed)
     h, w = label.shape
     size = np.zeros(count, np.int64)
     held = np.zeros(count, np.int64)
@@ -129,7 +129,7 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
             continue
         taken = min(n, SAMPLED)
         for t in range(taken):
-            q = pixel[start[r] + (t if n <= SAMPLED else np.random.randint(n))]
+            q = pixel[start[r] + (t if n <= SAMPLED else int(n * uniform(state)))]
             v, u = q // w, q % w
             rays[t, 0], rays[t, 1], rays[t, 2] = (u - k[2]) / k[0], (v - k[3]) / k[1], 1.0
             depths[t] = inverse_depth[v, u]
@@ -139,11 +139,12 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
             if trial < 0:
                 p = support.copy()
             else:
-                i, j, l = np.random.randint(taken), np.random.randint(taken), np.random.randint(taken)
-                a = np.stack((rays[i], rays[j], rays[l]))
+                first, second = int(taken * uniform(state)), int(taken * uniform(state))
+                third = int(taken * uniform(state))
+                a = np.stack((rays[first], rays[second], rays[third]))
                 if abs(np.linalg.det(a)) < 1e-6:
                     continue
-                p = np.linalg.solve(a, np.array([depths[i], depths[j], depths[l]]))
+                p = np.linalg.solve(a, np.array([depths[first], depths[second], depths[third]]))
             agree = 0
             for t in range(taken):
                 predicted = p[0] * rays[t, 0] + p[1] * rays[t, 1] + p[2]
