@@ -127,9 +127,10 @@ def _before_nearest(
 ) -> Bool[Tensor, "nz ny nx"]:
     """Blocks that lie wholly before the nearest of a camera's points in their direction.
 
-    The points are binned in a pinhole image about their mean direction, about two to a bin; a bin without a measured
-    point frees nothing.
+    The measured points are binned in a pinhole image about their mean direction, about two to a bin; an empty bin frees
+    nothing, and points that are not measured only end what others free.
     """
+    points, assumed = points[measured], points[~measured]
     axis = F.normalize(F.normalize(points, dim=1).mean(0), dim=0)
     across = torch.linalg.cross(axis, torch.eye(3, device=axis.device)[axis.abs().argmin()])
     across = F.normalize(across, dim=0)
@@ -144,9 +145,11 @@ def _before_nearest(
     bins = ((v - v0) / pitch).long() * columns + ((u - u0) / pitch).long()
     nearest = torch.zeros(rows * columns, device=u.device)
     nearest.scatter_reduce_(0, bins, depth, "amin", include_self=False)
-    frees = torch.zeros_like(nearest, dtype=torch.bool)
-    frees[bins[measured[ahead]]] = True
-    nearest[~frees] = 0
+    u, v, depth = (assumed @ turn.T).unbind(-1)
+    column, row = ((u / depth - u0) / pitch).floor(), ((v / depth - v0) / pitch).floor()
+    inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+    bins = (row * columns + column)[inside].long()
+    nearest.scatter_reduce_(0, bins, depth[inside], "amin")
 
     # The centres of the blocks in the turned frame are an outer sum, one term an axis.
     def along(row: int) -> Tensor:

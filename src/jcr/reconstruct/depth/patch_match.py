@@ -311,7 +311,7 @@ def spread_planes(
 @compiled
 @no_type_check
 def to_the_peak(planes, score, greys, others, asked, weight, weighted, moments, a, b, k, step):
-    """Move each plane to the peak of the parabola through its score and those `step` (relative, of inverse depth) off."""
+    """Move each plane to the peak of the parabola through its score and those `step` (relative) off."""
     h, w = score.shape
     for v in range(h):
         for u in range(w):
