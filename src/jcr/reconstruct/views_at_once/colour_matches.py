@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.geometry import apply, inverse, rotation_angle
+from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics
 
 WINDOW = (21, 21)
@@ -27,6 +27,10 @@ LARGEST_RETURN_PX = 0.5
 LEAST_CORRELATION = 0.8
 """Of the patches around both ends, which brightness and contrast leave alone."""
 PATCH_RADIUS = 5
+STEP_RADIUS, LARGEST_STEP = 5, 0.04
+"""Pixels around a keypoint within which depth must not change by more than this share."""
+LARGEST_STD_PX = 0.1
+"""One sigma of a match, across the direction in which its window holds it least."""
 LARGEST_GAP = 0.15
 """By how much the distance of a point from the other camera may differ from that view's own depth, in logarithms."""
 
@@ -61,7 +65,7 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
     starts, points, views, pixels = [], [], [], []
     total = 0
     for n in range(count):
-        known = (geometry.depth[n] > 0).astype(np.uint8)
+        known = (_smooth_surface(geometry.depth[n]) & _held_both_ways(gray[n])).astype(np.uint8)
         corners = cv2.goodFeaturesToTrack(gray[n], keypoints, 0.005, width / 80, mask=known)
         if corners is None:
             continue
@@ -69,10 +73,9 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
         x_in_recon = apply(geometry.recon_from_camera[n], geometry.depth[n][..., None] * directions)
         matched = np.zeros(len(corners), bool)
         for m in range(count):
-            between = inverse(geometry.recon_from_camera[m]) @ geometry.recon_from_camera[n]
-            if m == n or np.degrees(rotation_angle(between[:3, :3])) > 180 or _apart_deg(geometry, n, m) > WIDEST_DEG:
+            if m == n or _apart_deg(geometry, n, m) > WIDEST_DEG:
                 continue
-            good, there = _matched(gray[n], gray[m], corners, x_in_recon, known > 0, geometry, m)
+            good, there = _matched(gray[n], gray[m], corners, x_in_recon, geometry, n, m)
             points.append(total + np.flatnonzero(good))
             views.append(np.full(good.sum(), m))
             pixels.append(there[good])
@@ -82,6 +85,31 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
     if not points:
         return Matches(np.zeros((0, 3)), np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     return Matches(np.concatenate(starts), np.concatenate(points), np.concatenate(views), np.concatenate(pixels))
+
+
+def _smooth_surface(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Where depth is known and without a step around a pixel: an outline is no point of a surface."""
+    window = np.ones((2 * STEP_RADIUS + 1,) * 2, np.uint8)
+    nearest, farthest = cv2.erode(depth, window), cv2.dilate(depth, window)
+    return (nearest > 0) & (farthest < (1 + LARGEST_STEP) * nearest)
+
+
+def _held_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Where a window's content holds it in all directions: along a straight edge a match stays where it was predicted.
+
+    The variance of the flow is the noise's over the smaller eigenvalue of the gradients' summed products (the
+    structure tensor), of which noise alone has a share that is taken off.
+    """
+    image = gray.astype(np.float32)
+    by_x, by_y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    # A Laplacian of white noise has 6 times its deviation (Immerkær, 1996).
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    noise = max(float(np.median(np.abs(cv2.filter2D(image, -1, kernel)))) / 0.6745 / 6, 0.5)
+    xx, xy, yy = (cv2.boxFilter(a * b, -1, WINDOW, normalize=False) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
+    least = (xx + yy) / 2 - np.sqrt((xx - yy) ** 2 / 4 + xy**2)
+    # Sobel's weights of white noise: 12 of the 64 parts.
+    least -= noise**2 * 12 / 64 * WINDOW[0] * WINDOW[1]
+    return least > 2 * (noise / LARGEST_STD_PX) ** 2
 
 
 def _apart_deg(geometry: Geometry, n: int, m: int) -> float:
@@ -95,14 +123,14 @@ def _matched(
     end: UInt8[ndarray, "h w"],
     corners: Float[ndarray, "k 2"],
     x_in_recon: Float[ndarray, "h w 3"],
-    known: Bool[ndarray, "h w"],
     geometry: Geometry,
+    n: int,
     m: int,
 ) -> tuple[Bool[ndarray, " k"], Float[ndarray, "k 2"]]:
     """Which corners of `start` are seen in `end`, the image of view m, and where."""
     k = geometry.pinhole
     x_in_end = apply(inverse(geometry.recon_from_camera[m]), x_in_recon)
-    z = np.where(known & (x_in_end[..., 2] > 1e-9), x_in_end[..., 2], np.nan)
+    z = np.where((geometry.depth[n] > 0) & (x_in_end[..., 2] > 1e-9), x_in_end[..., 2], np.nan)
     with np.errstate(invalid="ignore"):
         u = (k.fx * x_in_end[..., 0] / z + k.cx).astype(np.float32)
         v = (k.fy * x_in_end[..., 1] / z + k.cy).astype(np.float32)
