@@ -135,7 +135,7 @@ class Backend:
     """As measured, and where that stands; empty: not measured here."""
     files: tuple[str, ...] = HUB_FILES
     """Of its weights on the hub."""
-    parameters: float = 0.0
+    parameters: int = 0
     """Of the network, in millions."""
     download_gb: float = 0.0
     commercial: bool = True
