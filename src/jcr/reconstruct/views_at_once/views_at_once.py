@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.camera import project, rays, unproject, zoomed
@@ -189,7 +189,7 @@ def _contradicted(capture: Capture, candidate: _Candidate, pinhole: Intrinsics) 
     refined = candidate.refined
     if refined is not None and candidate.hand_eye.observability.observable:
         base_from_camera = gripper @ candidate.hand_eye.gripper_from_camera
-        distance = epipolar_px(base_from_camera, refined.tracks, capture, pinhole)
+        distance = epipolar_px(base_from_camera, refined.tracks, capture, pinhole, candidate.hand_eye.inliers)
         for k in np.flatnonzero(distance > max(FAR_OFF_PX, FAR_OFF * float(np.median(distance)))):
             named.setdefault(k, f"its matches lie {distance[k]:.0f} px from the robot's epipolar lines")
     return tuple(f"{capture.images[k]}: {why} (median); check its pose" for k, why in sorted(named.items()))
@@ -211,9 +211,13 @@ def _angle_differences_deg(
 
 
 def epipolar_px(
-    base_from_camera: Float[ndarray, "n 4 4"], tracks: Tracks, capture: Capture, pinhole: Intrinsics
+    base_from_camera: Float[ndarray, "n 4 4"],
+    tracks: Tracks,
+    capture: Capture,
+    pinhole: Intrinsics,
+    trusted: Bool[ndarray, " n"],
 ) -> Float[ndarray, " n"]:
-    """Per view the median distance of its matches from the epipolar lines of their keypoints, in pixels.
+    """Per view the median distance, in pixels, of matches with trusted views from the epipolar lines of their keypoints.
 
     Lines are drawn by cameras that the robot and a hand-eye transform give, without distortion. Zero where a view has
     no match.
@@ -229,10 +233,12 @@ def epipolar_px(
     normal = np.cross(between[:, :3, 3], np.einsum("kij,kj->ki", between[:, :3, :3], direction[start]))
     line = normal / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
     distance = pinhole.fx * np.abs((line * direction[others]).sum(1))
-    image = tracks.image[others]
-    return np.array(
-        [np.median(distance[image == k]) if (image == k).any() else 0.0 for k in range(len(base_from_camera))]
-    )
+    views = tracks.image[start], tracks.image[others]
+    medians = []
+    for k in range(len(base_from_camera)):
+        mine = ((views[0] == k) & trusted[views[1]]) | ((views[1] == k) & trusted[views[0]])
+        medians.append(float(np.median(distance[mine])) if mine.any() else 0.0)
+    return np.array(medians)
 
 
 def _second_pass(
