@@ -50,7 +50,9 @@ BENCHES = {
     "predictions": Bench(
         "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
     ),
-    "models": Bench("any-view models from predictions with published errors, beside COLMAP and direct alignment"),
+    "models": Bench(
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment"
+    ),
     "align": Bench(
         "global alignment: fast against adam, kinematic against free, in error, time and memory", True
     ),

@@ -1,4 +1,4 @@
-"""`jcr bench models`: any-view models as back ends, from predictions with errors of a published size, beside the others."""
+"""`jcr bench models`: any-view models from predictions with errors of a published size, beside other back ends."""
 
 import shutil
 import tempfile
@@ -67,7 +67,9 @@ def run() -> str:
         for table, texture in TABLES.items():
             for seed in SEEDS:
                 place = Path(folder) / f"{table}{seed}"
-                simulate(place, SimulateOptions("measuring", images=IMAGES, seed=seed, texture=texture, **WEBCAM))
+                simulate(
+                    place, SimulateOptions("measuring", images=IMAGES, seed=seed, texture=texture, **WEBCAM)
+                )
                 shutil.copytree(place / "truth" / "labels", place / "labels")
                 capture, truth = read_capture(place), read_truth(place)
                 for level, errors in LEVELS.items():
@@ -77,11 +79,11 @@ def run() -> str:
                 for method, reconstructed in _methods(place, seed).items():
                     cells.setdefault((table, method), []).append(_cell(capture, place, reconstructed))
     lines = [
-        f"Simulated scenes `measuring` of seeds {SEEDS[0]} to {SEEDS[-1]}, {IMAGES} images, with the robot noise and the "
-        "webcam of table1; medians. The predictions are the truth with errors: each camera turned about the scene and "
+        f"Simulated scenes `measuring` of seeds {SEEDS[0]} to {SEEDS[-1]}, {IMAGES} images, with the robot noise and "
+        "the webcam of table1; medians. The predictions are the truth with errors: each camera turned about the scene and "
         "about itself, its distance and its depth wrong by smooth shares, depth edges smoothed. Pairs right up to 3° "
-        f"(area under the curve): {', '.join(f'{level} {np.mean(values):.0f} %' for level, values in right.items())}. σ: "
-        "the true error over the reported one. Surface: median distance of the cloud from the true surface.",
+        f"(area under the curve): {', '.join(f'{level} {np.mean(values):.0f} %' for level, values in right.items())}. "
+        "σ: the true error over the reported one. Surface: median distance of the cloud from the true surface.",
     ]
     for table in TABLES:
         lines += [
@@ -102,7 +104,9 @@ def _claim(cells: dict[tuple[str, str], list[Cell | None]]) -> str:
         found = [cell for cell in cells[table, method] if cell is not None]
         if not found:
             return "nothing"
-        mm, deg = (np.median([getattr(cell, name) for cell in found]) for name in ("translation_mm", "rotation_deg"))
+        mm, deg = (
+            np.median([getattr(cell, name) for cell in found]) for name in ("translation_mm", "rotation_deg")
+        )
         return f"{mm:.1f} mm and {deg:.2f}°"
 
     level = "as on HiRoom"
@@ -149,7 +153,9 @@ def _methods(place: Path, seed: int) -> dict[str, Callable[[Capture], Reconstruc
         methods[f"predicted and refined, {level}"] = predicted(errors, True)
     # Its tracks in the calibration's own adjustment instead of the cameras with their covariance.
     refined = methods["predicted and refined, as on HiRoom"]
-    methods["the same, its tracks adjusted with the robot"] = lambda capture: replace(refined(capture), evidence=None)
+    methods["the same, its tracks adjusted with the robot"] = lambda capture: replace(
+        refined(capture), evidence=None
+    )
     return methods
 
 
@@ -172,7 +178,9 @@ def _cell(capture: Capture, place: Path, reconstructed: Callable[[Capture], Reco
     heights = []
     try:
         cloud = label_tabletop(masked)
-        sizes = {size.label: size for size in measure(cloud, float(np.sqrt(hand_eye.covariance[6, 6]))).objects}
+        sizes = {
+            size.label: size for size in measure(cloud, float(np.sqrt(hand_eye.covariance[6, 6]))).objects
+        }
         overlap, _ = matched(cloud.label, masked.label, len(truth.labels))
         true_of = {thing.label: thing for thing in truth.objects}
         heights = [

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, transform
+from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
 from jcr.reconstruct.views_at_once.da3 import grid_of
 from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
 from jcr.simulate.truth import Truth, read_truth, true_depth
@@ -76,7 +76,9 @@ def predicted_views(truth: Truth, errors: ViewErrors, seed: int) -> Predicted:
 
 
 def auc(
-    recon_from_camera: Float[ndarray, "n 4 4"], base_from_camera: Float[ndarray, "n 4 4"], threshold_deg: float
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    base_from_camera: Float[ndarray, "n 4 4"],
+    threshold_deg: float,
 ) -> float:
     """Share of pairs of views that are right, averaged over thresholds up to one, as pose benchmarks count.
 

@@ -43,9 +43,9 @@ def choose(
 ) -> Choice:
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
-    `auto` runs the best back end whose weights are on this machine, and the next one, and then a network, when that gives
-    nothing or its calibration is not to be trusted for another reason than the motion. Of two results a trusted one is kept,
-    else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure that the
+    `auto` runs the best back end whose weights are on this machine, and the next one, and then a network, when that
+    gives nothing or its calibration is not to be trusted for another reason than the motion. Of two results a trusted
+    one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure that the
     run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
     names = _asked(candidates(options))

@@ -116,7 +116,10 @@ def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
 ) -> None:
     capture = Capture(Path(), ("a.png",), np.eye(4)[None], (64, 48))
     for installed, words in (
-        (False, "needs depth_anything_3, .*: pip install .*; then jcr models get da3 downloads .* \\(0.5 GB\\)"),
+        (
+            False,
+            "needs depth_anything_3, .*: pip install .*; then jcr models get da3 downloads .* \\(0.5 GB\\)",
+        ),
         (True, "its weights are not on this machine; jcr models get da3 downloads"),
     ):
         monkeypatch.setattr(Backend, "is_installed", lambda self, there=installed: there)
@@ -143,7 +146,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ("options", "words"),
     [
         (ReconstructOptions("colmap", predictions=Path("p.npz")), "--predictions p.npz: .*--backend predictions"),
-        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or da3-small or mapanything"),
+        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or .*pi3x"),
         (ReconstructOptions("given", board="b"), "--board b: .*give --backend marker"),
         (ReconstructOptions("mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),

@@ -43,7 +43,7 @@ def hub() -> Iterator[Hub]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
-        def log_message(self, *args: object) -> None: ...
+        def log_message(self, format: str, *args: object) -> None: ...
 
         def do_HEAD(self) -> None:
             self.do_GET()
@@ -120,7 +120,9 @@ def published(hub: Hub) -> dict[str, object]:
 
 def get(hub: Hub, home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {
-        name: value for name, value in os.environ.items() if not name.lower().endswith("_proxy") and name[:3] != "HF_"
+        name: value
+        for name, value in os.environ.items()
+        if not name.lower().endswith("_proxy") and name[:3] != "HF_"
     }
     return subprocess.run(
         [sys.executable, "-m", "jcr", "models", "get", *arguments],

@@ -105,7 +105,16 @@ def as_text(rows: list[Model]) -> str:
 
 def as_markdown() -> str:
     """The back ends as a table, without what differs from machine to machine."""
-    head = ["back end", "options of its own", "auto", "scale", "parameters", "download", "licence", "measured"]
+    head = [
+        "back end",
+        "options of its own",
+        "auto",
+        "scale",
+        "parameters",
+        "download",
+        "licence",
+        "measured",
+    ]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for row in BACKENDS.values():
         flags = [f"`--{name.replace('_', '-')}`" for name in row.options]

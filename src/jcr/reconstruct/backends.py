@@ -360,7 +360,11 @@ def reconstruct(
     if not row.is_installed():
         raise InputError(
             f"--backend {row.name} needs {row.package}, which is not installed: {row.install}"
-            + (f"; then {weights_command(row)}" if row.hub_id and not row.has_weights() else ", or choose another")
+            + (
+                f"; then {weights_command(row)}"
+                if row.hub_id and not row.has_weights()
+                else ", or choose another"
+            )
         )
     # By name, so that the order of the frames changes nothing.
     order = np.argsort(np.array(capture.images), kind="stable")
@@ -474,7 +478,9 @@ def weights_folder(options: ReconstructOptions) -> Path:
         return cached[0].parent
     if named == row.hub_id:
         raise InputError(f"--backend {row.name}: its weights are not on this machine; {weights_command(row)}")
-    raise InputError(f"--weights {named}: no such folder, nor such weights in the cache; {weights_command(row)}")
+    raise InputError(
+        f"--weights {named}: no such folder, nor such weights in the cache; {weights_command(row)}"
+    )
 
 
 def weights_command(row: Backend) -> str:

@@ -65,8 +65,8 @@ def download(
         for file in files:
             if pinned["files"].get(file.name, _sum(file)) != _sum(file):
                 raise InputError(
-                    f"{hub_id}: {file.name} of revision {commit[:12]} has another checksum than it had when it was first "
-                    "downloaded; do not use it, or delete its entry in "
+                    f"{hub_id}: {file.name} of revision {commit[:12]} has another checksum than it had when it was "
+                    "first downloaded; do not use it, or delete its entry in "
                     f"{_pins_path()} where you trust the hub more"
                 )
     folder = cache / f"models--{hub_id.replace('/', '--')}"
@@ -145,8 +145,8 @@ def _fetched(hub_id: str, file: _File, commit: str, incoming: Path, report: Prog
                 return part
             part.unlink()
             raise InputError(
-                f"{hub_id}: {file.name} has not the checksum that the hub publishes for it; it was deleted: try again, and "
-                "ask who runs the mirror or proxy in between"
+                f"{hub_id}: {file.name} has not the checksum that the hub publishes for it; it was deleted: try again, "
+                "and ask who runs the mirror or proxy in between"
             )
     raise InputError(
         f"{hub_id}: {file.name} broke off {ATTEMPTS} times ({trouble or 'too short'}); what came is kept, and the same "
@@ -183,7 +183,9 @@ def _of_the_network(error: Exception) -> bool:
     """Whether the connection or the hub is at fault; the client's transport (requests, httpx) differs by its version."""
     from huggingface_hub.errors import HfHubHTTPError
 
-    transport = type(error).__module__.partition(".")[0].startswith(("httpx", "httpcore", "requests", "urllib3"))
+    transport = (
+        type(error).__module__.partition(".")[0].startswith(("httpx", "httpcore", "requests", "urllib3"))
+    )
     return transport or isinstance(error, HfHubHTTPError | OSError | RuntimeError | ValueError)
 
 
@@ -208,7 +210,9 @@ def _sum(file: _File) -> str:
 def _require_space(cache: Path, size: int) -> None:
     cache.mkdir(parents=True, exist_ok=True)
     if shutil.disk_usage(cache).free < size + RESERVE:
-        raise InputError(f"{cache}: {size / 1e9:.2g} GB do not fit on its disk; free some, or set HF_HOME to another")
+        raise InputError(
+            f"{cache}: {size / 1e9:.2g} GB do not fit on its disk; free some, or set HF_HOME to another"
+        )
 
 
 def _network_advice() -> str:

@@ -319,7 +319,12 @@ def test_vggts_cameras_are_those_of_its_formula() -> None:
     rng = np.random.default_rng(0)
     quaternion = rng.normal(size=(5, 4))
     encoding = np.concatenate(
-        [rng.normal(size=(5, 3)), quaternion / np.linalg.norm(quaternion, axis=1)[:, None], rng.uniform(0.5, 1.2, (5, 2))], 1
+        [
+            rng.normal(size=(5, 3)),
+            quaternion / np.linalg.norm(quaternion, axis=1)[:, None],
+            rng.uniform(0.5, 1.2, (5, 2)),
+        ],
+        1,
     )
     pose, intrinsics = decoder.pose_encoding_to_extri_intri(torch.tensor(encoding)[None].float(), (392, 518))
     recon_from_camera, pinholes = cameras(encoding, 392, 518)

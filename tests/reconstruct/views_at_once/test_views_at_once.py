@@ -17,7 +17,9 @@ from jcr.records import Capture, Intrinsics
 
 pytestmark = pytest.mark.slow  # draws, and torch
 COUNT, LENS = 6, Intrinsics(420.0, 420.0, 199.5, 149.5, 400, 300)
-X = transform(Rotation.from_euler("xyz", [10, -20, 40], degrees=True).as_matrix(), np.array([0.03, -0.05, 0.08]))
+X = transform(
+    Rotation.from_euler("xyz", [10, -20, 40], degrees=True).as_matrix(), np.array([0.03, -0.05, 0.08])
+)
 
 
 def base_from_camera() -> ndarray:
@@ -28,7 +30,10 @@ def base_from_camera() -> ndarray:
     eyes = far[:, None] * np.stack([0.45 * np.cos(azimuth), 0.45 * np.sin(azimuth), np.full(COUNT, 0.9)], -1)
     target = np.column_stack([rng.uniform(-0.05, 0.05, (COUNT, 2)), np.zeros(COUNT)])
     forward = (target - eyes) / np.linalg.norm(target - eyes, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(forward, [0.0, 0.0, 1.0]), axis=1)[:, None]
+    right = (
+        np.cross(forward, [0.0, 0.0, 1.0])
+        / np.linalg.norm(np.cross(forward, [0.0, 0.0, 1.0]), axis=1)[:, None]
+    )
     level = np.stack([right, np.cross(forward, right), forward], -1)
     return transform(level @ Rotation.from_euler("z", rng.uniform(-1, 1, (COUNT, 1))).as_matrix(), eyes)
 
@@ -38,9 +43,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Pictures of a printed plane."""
     place = tmp_path_factory.mktemp("plane")
     rng = np.random.default_rng(0)
-    print_ = sum(
-        cv2.resize(rng.uniform(0, 1, (n, n)), (1500, 1500), interpolation=cv2.INTER_CUBIC) for n in (40, 100, 250)
-    )
+    layers = [
+        cv2.resize(rng.uniform(0, 1, (n, n)), (1500, 1500), interpolation=cv2.INTER_CUBIC)
+        for n in (40, 100, 250)
+    ]
+    print_ = np.sum(layers, axis=0)
     print_ = (255 * (print_ - print_.min()) / np.ptp(print_)).astype(np.uint8)
     # Print pixels from metres on the plane: 1500 over 1.5 m, its middle at the origin.
     pixel_from_plane = np.array([[1000.0, 0, 749.5], [0, 1000.0, 749.5], [0, 0, 1]])
@@ -163,6 +170,7 @@ def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better
     if not better:
         assert note.endswith("not kept")
     once = reconstruct(capture, options(), predict=Fake(bend=0.02))
+    assert found.evidence is not None and once.evidence is not None
     # Its cameras are the robot's: those of the images alone stay.
     np.testing.assert_array_equal(found.evidence.recon_from_camera, once.evidence.recon_from_camera)
 
@@ -173,7 +181,10 @@ def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
     turned, shifted = capture.base_from_gripper.copy(), capture.base_from_gripper.copy()
     turned[2] = retract(turned[2], np.array([0, 0, 0, 0.25, 0.15, 0.25]))
     shifted[3, :3, 3] += [0.0, 0.05, 0.03]  # which no angle shows
-    for gripper, said in ((turned, "2.png: its angles to the other views"), (shifted, "3.png: its matches lie")):
+    for gripper, said in (
+        (turned, "2.png: its angles to the other views"),
+        (shifted, "3.png: its matches lie"),
+    ):
         found = reconstruct(replace(capture, base_from_gripper=gripper), options(), predict=Fake())
         named = [note for note in found.notes if "check its pose" in note]
         assert len(named) == 1 and named[0].startswith(said), named

@@ -84,7 +84,9 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
         total += len(corners)
     if not points:
         return Matches(np.zeros((0, 3)), np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    return Matches(np.concatenate(starts), np.concatenate(points), np.concatenate(views), np.concatenate(pixels))
+    return Matches(
+        np.concatenate(starts), np.concatenate(points), np.concatenate(views), np.concatenate(pixels)
+    )
 
 
 def _smooth_surface(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
@@ -105,7 +107,10 @@ def _held_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     # A Laplacian of white noise has 6 times its deviation (Immerkær, 1996).
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     noise = max(float(np.median(np.abs(cv2.filter2D(image, -1, kernel)))) / 0.6745 / 6, 0.5)
-    xx, xy, yy = (cv2.boxFilter(a * b, -1, WINDOW, normalize=False) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
+    xx, xy, yy = (
+        cv2.boxFilter(a * b, -1, WINDOW, normalize=False)
+        for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y))
+    )
     least = (xx + yy) / 2 - np.sqrt((xx - yy) ** 2 / 4 + xy**2)
     # Sobel's weights of white noise: 12 of the 64 parts.
     least -= noise**2 * 12 / 64 * WINDOW[0] * WINDOW[1]
@@ -138,11 +143,13 @@ def _matched(
     if inside.mean() < 0.02:
         return np.zeros(len(corners), bool), corners
     # Far outside, where nothing is, instead of NaN, which remap does not know.
-    u, v = np.where(np.isfinite(u), u, -1e4).astype(np.float32), np.where(np.isfinite(v), v, -1e4).astype(np.float32)
+    u, v = (
+        np.where(np.isfinite(u), u, -1e4).astype(np.float32),
+        np.where(np.isfinite(v), v, -1e4).astype(np.float32),
+    )
     drawn = cv2.remap(end, u, v, cv2.INTER_LINEAR)
-    flow = dict(winSize=WINDOW, maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(start, drawn, corners, corners.copy(), **flow)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(drawn, start, moved, moved.copy(), **flow)
+    moved, found = _flow(start, drawn, corners)
+    back, returned = _flow(drawn, start, moved)
     good = (found[:, 0] > 0) & (returned[:, 0] > 0)
     good &= np.linalg.norm(back - corners, axis=1) < LARGEST_RETURN_PX
     there = np.stack([_sampled(u, moved), _sampled(v, moved)], axis=-1)
@@ -156,6 +163,22 @@ def _matched(
     return good, there
 
 
+def _flow(
+    one: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], at: Float[ndarray, "k 2"]
+) -> tuple[Float[ndarray, "k 2"], UInt8[ndarray, "k 1"]]:
+    """Where points of one image are in the other, which looks nearly like it; and whether that was found."""
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        one,
+        other,
+        at,
+        at.copy(),
+        winSize=WINDOW,
+        maxLevel=LEVELS,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return moved, found
+
+
 def _sampled(values: Float[ndarray, "h w"], x_px: Float[ndarray, "k 2"]) -> Float[ndarray, " k"]:
     """Between pixels, linearly."""
     x = x_px.astype(np.float32)
@@ -163,7 +186,10 @@ def _sampled(values: Float[ndarray, "h w"], x_px: Float[ndarray, "k 2"]) -> Floa
 
 
 def _correlation(
-    one: UInt8[ndarray, "h w"], at: Float[ndarray, "k 2"], other: UInt8[ndarray, "h w"], there: Float[ndarray, "k 2"]
+    one: UInt8[ndarray, "h w"],
+    at: Float[ndarray, "k 2"],
+    other: UInt8[ndarray, "h w"],
+    there: Float[ndarray, "k 2"],
 ) -> Float[ndarray, " k"]:
     """Normalised correlation of the patches around both ends."""
     if not len(at):

@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import nearest_rotation
-from jcr.records import Intrinsics
 from jcr.reconstruct.preprocess import ImageGrid
+from jcr.records import Intrinsics
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -114,7 +114,9 @@ def checked(predicted: Predicted, model: str) -> Predicted:
     there &= predicted.x_in_camera[..., 2] > 0
     poses = predicted.recon_from_camera
     if not there.any() or (poses is not None and not np.isfinite(poses).all()):
-        raise InputError(f"{model} gave no usable depth or camera; its weights may be damaged, get them again")
+        raise InputError(
+            f"{model} gave no usable depth or camera; its weights may be damaged, get them again"
+        )
     return Predicted(
         predicted.grid,
         np.where(there[..., None], predicted.x_in_camera, 0).astype(np.float32),

@@ -65,7 +65,11 @@ def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
         answers = model.infer(shown, use_amp=device != "cpu", apply_mask=False)
     count, height, width = colors.shape[:3]
     points = np.empty((count, height, width, 3), np.float32)
-    confidence, poses, pinholes = np.empty((count, height, width)), np.empty((count, 4, 4)), np.empty((count, 4))
+    confidence, poses, pinholes = (
+        np.empty((count, height, width)),
+        np.empty((count, 4, 4)),
+        np.empty((count, 4)),
+    )
     for k, answer in enumerate(answers):
         poses[k] = rigid(output(answer, "camera_poses", (1, 4, 4), "MapAnything"))[0]
         x_in_recon = output(answer, "pts3d", (height, width, 3), "MapAnything")

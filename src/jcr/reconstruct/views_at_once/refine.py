@@ -14,8 +14,8 @@ import pycolmap
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from jcr.camera import by_parameters, by_point, project, rays, unproject, usable_lens, zoomed
-from jcr.geometry import apply, inverse, skew
+from jcr.camera import by_parameters, by_point, project, unproject, zoomed
+from jcr.geometry import inverse, skew
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.sfm import log_level
 from jcr.reconstruct.views_at_once.colour_matches import Geometry, Matches, colour_matches
@@ -81,8 +81,8 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
             return None
         poses, camera = adjusted.recon_from_camera, adjusted.pinhole
         change = _depth_changes(adjusted, depth)
-        depth = depth * np.stack([_smooth(c, *depth.shape[1:]) for c in change])
-        factor = factor * np.stack([_smooth(c, *factor.shape[1:]) for c in change])
+        depth = depth * np.stack([_smooth(c, work.size[1], work.size[0]) for c in change])
+        factor = factor * np.stack([_smooth(c, *predicted.grid.size[::-1]) for c in change])
     assert adjusted is not None
     tracks, work_px = adjusted.tracks, adjusted.tracks.x_px
     evidence = CameraEvidence(poses, _covariance(adjusted, images.pinhole is None))
@@ -112,13 +112,19 @@ def _working_grid(size: tuple[int, int]) -> ImageGrid:
 
 
 def _shrunk(image: UInt8[ndarray, "h w 3"], grid: ImageGrid) -> UInt8[ndarray, "h2 w2 3"]:
-    return image if grid.size == grid.original_size else cv2.resize(image, grid.size, interpolation=cv2.INTER_AREA)
+    return (
+        image
+        if grid.size == grid.original_size
+        else cv2.resize(image, grid.size, interpolation=cv2.INTER_AREA)
+    )
 
 
 def _depth_on(grid: ImageGrid, predicted: Predicted) -> Float[ndarray, "n h w"]:
     """Predicted depth at the pixels of another grid of the same images; 0 outside, and beside what is unknown."""
     v, u = np.mgrid[: grid.size[1], : grid.size[0]]
-    there = predicted.grid.grid_from_original(grid.original_from_grid(np.stack([u, v], -1).astype(np.float64)))
+    there = predicted.grid.grid_from_original(
+        grid.original_from_grid(np.stack([u, v], -1).astype(np.float64))
+    )
     x, y = (there[..., axis].astype(np.float32) for axis in range(2))
     # The grid's outermost half pixels are still inside the image.
     x, y = np.clip(x, 0, predicted.grid.size[0] - 1), np.clip(y, 0, predicted.grid.size[1] - 1)
@@ -157,7 +163,11 @@ def _started(tracks: Tracks, matches: Matches, geometry: Geometry) -> Tracks:
 
 
 def _adjusted(
-    tracks: Tracks, recon_from_camera: Float[ndarray, "n 4 4"], pinhole: Intrinsics, loss_px: float, hold: bool
+    tracks: Tracks,
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    pinhole: Intrinsics,
+    loss_px: float,
+    hold: bool,
 ) -> _Adjusted | None:
     """Bundle adjustment of cameras and points, and of the focal length unless it is held; wrong matches leave.
 
@@ -231,7 +241,9 @@ def _depths(
 ) -> Float[ndarray, " k"]:
     """Depth of every observation's point in its camera."""
     camera_from_recon = inverse(recon_from_camera)[tracks.image]
-    return np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], points[tracks.point]) + camera_from_recon[:, 2, 3]
+    return (
+        np.einsum("kj,kj->k", camera_from_recon[:, 2, :3], points[tracks.point]) + camera_from_recon[:, 2, 3]
+    )
 
 
 def _residuals(adjusted: _Adjusted) -> Float[ndarray, "k 2"]:
@@ -327,7 +339,9 @@ def _covariance(adjusted: _Adjusted, focal_free: bool) -> Float[ndarray, "r r"]:
     np.add.at(block, tracks.point, np.einsum("k,kij,kil->kjl", weight, by_x, by_x))
     for k in range(count):
         mine = tracks.image == k
-        np.add.at(cross, tracks.point[mine], np.einsum("k,kij,kil->kjl", weight[mine], jacobian[mine], by_x[mine]))
+        np.add.at(
+            cross, tracks.point[mine], np.einsum("k,kij,kil->kjl", weight[mine], jacobian[mine], by_x[mine])
+        )
     block += 1e-9 * np.trace(block, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     away = cross @ np.linalg.inv(block)
     # A larger scene seen from farther away looks the same: that step, and all of the first camera's, is held.

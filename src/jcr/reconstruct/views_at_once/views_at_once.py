@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.camera import project, rays, unproject, zoomed
+from jcr.camera import project, rays, unproject
 from jcr.errors import InputError
-from jcr.geometry import ARM, apply, inverse, rotation_angle, scale_translation
+from jcr.geometry import ARM, apply, inverse, rotation_angle
 from jcr.handeye.solve import solve_hand_eye
 from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
@@ -109,7 +109,9 @@ def reconstruct(
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 0.5)
     if predicted.recon_from_camera is None:
-        raise InputError(f"--backend {options.backend} sees one view at a time and gives no cameras; choose another")
+        raise InputError(
+            f"--backend {options.backend} sees one view at a time and gives no cameras; choose another"
+        )
     pinhole = images.pinhole or _own_pinhole(predicted, options.backend)
     chosen, notes = _refined(capture, images, predicted, pinhole, options)
     if options.takes_poses and chosen.hand_eye.converged:
@@ -123,7 +125,12 @@ def _require_memory(capture: Capture, options: ViewsOptions) -> None:
     """Say what it will take, before it is begun."""
     width, height = capture.image_size
     pictures = len(capture) * width * height * (3 + 4)
-    needed = resident() + ALLOWANCE + pictures + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
+    needed = (
+        resident()
+        + ALLOWANCE
+        + pictures
+        + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
+    )
     require(int(needed), options.memory_gb * GB, f"--backend {options.backend} with {len(capture)} images")
     announce(int(needed), options.memory_gb * GB, options.cost.told(len(capture), options.device))
 
@@ -157,9 +164,13 @@ def _refined(
     refined = refine(predicted, images, pinhole) if options.refined else None
     if refined is None:
         note = "too few matches by colour: the cameras are as the model has them"
-        return as_predicted, ((note, *_contradicted(capture, as_predicted, pinhole)) if options.refined else ())
+        return as_predicted, (
+            (note, *_contradicted(capture, as_predicted, pinhole)) if options.refined else ()
+        )
     adjusted = _candidate("refined", gripper, predicted, refined)
-    kept, left = (adjusted, as_predicted) if adjusted.missed_m < as_predicted.missed_m else (as_predicted, adjusted)
+    kept, left = (
+        (adjusted, as_predicted) if adjusted.missed_m < as_predicted.missed_m else (as_predicted, adjusted)
+    )
     note = (
         f"leave-one-out error of the cameras {kept.told()} ({left.told()}): the former were kept; "
         f"{len(refined.tracks.image)} matches by colour, {refined.error_px:.2f} px"
@@ -174,9 +185,7 @@ def _candidate(
     poses = predicted.recon_from_camera if refined is None else refined.recon_from_camera
     assert poses is not None
     covariance = None if refined is None else refined.evidence.covariance
-    return _Candidate(
-        name, predicted, refined, solve_hand_eye(gripper, poses, camera_covariance=covariance)
-    )
+    return _Candidate(name, predicted, refined, solve_hand_eye(gripper, poses, camera_covariance=covariance))
 
 
 def _contradicted(capture: Capture, candidate: _Candidate, pinhole: Intrinsics) -> tuple[str, ...]:
@@ -203,7 +212,8 @@ def _angle_differences_deg(
     It is the same for both, wherever the camera is mounted.
     """
     angles = [
-        np.degrees(rotation_angle((inverse(poses)[:, None] @ poses[None])[..., :3, :3])) for poses in (camera, gripper)
+        np.degrees(rotation_angle((inverse(poses)[:, None] @ poses[None])[..., :3, :3]))
+        for poses in (camera, gripper)
     ]
     difference = np.abs(angles[0] - angles[1])
     np.fill_diagonal(difference, np.nan)
@@ -250,7 +260,9 @@ def _second_pass(
     those of the first pass stay, for the robot's poses must not count twice.
     """
     base_from_camera = capture.base_from_gripper @ first.hand_eye.gripper_from_camera
-    again = with_known_rays(predict(Views(images.colors, images.pinhole or pinhole, base_from_camera)), images)
+    again = with_known_rays(
+        predict(Views(images.colors, images.pinhole or pinhole, base_from_camera)), images
+    )
     if first.refined is None or again.recon_from_camera is None:
         return first, "a second pass was not judged: too few matches by colour"
     tracks = first.refined.tracks
@@ -259,12 +271,17 @@ def _second_pass(
         transfer_px(capture, first.poses, points, first.predicted, tracks, images, pinhole, first.hand_eye)
         for points in (first.points, aligned)
     )
-    words = f"second pass, shown the robot's cameras: matches in views left out are predicted to {after:.2f} px, before {before:.2f} px"
+    words = (
+        f"second pass, shown the robot's cameras: matches in views left out are predicted to {after:.2f} px, before "
+        f"{before:.2f} px"
+    )
     if not after < CLEARLY * before:
         return first, f"{words}: not kept"
     factor = np.ones(again.confidence.shape, np.float32)
     second = replace(again, x_in_camera=aligned.astype(np.float32), recon_from_camera=first.poses)
-    return replace(first, predicted=second, refined=replace(first.refined, depth_factor=factor)), f"{words}: kept"
+    return replace(
+        first, predicted=second, refined=replace(first.refined, depth_factor=factor)
+    ), f"{words}: kept"
 
 
 def _in_unit_of(first: _Candidate, again: Predicted) -> Float[ndarray, "n h w 3"]:
@@ -315,7 +332,11 @@ def transfer_px(
 
 
 def _record(
-    capture: Capture, images: PreparedImages, chosen: _Candidate, options: ViewsOptions, notes: tuple[str, ...]
+    capture: Capture,
+    images: PreparedImages,
+    chosen: _Candidate,
+    options: ViewsOptions,
+    notes: tuple[str, ...],
 ) -> Reconstruction:
     """As a reconstruction, with the evidence of the images alone."""
     predicted, refined = chosen.predicted, chosen.refined
@@ -326,27 +347,46 @@ def _record(
         pinhole = refined.pinhole
         points = points[..., 2:] * rays(grid.grid_intrinsics(pinhole)).astype(np.float32)
     shown = PreparedImages(
-        np.stack([resize_and_crop(image, grid) for image in images.colors]), grid, images.lens, pinhole, images.notes
+        np.stack([resize_and_crop(image, grid) for image in images.colors]),
+        grid,
+        images.lens,
+        pinhole,
+        images.notes,
     )
     poses = chosen.poses
-    in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)]).astype(np.float32)
+    in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)]).astype(
+        np.float32
+    )
     there = predicted.confidence > 0
-    made = reconstruction_from_pointmaps(
-        shown,
-        np.arange(len(capture)),
-        poses,
-        np.where(there[..., None], in_recon, 0),
-        predicted.confidence.astype(np.float32),
-        source=options.backend,
+    x_in_recon = np.where(there[..., None], in_recon, 0)
+    notes = (f"weights {options.weights.name}: {options.licence}", *notes)
+    if refined is None:
+        made = reconstruction_from_pointmaps(
+            shown,
+            np.arange(len(capture)),
+            poses,
+            x_in_recon,
+            predicted.confidence,
+            source=options.backend,
+            backend=options.backend,
+            is_metric=predicted.is_metric,
+            notes=notes,
+        )
+        return replace(made, evidence=predicted_evidence(predicted))
+    return Reconstruction(
+        image_index=np.arange(len(capture)),
+        recon_from_camera=poses,
+        intrinsics=images.lens or refined.pinhole,
+        pointmap_intrinsics=grid.grid_intrinsics(pinhole or refined.pinhole),
+        points_in_recon=x_in_recon,
+        confidence=predicted.confidence,
+        colors=shown.colors,
+        tracks=refined.tracks,
         backend=options.backend,
         is_metric=predicted.is_metric,
-        notes=(f"weights {options.weights.name}: {options.licence}", *notes),
+        notes=(*images.notes, *notes),
+        evidence=refined.evidence,
     )
-    if refined is None:
-        return replace(made, evidence=predicted_evidence(predicted))
-    if images.lens is None:
-        made = replace(made, intrinsics=refined.pinhole)
-    return replace(made, tracks=refined.tracks, evidence=refined.evidence)
 
 
 def predicted_evidence(predicted: Predicted) -> CameraEvidence:
