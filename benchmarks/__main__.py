@@ -53,6 +53,9 @@ BENCHES = {
     "models": Bench(
         "any-view models from predictions with published errors, beside COLMAP and direct alignment"
     ),
+    "model_cost": Bench(
+        "seconds and memory of any-view networks with random weights, beside what is estimated", True
+    ),
     "align": Bench(
         "global alignment: fast against adam, kinematic against free, in error, time and memory", True
     ),

@@ -31,7 +31,7 @@ from jcr.segment.tabletop import label_tabletop
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.truth import read_truth, truth_points
 
-SEEDS = (3, 4, 5)
+SEEDS = (3, 4)
 IMAGES = 10
 TABLES = {"textured": True, "plain": False}
 LEVELS = {
@@ -78,12 +78,13 @@ def run() -> str:
                     right[level].append(100 * auc(made.recon_from_camera, truth.base_from_camera, 3.0))
                 for method, reconstructed in _methods(place, seed).items():
                     cells.setdefault((table, method), []).append(_cell(capture, place, reconstructed))
+    shares = ", ".join(f"{level} {np.mean(values):.0f} %" for level, values in right.items())
     lines = [
         f"Simulated scenes `measuring` of seeds {SEEDS[0]} to {SEEDS[-1]}, {IMAGES} images, with the robot noise and "
-        "the webcam of table1; medians. The predictions are the truth with errors: each camera turned about the scene and "
-        "about itself, its distance and its depth wrong by smooth shares, depth edges smoothed. Pairs right up to 3° "
-        f"(area under the curve): {', '.join(f'{level} {np.mean(values):.0f} %' for level, values in right.items())}. "
-        "σ: the true error over the reported one. Surface: median distance of the cloud from the true surface.",
+        "the webcam of table1; medians. The predictions are the truth with errors: each camera turned about the scene "
+        "and about itself, its distance and its depth wrong by smooth shares, depth edges smoothed. Pairs right up to "
+        f"3° (area under the curve): {shares}. σ: the true error over the reported one. Surface: median distance of "
+        "the cloud from the true surface.",
     ]
     for table in TABLES:
         lines += [
@@ -125,7 +126,7 @@ def _row(method: str, found: list[Cell | None]) -> str:
         return f"| {method} | 0 of {len(found)} | | | | | |"
     accepted = sum(cell.converged for cell in there)
     mm, deg, sigmas, height, surface = (
-        float(np.nanmedian([getattr(cell, name) for cell in there]))
+        float(_median([getattr(cell, name) for cell in there]))
         for name in ("translation_mm", "rotation_deg", "sigmas", "height_percent", "surface_mm")
     )
     measured = sum(cell.measured for cell in there)
@@ -133,6 +134,12 @@ def _row(method: str, found: list[Cell | None]) -> str:
         f"| {method} | {accepted} of {len(found)} | {mm:.2f} mm | {deg:.3f}° | {sigmas:.1f} | {height:.1f} % "
         f"({measured}) | {surface:.1f} mm |"
     )
+
+
+def _median(values: list[float]) -> float:
+    """Of those that there are."""
+    there = [value for value in values if not np.isnan(value)]
+    return float(np.median(there)) if there else float("nan")
 
 
 def _methods(place: Path, seed: int) -> dict[str, Callable[[Capture], Reconstruction]]:

@@ -43,10 +43,10 @@ def choose(
 ) -> Choice:
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
-    `auto` runs the best back end whose weights are on this machine, and the next one, and then a network, when that
+    `auto` runs the best back end whose weights are on this machine, and the next ones when that
     gives nothing or its calibration is not to be trusted for another reason than the motion. Of two results a trusted
-    one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure that the
-    run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
+    one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure
+    that the run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
     names = _asked(candidates(options))
     if len(names) == 1:
@@ -69,11 +69,10 @@ def choose(
 
 
 def _asked(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Of the candidates the two best, and then the best network whose weights are here, which is asked last.
-
-    On tables with print COLMAP is better than a network, on plain ones direct alignment (docs/models.md).
-    """
-    return names[:2] + tuple(name for name in names[2:] if BACKENDS[name].hub_id)[:1]
+    """Of the candidates the two best, where one network that sees all views does not count; no second such one."""
+    networks = [name for name in names if BACKENDS[name].sees_all_views]
+    asked = tuple(name for name in names if name not in networks[1:])
+    return asked[: 3 if networks else 2]
 
 
 def again(

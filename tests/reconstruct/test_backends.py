@@ -103,7 +103,7 @@ def test_the_best_whose_weights_are_here_comes_first(
 ) -> None:
     assert candidates(ReconstructOptions()) == ("colmap", "direct")
     present |= {"dust3r", "mapanything"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "direct", "mapanything")
+    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "mapanything", "direct")
     present.add("mast3r")
     assert candidates(ReconstructOptions())[0] == "mast3r"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")

@@ -145,6 +145,11 @@ class Backend:
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Of an any-view model: views_at_once.cost.Cost."""
 
+    @property
+    def sees_all_views(self) -> bool:
+        """Whether it is a network that is shown all views at once."""
+        return any(self.cost)
+
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
         return not self.package or is_installed(self.package)
@@ -191,14 +196,6 @@ BACKENDS: dict[str, Backend] = {
             "BSD-3-Clause",
             auto=True,
             accuracy="0.05 mm and 0.005° on the bundled capture (docs/results/run.md)",
-        ),
-        Backend(
-            "direct",
-            _direct,
-            "Apache-2.0",
-            auto=True,
-            accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
-            "(docs/plain-tables.md)",
         ),
         Backend(
             "da3",
@@ -268,6 +265,14 @@ BACKENDS: dict[str, Backend] = {
             cost=(6.0, 0.4, 20.0, 4.0),
         ),
         Backend(
+            "direct",
+            _direct,
+            "Apache-2.0",
+            auto=True,
+            accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
+            "(docs/plain-tables.md)",
+        ),
+        Backend(
             "marker",
             _marker,
             "Apache-2.0",
@@ -291,9 +296,10 @@ BACKENDS: dict[str, Backend] = {
 }
 """By name; `auto` takes the first that it may.
 
-Networks whose uncertainty is known come before the one whose is not, metric ones before others. COLMAP needs no
-weights, and sees what networks do not. Direct alignment comes after it: COLMAP matches what is printed on things, it
-the colours of plain ones.
+Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
+sees what networks do not. Networks that see all views come after it: refined by colours they are as good where it works,
+and better than direct alignment on plain tables (docs/results/models.md, with simulated predictions), for more time.
+Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
 """
 
 PATHS = ("predictions", "cameras")

@@ -120,9 +120,9 @@ def _published(hub_id: str, names: Sequence[str], revision: str | None) -> tuple
     files = {sibling.rfilename: sibling for sibling in info.siblings or ()}
     found = []
     for name in names:
-        if name not in files or files[name].size is None or info.sha is None:
+        file = files.get(name)
+        if file is None or file.size is None or info.sha is None:
             raise InputError(f"{hub_id}: the hub has no {name} of it; ask for another --revision")
-        file = files[name]
         found.append(_File(name, file.size, file.lfs.sha256 if file.lfs else None, file.blob_id or ""))
     assert info.sha is not None
     return info.sha, found
