@@ -70,6 +70,19 @@ def _views_at_once(
     return reconstruct(capture, made, progress)
 
 
+def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    extra("torch", "networks", f"--backend {options.backend}")
+    from jcr.reconstruct.views_at_once import moge
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+
+    def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
+        return _colmap(capture, replace(options, backend="colmap", dense=False), progress)
+
+    weights, licence = weights_folder(options), weights_of(options)[1]
+    made = SingleViewsOptions("moge", moge.load, weights, licence, cameras, device_of(options))
+    return reconstruct(capture, made, progress)
+
+
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.marker import MarkerOptions, reconstruct
 
@@ -271,6 +284,19 @@ BACKENDS: dict[str, Backend] = {
             auto=True,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
             "(docs/plain-tables.md)",
+        ),
+        Backend(
+            "moge",
+            _moge,
+            "MIT",
+            metric=True,
+            options=("weights",),
+            hub_id="Ruicheng/moge-2-vitl",
+            package="moge",
+            install="pip install --no-deps dlr-moge dlr-utils3d",
+            files=("model.pt",),
+            parameters=326,
+            download_gb=1.3,
         ),
         Backend(
             "marker",

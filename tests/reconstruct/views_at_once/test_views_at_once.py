@@ -10,10 +10,18 @@ from numpy import ndarray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from jcr.camera import rays
+from jcr.camera import project, rays
 from jcr.errors import InputError
-from jcr.geometry import apply_similarity, fit_similarity, inverse, retract, rotation_between_deg, transform
-from jcr.records import Capture, Intrinsics
+from jcr.geometry import (
+    apply,
+    apply_similarity,
+    fit_similarity,
+    inverse,
+    retract,
+    rotation_between_deg,
+    transform,
+)
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 pytestmark = pytest.mark.slow  # draws, and torch
 COUNT, LENS = 6, Intrinsics(420.0, 420.0, 199.5, 149.5, 400, 300)
@@ -195,3 +203,46 @@ def test_what_does_not_fit_the_memory_is_refused_before_it_is_begun(capture: Cap
 
     with pytest.raises(InputError, match=r"--backend da3 with 6 images needs .* raise --memory-gb"):
         reconstruct(capture, options(memory_gb=0.3), predict=Fake())
+
+
+def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -> None:
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+
+    # Cameras and points as structure from motion has them: exact, few, in a unit of its own.
+    unit, truth = 3.0, inverse(base_from_camera()[0]) @ base_from_camera()
+    rng = np.random.default_rng(0)
+    on_plane = np.column_stack([rng.uniform(-0.2, 0.2, (400, 2)), np.zeros(400)])
+    in_recon = apply(inverse(base_from_camera()[0]), on_plane)
+    seen = [project(LENS, apply(inverse(pose), in_recon)) for pose in truth]
+    inside = np.array([((px > 1) & (px < [LENS.width - 2, LENS.height - 2])).all(1) for px in seen])
+    image, point = np.nonzero(inside)
+    recon_from_camera = truth.copy()
+    recon_from_camera[:, :3, 3] *= unit
+    nothing = np.zeros((COUNT, 2, 2))
+    sparse = Reconstruction(
+        image_index=np.arange(COUNT),
+        recon_from_camera=recon_from_camera,
+        intrinsics=LENS,
+        pointmap_intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
+        points_in_recon=np.zeros((COUNT, 2, 2, 3)),
+        confidence=nothing,
+        colors=np.zeros((COUNT, 2, 2, 3), np.uint8),
+        tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
+        backend="colmap",
+    )
+    made = SingleViewsOptions("moge", options().load, Path("w"), "MIT", lambda capture, progress: sparse)
+
+    def one_by_one(views):
+        found = Fake(bend=0.02)(views)
+        # In metres but for a tenth, and without cameras.
+        points = found.x_in_camera * np.float32(0.5 * 1.1)
+        return replace(found, x_in_camera=points, recon_from_camera=None, is_metric=True)
+
+    found = reconstruct(capture, made, predict=one_by_one)
+    base, scale = fit_similarity(base_from_camera()[:, :3, 3], found.recon_from_camera[:, :3, 3])
+    assert found.is_metric and scale == pytest.approx(1 / 1.1, rel=0.02), (
+        "its metre is kept, to be held against the robot's"
+    )
+    in_base = apply_similarity(base, float(scale), found.points_in_recon.reshape(-1, 3).astype(float))
+    assert np.median(np.abs(in_base[:, 2])) < 1e-3, "10 mm as predicted"
+    assert len(found.tracks.image) == len(image)

@@ -8,6 +8,8 @@ median distance from it.
 """
 
 import json
+import os
+import warnings
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -60,10 +62,13 @@ def load(weights: Path, device: str) -> Predict:
 
 def build(name: str) -> nn.Module:
     """The network of a configuration of the package, with random weights; KeyError for a name it does not know."""
-    from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
-    from depth_anything_3.registry import MODEL_REGISTRY  # type: ignore[import-not-found]
+    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # it tells stdout which layers it builds
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its configuration's library
+        from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
+        from depth_anything_3.registry import MODEL_REGISTRY  # type: ignore[import-not-found]
 
-    return create_object(load_config(MODEL_REGISTRY[name])).eval()
+        return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
 def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Predicted:

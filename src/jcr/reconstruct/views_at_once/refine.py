@@ -80,9 +80,9 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
         if adjusted is None:
             return None
         poses, camera = adjusted.recon_from_camera, adjusted.pinhole
-        change = _depth_changes(adjusted, depth)
-        depth = depth * np.stack([_smooth(c, work.size[1], work.size[0]) for c in change])
-        factor = factor * np.stack([_smooth(c, *predicted.grid.size[::-1]) for c in change])
+        change = depth_changes(adjusted.tracks, poses, depth)
+        depth = depth * np.stack([smooth_factor(c, work.size[1], work.size[0]) for c in change])
+        factor = factor * np.stack([smooth_factor(c, *predicted.grid.size[::-1]) for c in change])
     assert adjusted is not None
     tracks, work_px = adjusted.tracks, adjusted.tracks.x_px
     evidence = CameraEvidence(poses, _covariance(adjusted, images.pinhole is None))
@@ -267,14 +267,15 @@ def _without_outliers(adjusted: _Adjusted, in_front: Bool[ndarray, " k"]) -> _Ad
     return replace(adjusted, tracks=kept)
 
 
-def _depth_changes(adjusted: _Adjusted, depth: Float[ndarray, "n h w"]) -> Sequence[Float[ndarray, "6"]]:
+def depth_changes(
+    tracks: Tracks, recon_from_camera: Float[ndarray, "n 4 4"], depth: Float[ndarray, "n h w"]
+) -> Sequence[Float[ndarray, "6"]]:
     """Per view a quadratic in the image's coordinates, for the logarithm by which its depth is too small.
 
-    Robust least squares on the adjusted points, with a prior on all but its constant: five points in a corner do not
-    bend the rest.
+    `depth` is on the grid in whose pixels `tracks` counts, 0 where nothing is known. Robust least squares on the tracks'
+    points, with a prior on all but its constant: five points in a corner do not bend the rest.
     """
-    tracks = adjusted.tracks
-    z = _depths(tracks, adjusted.recon_from_camera, tracks.points_in_recon)
+    z = _depths(tracks, recon_from_camera, tracks.points_in_recon)
     column, row = np.clip(np.rint(tracks.x_px).astype(int), 0, [depth.shape[2] - 1, depth.shape[1] - 1]).T
     own = depth[tracks.image, row, column]
     found = []
@@ -300,7 +301,7 @@ def _basis(x: ndarray, y: ndarray) -> ndarray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _smooth(coefficients: Float[ndarray, "6"], height: int, width: int) -> Float[ndarray, "h w"]:
+def smooth_factor(coefficients: Float[ndarray, "6"], height: int, width: int) -> Float[ndarray, "h w"]:
     """The factor at every pixel of an image of that size."""
     y, x = np.meshgrid(np.linspace(0, 1, height), np.linspace(0, 1, width), indexing="ij")
     return np.exp(_basis(x, y) @ coefficients).astype(np.float32)

@@ -7,7 +7,9 @@ is a check of it. What is kept, of the prediction, its refinement, and a second 
 first calibration, is what predicts images left out best.
 """
 
+import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,7 +106,7 @@ def reconstruct(
     report = progress or silent
     _require_memory(capture, options)
     images = prepare_images(capture, lambda size: ImageGrid(size, size, (0, 0), size))
-    predict = predict or options.load(options.weights, options.device)
+    predict = predict or loaded(options.load, options.weights, options.device)
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 0.5)
@@ -119,6 +121,18 @@ def reconstruct(
         notes = (*notes, note)
     report("reconstruct", 1.0)
     return _record(capture, images, chosen, options, notes)
+
+
+def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> Predict:
+    """A model that says nothing on stdout, which is for the command's result; packages print there."""
+    with redirect_stdout(sys.stderr):
+        predict = load(weights, device)
+
+    def predict_quietly(views: Views) -> Predicted:
+        with redirect_stdout(sys.stderr):
+            return predict(views)
+
+    return predict_quietly
 
 
 def _require_memory(capture: Capture, options: ViewsOptions) -> None:
