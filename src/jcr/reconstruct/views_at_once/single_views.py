@@ -1,7 +1,8 @@
 """The back end of a model that sees one view at a time: COLMAP's cameras, its depth.
 
 Structure from motion gives cameras and points, which are exact and few; the model gives every pixel a depth, which
-bends. Each view's depth is multiplied by the smooth factor that fits the points (refine.depth_changes). The model's metre becomes the unit, so that the calibration holds it against the robot's.
+bends. Each view's depth is multiplied by the smooth factor that fits the points (refine.depth_changes). The model's
+metre becomes the unit, so that the calibration holds it against the robot's.
 """
 
 from collections.abc import Callable
