@@ -222,7 +222,7 @@ BACKENDS: dict[str, Backend] = {
             parameters=135,
             download_gb=0.5,
             takes_poses=True,
-            cost=(0.7, 0.15, 2.1, 0.6),
+            cost=(1.0, 0.15, 5.5, 0.2),
         ),
         Backend(
             "da3-small",
@@ -236,7 +236,7 @@ BACKENDS: dict[str, Backend] = {
             parameters=34,
             download_gb=0.14,
             takes_poses=True,
-            cost=(0.2, 0.1, 1.2, 0.06),
+            cost=(0.35, 0.09, 2.4, 0.05),
         ),
         Backend(
             "mapanything",
