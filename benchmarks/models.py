@@ -149,7 +149,12 @@ def _methods(place: Path, seed: int) -> dict[str, Callable[[Capture], Reconstruc
 
     def predicted(errors: ViewErrors, refined: bool) -> Callable[[Capture], Reconstruction]:
         options = ViewsOptions(
-            "da3", da3.load, Path("simulated"), BACKENDS["da3"].licence, Cost(0, 0, 0, 0), refined=refined
+            "da3",
+            da3.load,
+            Path("simulated"),
+            BACKENDS["da3"].licence,
+            Cost(0.0, 0.0, 0.0, 0.0),
+            refined=refined,
         )
         return lambda capture: reconstruct(capture, options, predict=predictions(place, errors, seed))
 

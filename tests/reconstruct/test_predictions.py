@@ -271,7 +271,7 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
 
     model = FakeMapAnything(truth)
-    options = ViewsOptions("mapanything", mapanything.load, Path("X"), "Apache-2.0", Cost(0, 0, 0, 0))
+    options = ViewsOptions("mapanything", mapanything.load, Path("X"), "Apache-2.0", Cost(0.0, 0.0, 0.0, 0.0))
     result = reconstruct(capture, options, predict=partial(mapanything.predict, model))
     view = model.views[0]
     assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]

@@ -494,6 +494,8 @@ def weights_of(options: ReconstructOptions) -> tuple[str, str]:
     for published in BACKENDS.values():
         if published.hub_id == weights:
             return weights, published.licence
+    if "pair_graph" not in row.options:
+        return weights, f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
     return weights, f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
 
 
