@@ -57,18 +57,16 @@ def choose(
     if isinstance(kept.failure, InputError) and options.weights is not None:
         raise kept.failure
     attempts, at = [kept.attempt()], 0
+    if kept.is_enough and BACKENDS[kept.backend].hub_id:
+        kept = kept.noted(_about(kept.backend))
     for one in made[1:]:
-        if kept.hand_eye is not None and (
-            kept.hand_eye.converged or not kept.hand_eye.observability.observable
-        ):
+        if kept.is_enough:
             break
         other = _tried(capture, one, calibrate_options, progress)
         kept, (attempts[at], of_other) = _better(kept, other)
         attempts.append(of_other)
         if kept.name == other.name:
             at = len(attempts) - 1
-    if len(attempts) == 1 and BACKENDS[kept.backend].hub_id:
-        kept = kept.noted(_about(kept.backend))
     choice = _choice(kept, tuple(attempts))
     chosen(choice.reconstruction)
     return choice
@@ -114,6 +112,12 @@ class _Tried:
     def missed_m(self) -> float:
         """Error on images left out; infinite where there were too few to leave one out."""
         return missed_m(None if self.hand_eye is None else self.hand_eye.held_out)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether no other back end is asked: this one is trusted, or the motion is at fault."""
+        hand_eye = self.hand_eye
+        return hand_eye is not None and (hand_eye.converged or not hand_eye.observability.observable)
 
     def told(self) -> str:
         """The back end, and its error on images left out."""
@@ -188,7 +192,7 @@ def _about(backend: str, name: str = "") -> str:
 
 def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
     """Which of two is kept, noting why, and the account of both; `one` is known to be doubtful."""
-    if isinstance(other.failure, InputError):
+    if isinstance(other.failure, InputError) and not BACKENDS[other.backend].hub_id:
         raise other.failure
     if one.hand_eye is None:
         nothing = f"{_about(one.backend, one.name)}, gave nothing ({one.failure})"
