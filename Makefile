@@ -14,7 +14,7 @@ env: .venv/ready
 	@echo "prepared. To have the jcr command in this shell:  . .venv/bin/activate"
 
 demo: .venv/ready
-	$(BIN)/python examples/demo.py
+	$(BIN)/python examples/demo.py $(BACKEND)
 
 test: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile

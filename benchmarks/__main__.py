@@ -36,19 +36,38 @@ BENCHES = {
     "run": Bench("the whole job on the bundled capture: error, time and memory", True),
     "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
     "real": Bench("real captures in DIR, against the references stored beside them", True, of_captures=True),
+    "matching": Bench(
+        "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
+        True,
+        of_captures=True,
+    ),
+    "gate": Bench("scenes that mislead matching, with the robot's gate and without", True),
+    "many": Bench("from 8 to 200 images: seconds and peak memory", True),
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
+    ),
+    "robots": Bench(
+        "arms with systematic errors: is the answer within its sigma, and nearer than others'", draws=True
     ),
     "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
     "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
     "density": Bench(
         "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
     ),
+    "depth": Bench(
+        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason", True
+    ),
     "map": Bench(
         "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
     ),
     "predictions": Bench(
         "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
+    ),
+    "models": Bench(
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment"
+    ),
+    "model_cost": Bench(
+        "seconds and memory of any-view networks with random weights, beside what is estimated", True
     ),
     "align": Bench(
         "global alignment: fast against adam, kinematic against free, in error, time and memory", True

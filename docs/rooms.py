@@ -9,7 +9,11 @@ from pathlib import Path
 ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("cli/", "one module a command, imported when it is asked for", 1),),
     (("view/", "a run in the browser", 1),),
-    (("batch.py", "many captures", 1), ("verify.py", "has the camera moved?", 1)),
+    (
+        ("batch.py", "many captures", 1),
+        ("verify.py", "has the camera moved?", 1),
+        ("touch.py", "does the tip agree?", 1),
+    ),
     (("live/", "take a capture", 1), ("pipeline.py", "the stages in order, each timed", 2)),
     (("mapping.py", "the map stage", 1), ("report/", "the page a person reads", 1)),
     (
@@ -22,6 +26,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
+    (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (("camera.py", "projection, distortion, derivatives", 1), ("least_squares.py", "damped Gauss-Newton", 1)),
@@ -39,10 +44,11 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
 """From the top down: name, what it is for, share of the row's width."""
 INSIDE = {
     "reconstruct/": (
-        ("depth/", "plane sweep"),
+        ("depth/", "PatchMatch, planes"),
         ("direct/", "by colour"),
         ("global_alignment/", "pairs to cameras"),
         ("dust3r/", "predicts pairs"),
+        ("views_at_once/", "predicts all"),
     )
 }
 FLOW = {

@@ -16,6 +16,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
+from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
@@ -42,6 +43,7 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     names: set[str] = set()
     monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
+    monkeypatch.setattr(backends, "_has_xfeat", lambda: "xfeat" in names)
     return names
 
 
@@ -65,12 +67,12 @@ def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
 def auto_result(
     problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Reconstruction, list[str]]:
-    """What auto keeps where each back end gives these camera poses or this error, and which ones it ran."""
+    """What auto keeps where each back end, or features, give these camera poses or this error; which ones it ran."""
     tried = []
 
     def answered(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         tried.append(options.backend)
-        answer = answers[options.backend]
+        answer = answers[options.backend if options.features == "auto" else options.features]
         if isinstance(answer, Exception):
             raise answer
         return reconstruction(options.backend, answer)
@@ -149,6 +151,25 @@ def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     kept, tried = auto_result(problem, {"colmap": nothing, "direct": good}, monkeypatch)
     assert tried == ["colmap", "direct"] and kept.backend == "direct"
     assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
+
+
+def test_learned_features_are_asked_where_those_of_sift_fail(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("xfeat")
+    rng = np.random.default_rng(0)
+    problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, 5e-4))
+    good = problem.recon_from_camera
+    shuffled = good[rng.permutation(8)]
+    kept, tried = auto_result(problem, {"sift": good}, monkeypatch)
+    assert tried == ["colmap"] and not kept.notes
+    kept, tried = auto_result(problem, {"sift": NotTrustedError("0 of 8"), "xfeat": good}, monkeypatch)
+    assert tried == ["colmap", "colmap"]
+    assert "colmap with sift, gave nothing (0 of 8); colmap with xfeat (held-out" in kept.notes[0]
+    # Two that fail, and a third that does not: all three are told.
+    refused = NotTrustedError("1 of 8")
+    kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
+    assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
 
 
 def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
@@ -332,3 +353,21 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says
     assert found["backend"] == "dust3r" and not found["converged"]
     licence = next(text for text in found["warnings"] if "licence" in text)
     assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()
+
+
+def test_one_network_that_sees_all_views_is_asked_between_colmap_and_direct_alignment(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present |= {"da3", "mapanything"}
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good, nothing = problem.recon_from_camera, NotTrustedError("0 of 8 images registered")
+    answers = {"colmap": nothing, "da3": nothing, "direct": good}
+    kept, tried = auto_result(problem, answers, monkeypatch)
+    assert tried == ["colmap", "da3", "direct"] and kept.backend == "direct"
+    kept, tried = auto_result(problem, answers | {"da3": good}, monkeypatch)
+    assert tried == ["colmap", "da3"] and kept.backend == "da3"
+    # A network that cannot run here takes nothing from what the others found.
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    answers = {"colmap": shuffled, "da3": InputError("--memory-gb 1: too little"), "direct": nothing}
+    kept, tried = auto_result(problem, answers, monkeypatch)
+    assert tried == ["colmap", "da3", "direct"] and kept.backend == "colmap"

@@ -64,6 +64,8 @@ class Capture:
     """Width, height in pixels after EXIF rotation; the same for all images."""
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    """Standard deviations of the given ones, in the order of camera.parameters, not a number where one is not stated."""
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
@@ -129,6 +131,11 @@ class CameraEvidence:
     of the cameras, which is therefore exact."""
 
 
+NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
+"""What a depth rests on: nothing; images that show the same (or a network's prediction); a plane that the colours
+and the matched depths around it speak for; both."""
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
@@ -153,6 +160,10 @@ class Reconstruction:
     """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
     notes: tuple[str, ...] = ()
     """What the user should know: images not registered, distortion dropped."""
+    reason: UInt8[ndarray, "m h w"] | None = None
+    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
+    depth_std: Float[ndarray, "m h w"] | None = None
+    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
     evidence: CameraEvidence | None = None
     """In the same frame, where the robot's poses had a say in `recon_from_camera` or cameras err beside them."""
 
@@ -213,6 +224,39 @@ class RobotNoise:
     estimated: bool
     given: tuple[float, float] | None = None
     """m, rad: what the user said of it; counted where the residuals say no more."""
+    systematic: float = 0.0
+    """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
+    systematic_left: tuple[float, float] = (0.0, 0.0)
+    """m, rad: systematic errors of these poses per axis, after the effective hand-eye transform took its part."""
+
+    @property
+    def together(self) -> tuple[float, float]:
+        """m, rad: random and systematic errors of a gripper pose per axis."""
+        metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
+        return float(metres), float(radians)
+
+
+@dataclass(frozen=True)
+class JointOffsets:
+    """By how much each joint of the arm seems off."""
+
+    offset: Float[ndarray, " dof"]
+    """rad: true angle less the reported one."""
+    std: Float[ndarray, " dof"]
+    prior_std: float
+    """rad: of any joint, before its own poses are asked."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
+
+    robot_random: Float[ndarray, "7 7"]
+    robot_systematic: Float[ndarray, "7 7"]
+    intrinsics: Float[ndarray, "7 7"]
+    """What would go if they were known."""
+    images: Float[ndarray, "7 7"]
+    """Camera poses and features; and what no motion shows."""
 
 
 @dataclass(frozen=True)
@@ -265,6 +309,8 @@ class HandEye:
     warnings: tuple[str, ...] = ()
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
+    intrinsics_covariance: Float[ndarray, "q q"] | None = None
+    """In the order of camera.parameters; None where they were not refined."""
     held_out: HeldOut | None = None
     reasons: tuple[str | None, ...] = ()
     """Per pose: why it was rejected, None when used."""
@@ -277,6 +323,15 @@ class HandEye:
     and in the covariance. None where nothing speaks against the lens."""
     refinement: "Refinement | None" = None
     """None where camera poses alone decided."""
+    systematic_p: float | None = None
+    """Chance of residuals like these where the robot's errors are random alone."""
+    joint_offsets: JointOffsets | None = None
+    """None where the arm is not known."""
+    angle_ratio: tuple[float, float] | None = None
+    """Rotation angles between cameras over those between grippers, 1 whatever gripper_from_camera is, and its standard
+    deviation."""
+    budget: Budget | None = None
+    """Of the covariance, without what `lens_shift` adds to it."""
     excitation: Excitation | None = None
     """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
     next_poses: tuple[NextPose, ...] = ()
@@ -305,6 +360,8 @@ class Attempt:
     """0 where there was nothing to calibrate."""
     why_not: str | None
     """Why the run does not go on with it; None where it does."""
+    features: str | None = None
+    """What was matched between images, where the back end has a choice."""
 
 
 @dataclass(frozen=True)
@@ -322,3 +379,7 @@ class PointCloud:
     """Row of `camera_centers_in_base`."""
     camera_centers_in_base: Float[ndarray, "m 3"]
     label_names: tuple[str, ...] = field(default=("none",))
+    reason: UInt8[ndarray, " n"] | None = None
+    """MATCHED, PRIOR or BOTH; the ray of a PRIOR shows no free space. None: no point is a prior."""
+    depth_std: Float[ndarray, " n"] | None = None
+    """One sigma (m) of the depth in its image; None: not known."""

@@ -11,6 +11,9 @@ class CalibrateOptions:
     """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
     scale: float | None = None
     """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
+    robot: str | None = None
+    """Name of the arm (see `jcr simulate --help`), whose joint offsets and link errors then count as such; else the one
+    that the capture names."""
     known_height: float | None = None
     """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
     known_length: tuple[str, float, float, float, float, float] | None = None

@@ -3,27 +3,34 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import scale_in_words
+from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
+from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.fit import Cues, deleted_residuals
+from jcr.handeye.fit import Cues, exceeds
+from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import excitation
-from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.residuals import angle_ratio, paper_residuals
+from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.solve import judged, solve_hand_eye
+from jcr.handeye.systematic import arm_errors, posed, systematic_errors
 from jcr.records import (
     Capture,
     HandEye,
     HeldOut,
+    Intrinsics,
     NextPose,
     PosePairs,
     Reconstruction,
@@ -37,6 +44,8 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+MIN_EXAMINED = 4
+"""Images from which something may be said of the robot's own errors."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
@@ -53,7 +62,21 @@ def calibrate(
     its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
-    hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
+    systematic, posed_arm, unused = _systematic(capture, options := options or CalibrateOptions())
+    systematic = _of_poses(systematic, reconstruction.image_index)
+    hand_eye = _calibrated(capture, reconstruction, options, systematic)
+    if posed_arm is not None:
+        arm, joints = posed_arm
+        posed_arm = arm, joints[reconstruction.image_index]
+    hand_eye = _robot_examined(
+        hand_eye,
+        capture.base_from_gripper[reconstruction.image_index],
+        reconstruction.recon_from_camera,
+        systematic,
+        posed_arm,
+    )
+    if unused is not None:
+        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, unused))
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
@@ -89,7 +112,12 @@ def _proposals(hand_eye: HandEye, used: Float[ndarray, "k 4 4"]) -> list[NextPos
     return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
 
 
-def _calibrated(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> HandEye:
+def _calibrated(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    systematic: Float[ndarray, "r r"],
+) -> HandEye:
     gripper = capture.base_from_gripper[reconstruction.image_index]
     evidence = reconstruction.evidence
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
@@ -101,11 +129,18 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     camera_covariance = None if evidence is None else evidence.covariance
     contradiction = None
     if cues is None and (metric_std := reconstruction.metric_std) is not None:
-        free = solve_hand_eye(gripper, camera, robot_noise=noise, camera_covariance=camera_covariance)
+        free = solve_hand_eye(
+            gripper, camera, robot_noise=noise, camera_covariance=camera_covariance, systematic=systematic
+        )
         contradiction = scale_contradiction(free, metric_std)
         cues = Cues(scale=(1.0, metric_std))
     hand_eye = solve_hand_eye(
-        gripper, camera, robot_noise=noise, cues=cues, camera_covariance=camera_covariance
+        gripper,
+        camera,
+        robot_noise=noise,
+        cues=cues,
+        camera_covariance=camera_covariance,
+        systematic=systematic,
     )
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
     if contradiction is not None:
@@ -132,7 +167,8 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
             reconstruction.intrinsics,
             tracks,
             noise,
-            refine_lens=capture.intrinsics is None,
+            _intrinsics_prior(capture, reconstruction.intrinsics),
+            _of_poses(systematic, np.flatnonzero(used)),
         )
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
@@ -146,7 +182,14 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     ):
         return hand_eye
     doubt = lens_doubt(
-        hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
+        hand_eye,
+        gripper[used],
+        camera[used],
+        reconstruction.intrinsics,
+        tracks,
+        noise,
+        _of_poses(systematic, np.flatnonzero(used)),
+        adjusted,
     )
     return hand_eye if doubt is None else _doubted(hand_eye, doubt)
 
@@ -199,12 +242,16 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
-    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
+    systematic = systematic_errors(gripper, None if options.robot is None else arm_named(options.robot))
+    cues = Cues(offset=offset)
+    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
     hand_eye = free
     # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
-        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset), scale=scale)
+        hand_eye = solve_hand_eye(
+            gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
+        )
         if not free.observability.observable and scale == 1.0:
             remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
             return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
@@ -224,6 +271,73 @@ def is_one(hand_eye: HandEye) -> bool:
     """Whether the scale is 1 within what is known of it."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+
+
+def _robot_examined(
+    hand_eye: HandEye,
+    gripper: Float[ndarray, "m 4 4"],
+    camera: Float[ndarray, "m 4 4"],
+    systematic: Float[ndarray, "r r"],
+    posed_arm: tuple[Arm, Joints] | None,
+) -> HandEye:
+    """With what the used poses tell of the robot itself."""
+    used = np.flatnonzero(hand_eye.inliers)
+    if len(used) < MIN_EXAMINED or not hand_eye.observability.observable:
+        return hand_eye
+    before = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
+    of_used = before, gripper[used], camera[used], _of_poses(systematic, used)
+    hand_eye = replace(
+        hand_eye,
+        systematic_p=systematic_p_value(*of_used),
+        angle_ratio=angle_ratio(gripper[used], camera[used]),
+    )
+    if posed_arm is None:
+        return hand_eye
+    arm, joints = posed_arm
+    return replace(hand_eye, joint_offsets=joint_offsets(*of_used, arm, joints[used]))
+
+
+def _systematic(
+    capture: Capture, options: CalibrateOptions
+) -> tuple[Float[ndarray, "r r"], tuple[Arm, Joints] | None, str | None]:
+    """Covariance of the systematic errors of the capture's gripper poses, the arm with its tool and joint angles, and
+    why an arm is not used.
+
+    InputError where the poses are not those of the arm that the user named; what a capture says of itself is only
+    doubted.
+    """
+    gripper = capture.base_from_gripper
+    try:
+        arm = _arm(capture, options)
+        if arm is None:
+            return systematic_errors(gripper), None, None
+        posed_arm = posed(arm, capture.joints, gripper)
+        return arm_errors(*posed_arm), posed_arm, None
+    except InputError as error:
+        if options.robot is not None:
+            raise InputError(f"--robot {options.robot}: {error}") from None
+        return systematic_errors(gripper), None, f"the capture's robot is not used: {error}"
+
+
+def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
+    name = options.robot or capture.robot
+    if name is not None:
+        return arm_named(name)
+    if capture.urdf is None or capture.joints is None:
+        return None
+    return read_chain(capture.urdf, capture.joints.shape[1])
+
+
+def _of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
+    """The covariance of some of the poses."""
+    rows = (6 * poses[:, None] + np.arange(6)).ravel()
+    return covariance[np.ix_(rows, rows)]
+
+
+def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
+    if capture.intrinsics is None:
+        return prior_of(found, ESTIMATED)
+    return prior_of(found, MEASURED if capture.intrinsics_std is None else capture.intrinsics_std)
 
 
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
@@ -291,10 +405,18 @@ def _refined(
         covariance=adjusted.covariance,
         translation_residual_m=metres,
         rotation_residual_rad=radians,
-        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
+        robot_noise=RobotNoise(
+            *adjusted.noise,
+            exceeds(adjusted.noise, adjusted.given_noise),
+            adjusted.given_noise,
+            adjusted.systematic,
+            adjusted.systematic_left,
+        ),
+        budget=adjusted.budget,
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=adjusted.bundle.camera,
+        intrinsics_covariance=adjusted.intrinsics_covariance,
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
         refinement=refinement,
@@ -302,12 +424,11 @@ def _refined(
 
 
 def _held_out(adjusted: Adjusted) -> HeldOut | None:
-    """Each image's robot pose predicted by an adjustment that was not told it."""
-    m = len(adjusted.robot_residual)
+    """Each image's gripper pose predicted by an adjustment that does not use it."""
+    m = len(adjusted.missed)
     if m < 4:
         return None
-    sigma = np.repeat(adjusted.noise, 3)
-    missed = deleted_residuals(adjusted.robot_residual / sigma, adjusted.robot_hat) * sigma
+    missed = adjusted.missed
     metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
     pixels = median_reprojection(adjusted, retract(adjusted.bundle.base_from_gripper, -missed))
     return HeldOut(
