@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from jcr.capture.plain_files import read_json
+from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import HUGE, require_rigid
@@ -396,20 +396,14 @@ def _content(file: Path) -> dict[str, object]:
 def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
     kind = content.get("format")
     if kind != FORMAT:
-        raise InputError(f"{file}: format {kind!r}, this version reads {FORMAT!r}; use the jcr that wrote it")
+        raise InputError(
+            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; use the jcr that wrote it"
+        )
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
         return CalibrationFile.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
-
-
-def first_fault(error: ValidationError) -> str:
-    """Where the first thing wrong is, and what."""
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
-    what = first["msg"].removeprefix("Value error, ")
-    return f"{place}: {what}" if place else what
 
 
 def _lens(intrinsics: Intrinsics | None) -> Lens | None:

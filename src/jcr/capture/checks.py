@@ -1,6 +1,8 @@
 """What every reader of captures demands, whatever the format: sound files, rigid metres, one camera."""
 
 import hashlib
+import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,13 @@ from numpy import ndarray
 
 from jcr.capture.images import read_image
 from jcr.capture.options import MIN_FRAMES
-from jcr.capture.plain_files import contained
+from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.records import Capture, Intrinsics
 
+NAMED = 10
+"""Images that a message names; of more it says how many."""
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
@@ -29,15 +33,35 @@ def checked_capture(
     """
     if not images:
         require_frames(0, where)
-    for name in images:
-        contained(folder, name, where)
-    twice = {name for name in images if images.count(name) > 1}
+    require_images(folder, images, where)
+    twice = [name for name, count in Counter(images).items() if count > 1]
     if twice:
         raise InputError(
-            f"{where}: names {', '.join(sorted(twice))} more than once; keep one frame per image"
+            f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
         )
     check_metres(base_from_gripper, where)
     return Capture(folder, tuple(images), base_from_gripper, _common_size(folder, images))
+
+
+def require_images(folder: Path, images: Sequence[str], where: str) -> None:
+    """InputError where images are not there, or lead out of the folder: before anything takes long."""
+    rows = [k for k, name in enumerate(images) if not os.path.exists(folder / name)]
+    for k in rows[:NAMED] or range(len(images)):
+        contained(folder, images[k], f"{where}: frame {k}")
+    missing = [images[k] for k in rows]
+    if len(missing) == 1:
+        raise InputError(f"{folder / missing[0]}: no such image; correct its name in {where} or add the file")
+    if missing:
+        raise InputError(
+            f"{where}: {len(missing)} of {len(images)} images are not there: {first_few(missing)}; correct the names "
+            "or add the files"
+        )
+
+
+def first_few(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:

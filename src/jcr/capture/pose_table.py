@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions, UnitsName
+from jcr.capture.plain_files import shown
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.capture.table_cells import Cells, is_number, read_cells
 from jcr.errors import InputError
@@ -93,7 +94,7 @@ def stamp_ns(text: str, where: str) -> int:
             raise ValueError
         return stamp
     except (InvalidOperation, ValueError, OverflowError):
-        raise InputError(f"{where}: {text!r} is no time stamp; give seconds or nanoseconds") from None
+        raise InputError(f"{where}: {shown(text)} is no time stamp; give seconds or nanoseconds") from None
 
 
 def _unnamed(file: Path, cells: Cells, options: ReadOptions) -> dict[str, tuple[str, ...]]:
@@ -155,6 +156,6 @@ def _numbers(cells: tuple[str, ...], name: str, where: str) -> list[float]:
     for row, cell in enumerate(cells, start=1):
         if not is_number(cell):
             raise InputError(
-                f"{where}: row {row}, column {name}: {cell!r} is no number; correct or drop the row"
+                f"{where}: row {row}, column {name}: {shown(cell)} is no number; correct or drop the row"
             )
     return [float(cell) for cell in cells]

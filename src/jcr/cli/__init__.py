@@ -68,6 +68,10 @@ _DISK = {
 """What the machine, not the program, has wrong, and the cure."""
 
 
+LONGEST_LINE = 2000
+"""Characters of a message."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its status."""
     sys.exit(dispatch(sys.argv[1:] if arguments is None else arguments))
@@ -173,5 +177,7 @@ def _choices(listed: re.Match[str]) -> str:
 
 
 def _fail(status: int, message: str) -> int:
-    sys.stderr.write(f"error: {' '.join(message.split())}\n")
+    line = " ".join(message.split())
+    # What files hold is quoted in messages, and a name may have a million letters.
+    sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
     return status
