@@ -55,6 +55,8 @@ class Capture:
     """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
     urdf: Path | None = None
     """Of the arm, where it was given."""
+    orientation: int = 1
+    """EXIF's, of all images: 1 as the sensor has them; others were turned upright, and the camera frame is theirs."""
 
     def __len__(self) -> int:
         return len(self.images)

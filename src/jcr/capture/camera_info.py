@@ -24,6 +24,8 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
             f"{file}: no camera_info; it needs image_width, image_height, camera_matrix, distortion_model and "
             "distortion_coefficients"
         ) from None
+    if not isinstance(matrix, list) or not isinstance(coefficients, list):
+        raise InputError(f"{file}: the camera matrix and the distortion must be lists of numbers")
     return lens_of_ros(matrix, model, coefficients, calibrated, size, str(file))
 
 
@@ -39,8 +41,6 @@ def lens_of_ros(
 
     Raises InputError for a lens that OpenCV's five coefficients cannot say, or of another resolution.
     """
-    if not all(isinstance(value, Sequence) for value in (matrix, coefficients, calibrated_size)):
-        raise InputError(f"{where}: the camera matrix and the distortion must be lists of numbers")
     if len(matrix) != 9:
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):

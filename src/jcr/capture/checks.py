@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import read_image
+from jcr.capture.images import TURNED, how_stored, read_image
 from jcr.capture.options import MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
@@ -20,6 +20,7 @@ from jcr.records import Capture, Intrinsics
 
 NAMED = 10
 """Images that a message names; of more it says how many."""
+MIRRORED = (2, 4, 5, 7)
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
@@ -40,7 +41,9 @@ def checked_capture(
             f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
         )
     check_metres(base_from_gripper, where)
-    return Capture(folder, tuple(images), base_from_gripper, _common_size(folder, images))
+    size = _common_size(folder, images)
+    orientation = _common_orientation(folder, images)
+    return Capture(folder, tuple(images), base_from_gripper, size, orientation=orientation)
 
 
 def require_images(folder: Path, images: Sequence[str], where: str) -> None:
@@ -137,3 +140,39 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
                 "all images must come from one camera at one resolution"
             )
     return first
+
+
+def _common_orientation(folder: Path, images: Sequence[str]) -> int:
+    """The EXIF orientation of all images; InputError where they differ, as a camera's axes cannot."""
+    first = how_stored(folder / images[0]).orientation
+    for name in images[1:]:
+        if (other := how_stored(folder / name).orientation) != first:
+            raise InputError(
+                f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: turned to be shown, their "
+                "cameras' axes differ; remove the tag from all images (exiftool -Orientation= FILES)"
+            )
+    if first in MIRRORED:
+        raise InputError(
+            f"{folder / images[0]}: EXIF orientation {first}: {TURNED[first]}, and no camera sees a mirrored world; "
+            "remove the tag (exiftool -Orientation= FILES)"
+        )
+    return first
+
+
+def how_turned(capture: Capture) -> str | None:
+    """What a user must know of a capture whose images are turned to be shown."""
+    if capture.orientation == 1:
+        return None
+    return (
+        f"EXIF orientation {capture.orientation}: the images are {TURNED[capture.orientation]}, as viewers show them, "
+        "and gripper_from_camera and the intrinsics are of the camera that would see them so; for a driver that gives "
+        "the sensor's own images remove the tag (exiftool -Orientation= FILES) and calibrate again"
+    )
+
+
+def how_scaled(capture: Capture) -> str | None:
+    """What was done to images of 16 bits that use fewer."""
+    bits = {how_stored(capture.folder / name).bits for name in capture.images}
+    if max(bits) == 8:
+        return None
+    return f"images of 16 bits of which {' or '.join(map(str, sorted(bits)))} are used: read by the upper eight of those"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import require_frames
+from jcr.capture.checks import how_scaled, how_turned, require_frames
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
@@ -90,9 +90,11 @@ def read_source(
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
         found = reader(path, options)
-        if isinstance(found, Capture):
-            require_frames(len(found), str(path), at_least)
-        return found
+        if not isinstance(found, Capture):
+            return found
+        require_frames(len(found), str(path), at_least)
+        remarks = [remark for remark in (how_turned(found), how_scaled(found)) if remark is not None]
+        return replace(found, notes=(*found.notes, *remarks))
     if into is None:
         raise InputError(
             f"{path}: its images lie inside of it; say where to put the chosen ones: into=FOLDER"

@@ -136,7 +136,9 @@ class _Thing(_Part):
     name: str
     label: int
     height: float
-    footprint_in_base: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
+    footprint_in_base: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=3)
+    ]
     base_from_box: Matrix
     box_size: Numbers3
 
@@ -148,8 +150,8 @@ class _Content(_Part):
     seed: int
     images: list[str]
     gripper_from_camera: Matrix
-    base_from_gripper: list[Matrix]
-    base_from_camera: list[Matrix]
+    base_from_gripper: Annotated[list[Matrix], Field(min_length=1)]
+    base_from_camera: Annotated[list[Matrix], Field(min_length=1)]
     intrinsics: _Lens
     labels: list[str]
     table_height: float
