@@ -40,6 +40,7 @@ BENCHES = {
         "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
     ),
     "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
+    "attack": Bench("captures with one silent fault: named, refused, or wrong; and false alarms"),
     "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
     "density": Bench(
         "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True

@@ -1,5 +1,6 @@
 """The calibration stage: poses first, robustly; then images, points, lens and robot adjusted together."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,13 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
+from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
+from jcr.capture.checks import how_turned
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.conventions import better_reading, explained
@@ -24,6 +28,7 @@ from jcr.records import (
     Capture,
     HandEye,
     HeldOut,
+    Intrinsics,
     NextPose,
     PosePairs,
     Reconstruction,
@@ -54,6 +59,9 @@ def calibrate(
     images.
     """
     hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
+    hand_eye = _in_sequence(hand_eye, capture, reconstruction)
+    if (turned := how_turned(capture)) is not None:
+        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, turned))
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
@@ -137,6 +145,15 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
+    faults = None
+    if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
+        faults = _camera_faults(hand_eye, capture, reconstruction, tracks, noise, adjusted, options)
+        if options.focus == "varies" and hand_eye.converged:
+            hand_eye = _refined(hand_eye, faults.adjusted, gripper, camera, reconstruction)
+            hand_eye.covariance[:6, :6] += faults.more_covariance
+            hand_eye = judged(hand_eye)
+        if not all(fault.of_lens for fault in faults.faults):
+            return _with_faults(hand_eye, faults.faults)
     # Of motions that show too little, what is missing comes first; and pointmaps were made with a lens of their own.
     if (
         capture.intrinsics is None
@@ -144,21 +161,81 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
         or tracks.from_pointmaps
         or not hand_eye.observability.observable
     ):
-        return hand_eye
+        return hand_eye if faults is None else _with_faults(hand_eye, faults.faults)
     doubt = lens_doubt(
         hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
     )
-    return hand_eye if doubt is None else _doubted(hand_eye, doubt)
+    if doubt is not None:
+        return _doubted(hand_eye, doubt)
+    return hand_eye if faults is None else _with_faults(hand_eye, faults.faults)
 
 
 def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
     """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
-    covariance = hand_eye.covariance + np.outer(doubt.shift, doubt.shift)
-    widened = judged(replace(hand_eye, covariance=covariance, lens_shift=doubt.shift))
-    if hand_eye.converged and widened.converged:
-        return replace(widened, warnings=(*widened.warnings, doubt.text))
-    # More images, the cure for a large covariance, do not mend a lens.
-    return replace(widened, converged=False, warnings=(doubt.text, *hand_eye.warnings))
+    return _with_faults(hand_eye, [Fault(doubt.text, doubt.shift, of_lens=True)])
+
+
+def _with_faults(hand_eye: HandEye, faults: Sequence[Fault]) -> HandEye:
+    """With what the faults do counted as uncertainty, and named: first, where that is more than can be trusted."""
+    for fault in faults:
+        by_lens = fault.shift if fault.of_lens else np.zeros(7)
+        if hand_eye.lens_shift is not None:
+            by_lens = np.hypot(by_lens, hand_eye.lens_shift)
+        covariance = hand_eye.covariance + np.outer(fault.shift, fault.shift)
+        lens_shift = by_lens if by_lens.any() else None
+        earlier, trusted = hand_eye.warnings, hand_eye.converged
+        hand_eye = judged(replace(hand_eye, covariance=covariance, lens_shift=lens_shift))
+        if trusted and hand_eye.converged and not fault.rejects:
+            hand_eye = replace(hand_eye, warnings=(*earlier, fault.text))
+        else:
+            # More images, the cure for a large covariance, do not mend a lens.
+            hand_eye = replace(hand_eye, converged=False, warnings=(fault.text, *earlier))
+    return hand_eye
+
+
+def _camera_faults(
+    hand_eye: HandEye,
+    capture: Capture,
+    reconstruction: Reconstruction,
+    tracks: Tracks,
+    noise: tuple[float, float] | None,
+    adjusted: Adjusted | None,
+    options: CalibrateOptions,
+) -> CameraFaults:
+    """What the used images say against one camera, whether or not their calibration is accepted."""
+    used, start = hand_eye.inliers, (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon)
+    rows, estimated = reconstruction.image_index[used], capture.intrinsics is None
+
+    def readjust(observations: Tracks, intrinsics: Intrinsics) -> Adjusted:
+        camera = reconstruction.recon_from_camera[used]
+        return adjust(
+            capture.base_from_gripper[rows],
+            start,
+            camera,
+            intrinsics,
+            observations,
+            noise,
+            refine_lens=estimated,
+        )
+
+    if adjusted is None:
+        adjusted = readjust(tracks, reconstruction.intrinsics)
+    # An answer that is rejected has no uncertainty beside which a fault could be small.
+    covariance = adjusted.covariance if hand_eye.converged else np.zeros((7, 7))
+    names = [capture.images[row] for row in rows]
+    return camera_faults(
+        adjusted, tracks, readjust, covariance, not estimated, names, options.focus == "varies"
+    )
+
+
+def _in_sequence(hand_eye: HandEye, capture: Capture, reconstruction: Reconstruction) -> HandEye:
+    """With a slip, a drift or a delay that the order of the images shows, where no fault of the camera does."""
+    if hand_eye.lens_shift is not None or any(CAMERA_FAULT in text for text in hand_eye.warnings):
+        return hand_eye
+    rows, camera = reconstruction.image_index, reconstruction.recon_from_camera
+    names = [capture.images[row] for row in rows]
+    fault = sequence_fault(hand_eye, capture.base_from_gripper[rows], camera, names)
+    return hand_eye if fault is None else _with_faults(hand_eye, [fault])
 
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
