@@ -31,7 +31,7 @@ LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
-MOST_ROUNDS, SETTLED = 5, 0.3
+MOST_ROUNDS, SETTLED = 8, 0.3
 """Adjustments with a fault corrected, and standard deviations of it below which they end."""
 FOCUS = {"distance", "scatter", "zoom"}
 """Of a focal length that differs between images, one is named."""
@@ -109,10 +109,12 @@ def camera_faults(
     std, start = np.sqrt(np.diag(covariance)[:6]), adjusted.bundle
     found: list[_Hypothesis] = []
     named: list[Fault] = []
-    equations, total = nuisance(adjusted, seed), np.zeros(nuisance_columns(m))
+    equations, total = nuisance(adjusted, start.camera, seed), np.zeros(nuisance_columns(m))
     if focus_varies:
         found.append(next(one for one in _hypotheses(equations, held) if one.kind == "scatter"))
-        adjusted, equations, total = _settled(adjusted, equations, total, found, tracks, readjust, seed)
+        adjusted, equations, total = _settled(
+            adjusted, equations, total, found, tracks, readjust, start.camera, seed
+        )
     for _ in range(AT_ONCE):
         best = _most_likely(equations, held, found)
         if best is None:
@@ -121,11 +123,13 @@ def camera_faults(
         alone = tested(equations, best.both, _all(found, equations))
         moved = adjusted, equations, total
         adjusted, equations, total = _settled(
-            adjusted, equations, total, [*found, best], tracks, readjust, seed
+            adjusted, equations, total, [*found, best], tracks, readjust, start.camera, seed
         )
         if best.kind == "scatter" and (simple := _simpler(best, total, equations, held)) is not None:
             best = simple
-            adjusted, equations, total = _settled(*moved, [*found, best], tracks, readjust, seed)
+            adjusted, equations, total = _settled(
+                *moved, [*found, best], tracks, readjust, start.camera, seed
+            )
         shift = np.r_[
             step_between(before.bundle.gripper_from_camera, adjusted.bundle.gripper_from_camera),
             np.log(adjusted.scale / before.scale),
@@ -192,6 +196,7 @@ def _settled(
     found: Sequence[_Hypothesis],
     tracks: Tracks,
     readjust: Readjust,
+    used: Intrinsics,
     seed: int,
 ) -> tuple[Adjusted, Nuisance, Float[ndarray, " e"]]:
     """The adjustment with what was found corrected in its observations and intrinsics, until it moves no more.
@@ -209,7 +214,7 @@ def _settled(
         given = with_parameters(
             given, parameters(adjusted.bundle.camera) - equations.units * total[: len(PARAMETERS)]
         )
-        equations = nuisance(adjusted, seed)
+        equations = nuisance(adjusted, used, seed)
         if (np.abs(step.value) < SETTLED * np.sqrt(np.diag(step.covariance))).all():
             break
     return adjusted, equations, total
@@ -308,6 +313,9 @@ def _lens_in_words(
     by = {name: value[k] * unit.get(name, 1.0) for k, name in enumerate(names)}
     error = {name: std[k] * unit.get(name, 1.0) for k, name in enumerate(names)}
     said = []
+    if {"fx", "fy"} <= by.keys() and _is_common(value, std):
+        new, sure = used.fx + by["fx"], significant(error["fx"])
+        said.append(f"a focal length of {new:.1f} ± {sure} px where {used.fx:.1f} is given")
     for pair, (what, px), digits in (
         (("fx", "fy"), ("focal lengths of", " px"), 1),
         (("cx", "cy"), ("a principal point of", " px"), 1),
@@ -315,13 +323,21 @@ def _lens_in_words(
         (("p1", "p2"), ("a distortion p1, p2 of", ""), 4),
     ):
         known = [name for name in pair if name in by]
+        if pair == ("fx", "fy") and said:
+            continue
         if any(abs(by[name]) > SURE * error[name] for name in known):
             new = ", ".join(f"{old[name] + by.get(name, 0.0):.{digits}f}" for name in pair)
             was = ", ".join(f"{old[name]:.{digits}f}" for name in pair)
             most = significant(max(error[name] for name in known))
-            said.append(f"{what} ({new}) ± {most}{px} where ({was}) is used")
+            said.append(f"{what} ({new}) ± {most}{px} where ({was}) is given")
     said = said or ["other intrinsics than those used, no one of them surely by itself"]
     return (
-        f"the images show {' and '.join(said)} ({p}); calibrate the camera again, or give no intrinsics (null) to have "
-        "them estimated"
+        f"the pictures show {' and '.join(said)} ({p}); calibrate the lens again at this resolution, or give no "
+        "intrinsics (null) to have them estimated"
     )
+
+
+def _is_common(value: Float[ndarray, " p"], std: Float[ndarray, " p"]) -> bool:
+    """Whether fx and fy, the first two, are off by one factor, surely."""
+    sure = (np.abs(value[:2]) > SURE * std[:2]).all()
+    return bool(sure and abs(value[0] - value[1]) < max(0.2 * abs(value[0]), 2e-3))

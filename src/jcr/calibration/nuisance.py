@@ -3,8 +3,8 @@
 At the optimum of the adjustment its normal equations are written once more, with columns for what it holds fixed: every
 parameter of the camera, a shear of the image, and a focal length and a shear for each image by itself. A hypothesis
 is a few combinations of these columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the
-dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), whose reference is χ² with
-as many degrees of freedom as there are combinations. The same step says how large they are and how far X would move.
+dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the
+robot's noise was estimated from few residuals. The same step says how large they are and how far X would move.
 """
 
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from jcr.calibration.bundle import Adjusted
 from jcr.camera import PARAMETERS, by_parameters, by_point, project
 from jcr.geometry import step_between
+from jcr.records import Intrinsics
 
 MOST_POINTS = 1200
 """That take part; more tell a fault no better, and take time."""
@@ -64,6 +65,11 @@ class Nuisance:
         return self._of_images(1, shares)
 
     @property
+    def freedom(self) -> int:
+        """Of the robot's residuals, by which its noise was estimated: fewer than the images have by far."""
+        return max(6 * self.images - 13, 1)
+
+    @property
     def extra(self) -> int:
         """Columns that may be freed."""
         return len(self.right) - self.base
@@ -89,8 +95,11 @@ class Tested:
     """Of X with the combinations free."""
 
 
-def nuisance(adjusted: Adjusted, seed: int = 0) -> Nuisance:
-    """The columns and equations of an adjustment; of many points a random share takes part."""
+def nuisance(adjusted: Adjusted, used: Intrinsics, seed: int = 0) -> Nuisance:
+    """The columns and equations of an adjustment; of many points a random share takes part.
+
+    Parameters of the camera count in units of those of `used`.
+    """
     problem, bundle = adjusted.problem, adjusted.bundle
     image, point, x_px = problem.image, problem.point, problem.x_px
     count = len(bundle.points_in_base)
@@ -126,7 +135,7 @@ def nuisance(adjusted: Adjusted, seed: int = 0) -> Nuisance:
     turned = np.cross(by_base, np.einsum("kij,kj->ki", gripper[:, :3, :3], in_gripper)[:, None])
     for axis in range(3):
         j[each, :, 6 + c + 6 * image + 3 + axis] = turned[:, :, axis]
-    units = np.array([camera.fx, camera.fy, camera.width, camera.width, *[1.0] * (len(PARAMETERS) - 4)])
+    units = np.array([used.fx, used.fy, used.width, used.width, *[1.0] * (len(PARAMETERS) - 4)])
     j[:, :, base : base + len(PARAMETERS)] = by_camera * units
     at = base + len(PARAMETERS)
     row = (x_px[:, 1] - camera.cy) / camera.height
@@ -222,10 +231,10 @@ def tested(
     fewer, more = spanned(beside), spanned(both)
     without, gain_without, _ = _freed(equations, fewer)
     step, gain, covariance = _freed(equations, more)
-    base, spread = equations.base, equations.dispersion
+    base, spread, p = equations.base, equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
     to_value = np.linalg.pinv(both)[q:] @ more
     return Tested(
-        float(chi2.logsf(max(gain - gain_without, 0.0) / spread, max(more.shape[1] - fewer.shape[1], 1))),
+        float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
         to_value @ step[base:],
         spread * to_value @ covariance[base:, base:] @ to_value.T,
         step[:6] - without[:6],

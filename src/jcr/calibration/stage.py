@@ -10,7 +10,7 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
-from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
@@ -145,14 +145,13 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
-    faults = None
     if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
         faults = _camera_faults(hand_eye, capture, reconstruction, tracks, noise, adjusted, options)
         if options.focus == "varies" and hand_eye.converged:
             hand_eye = _refined(hand_eye, faults.adjusted, gripper, camera, reconstruction)
             hand_eye.covariance[:6, :6] += faults.more_covariance
             hand_eye = judged(hand_eye)
-        if not all(fault.of_lens for fault in faults.faults):
+        if faults.faults:
             return _with_faults(hand_eye, faults.faults)
     # Of motions that show too little, what is missing comes first; and pointmaps were made with a lens of their own.
     if (
@@ -161,18 +160,13 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
         or tracks.from_pointmaps
         or not hand_eye.observability.observable
     ):
-        return hand_eye if faults is None else _with_faults(hand_eye, faults.faults)
+        return hand_eye
     doubt = lens_doubt(
         hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
     )
-    if doubt is not None:
-        return _doubted(hand_eye, doubt)
-    return hand_eye if faults is None else _with_faults(hand_eye, faults.faults)
-
-
-def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
-    """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
-    return _with_faults(hand_eye, [Fault(doubt.text, doubt.shift, of_lens=True)])
+    return (
+        hand_eye if doubt is None else _with_faults(hand_eye, [Fault(doubt.text, doubt.shift, of_lens=True)])
+    )
 
 
 def _with_faults(hand_eye: HandEye, faults: Sequence[Fault]) -> HandEye:
