@@ -18,7 +18,7 @@ from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 from jcr.rounding import significant
 
-LOG_P = float(np.log(1e-5))
+LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
 MATERIAL = 0.5
 """Standard deviations that the answer would move by on an axis: what does less is nobody's worry."""
@@ -26,6 +26,10 @@ AT_ONCE = 2
 """Faults named of one capture."""
 CAMERA_FAULT = "p = "
 """In the words of every fault, and of no other warning."""
+MOST_POINTS, WELL_SEEN = 800, 3
+"""Points that take part, first those in so many images: more tell a fault no better, and take time."""
+LEAST_SHEAR_PX = 3.0
+"""From top to bottom; less of it than this is what a lens model leaves over."""
 MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
@@ -106,46 +110,62 @@ def camera_faults(
     m = len(adjusted.bundle.base_from_gripper)
     if m < MIN_IMAGES:
         return CameraFaults((), adjusted, np.zeros((6, 6)))
-    std, start = np.sqrt(np.diag(covariance)[:6]), adjusted.bundle
+    std, used, all_tracks = np.sqrt(np.diag(covariance)[:6]), adjusted.bundle.camera, tracks
+    if len(np.unique(tracks.point)) > MOST_POINTS:
+        tracks = _some(tracks, seed)
+        adjusted = readjust(tracks, used)
     found: list[_Hypothesis] = []
     named: list[Fault] = []
-    equations, total = nuisance(adjusted, start.camera, seed), np.zeros(nuisance_columns(m))
+    equations, total = nuisance(adjusted, used), np.zeros(nuisance_columns(m))
     if focus_varies:
         found.append(next(one for one in _hypotheses(equations, held) if one.kind == "scatter"))
-        adjusted, equations, total = _settled(
-            adjusted, equations, total, found, tracks, readjust, start.camera, seed
-        )
-    for _ in range(AT_ONCE):
-        best = _most_likely(equations, held, found)
+        adjusted, equations, total = _settled(adjusted, equations, total, found, tracks, readjust, used)
+    dismissed: list[_Hypothesis] = []
+    while len(named) < AT_ONCE:
+        best = _most_likely(equations, held, found, dismissed)
         if best is None:
             break
         before = adjusted
         alone = tested(equations, best.both, _all(found, equations))
         moved = adjusted, equations, total
         adjusted, equations, total = _settled(
-            adjusted, equations, total, [*found, best], tracks, readjust, start.camera, seed
+            adjusted, equations, total, [*found, best], tracks, readjust, used
         )
         if best.kind == "scatter" and (simple := _simpler(best, total, equations, held)) is not None:
             best = simple
-            adjusted, equations, total = _settled(
-                *moved, [*found, best], tracks, readjust, start.camera, seed
-            )
+            adjusted, equations, total = _settled(*moved, [*found, best], tracks, readjust, used)
+        sheared = np.abs(total[len(PARAMETERS)]) + np.sqrt(np.mean(total[len(PARAMETERS) + 1 + m :] ** 2))
         shift = np.r_[
             step_between(before.bundle.gripper_from_camera, adjusted.bundle.gripper_from_camera),
             np.log(adjusted.scale / before.scale),
         ]
-        if not (np.abs(shift[:6]) > MATERIAL * std).any():
+        small = best.kind.startswith("shear") and sheared * used.fx < LEAST_SHEAR_PX
+        if small or not (np.abs(shift[:6]) > MATERIAL * std).any():
             adjusted, equations, total = moved
-            break
+            dismissed.append(best)
+            continue
         found.append(best)
         last = tested(equations, best.free, _all(found[:-1], equations, best.beside))
-        text = _in_words(best, total, last, alone.log_p, equations, start.camera, images)
+        text = _in_words(best, total, last, alone.log_p, equations, used, images)
         named.append(Fault(text, shift, of_lens=best.kind in ("lens", "aspect")))
     if not found:
         return CameraFaults((), adjusted, np.zeros((6, 6)))
+    if tracks is not all_tracks and focus_varies:
+        adjusted = readjust(_corrected(all_tracks, total, adjusted.bundle.camera), adjusted.bundle.camera)
     with_all = tested(equations, _all(found, equations)).shift_covariance
     without = tested(equations, np.zeros((equations.extra, 0))).shift_covariance
     return CameraFaults(tuple(named), adjusted, with_all - without)
+
+
+def _some(tracks: Tracks, seed: int) -> Tracks:
+    """The observations of a random choice of the points that most images see."""
+    count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
+    order = np.random.default_rng(seed).permutation(len(count))
+    enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
+    chosen = np.zeros(len(count), bool)
+    chosen[enough[count[enough] >= 2][:MOST_POINTS]] = True
+    rows = chosen[tracks.point]
+    return replace(tracks, image=tracks.image[rows], x_px=tracks.x_px[rows], point=tracks.point[rows])
 
 
 def _all(
@@ -156,11 +176,13 @@ def _all(
     return spanned(np.concatenate([np.zeros((equations.extra, 1)), *parts], axis=1))
 
 
-def _most_likely(equations: Nuisance, held: bool, found: Sequence[_Hypothesis]) -> _Hypothesis | None:
+def _most_likely(
+    equations: Nuisance, held: bool, found: Sequence[_Hypothesis], dismissed: Sequence[_Hypothesis]
+) -> _Hypothesis | None:
     """The hypothesis of least p, if that is little enough to be believed."""
     before, result = _all(found, equations), None
     for candidate in _hypotheses(equations, held):
-        if any(_alike(candidate, one) for one in found):
+        if any(_alike(candidate, one) for one in (*found, *dismissed)):
             continue
         beside = np.concatenate([before, candidate.beside], axis=1)
         log_p = tested(equations, candidate.free, beside).log_p + np.log(candidate.places)
@@ -197,7 +219,6 @@ def _settled(
     tracks: Tracks,
     readjust: Readjust,
     used: Intrinsics,
-    seed: int,
 ) -> tuple[Adjusted, Nuisance, Float[ndarray, " e"]]:
     """The adjustment with what was found corrected in its observations and intrinsics, until it moves no more.
 
@@ -214,7 +235,7 @@ def _settled(
         given = with_parameters(
             given, parameters(adjusted.bundle.camera) - equations.units * total[: len(PARAMETERS)]
         )
-        equations = nuisance(adjusted, used, seed)
+        equations = nuisance(adjusted, used)
         if (np.abs(step.value) < SETTLED * np.sqrt(np.diag(step.covariance))).all():
             break
     return adjusted, equations, total

@@ -19,8 +19,6 @@ from jcr.camera import PARAMETERS, by_parameters, by_point, project
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
 
-MOST_POINTS = 1200
-"""That take part; more tell a fault no better, and take time."""
 LOSS_SCALE = 2.0
 """Cauchy loss, as in the adjustment."""
 CELLS = 8
@@ -95,23 +93,11 @@ class Tested:
     """Of X with the combinations free."""
 
 
-def nuisance(adjusted: Adjusted, used: Intrinsics, seed: int = 0) -> Nuisance:
-    """The columns and equations of an adjustment; of many points a random share takes part.
-
-    Parameters of the camera count in units of those of `used`.
-    """
+def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
+    """The columns and equations of an adjustment; parameters of the camera count in units of those of `used`."""
     problem, bundle = adjusted.problem, adjusted.bundle
     image, point, x_px = problem.image, problem.point, problem.x_px
-    count = len(bundle.points_in_base)
-    if count > MOST_POINTS:
-        chosen = np.zeros(count, bool)
-        chosen[np.random.default_rng(seed).choice(count, MOST_POINTS, replace=False)] = True
-        rows = chosen[point]
-        image, x_px = image[rows], x_px[rows]
-        point = (np.cumsum(chosen) - 1)[point[rows]]
-        points = bundle.points_in_base[chosen]
-    else:
-        points = bundle.points_in_base
+    points = bundle.points_in_base
     m, camera, gripper = len(bundle.base_from_gripper), bundle.camera, bundle.base_from_gripper[image]
     x_rotation, x_offset = bundle.gripper_from_camera[:3, :3], bundle.gripper_from_camera[:3, 3]
     in_gripper = np.einsum("kji,kj->ki", gripper[:, :3, :3], points[point] - gripper[:, :3, 3])

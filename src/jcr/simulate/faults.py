@@ -11,7 +11,7 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from jcr.camera import NO_DISTORTION, parameters, project, with_parameters, zoomed
+from jcr.camera import NO_DISTORTION, PARAMETERS, parameters, project, with_parameters, zoomed
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.poses import gripper_poses, random_hand_eye
@@ -34,8 +34,8 @@ class Faults:
     """Relative, one sigma, between images."""
     zoom: float = 0.0
     """Relative, in the second half of the capture."""
-    lens: tuple[float, ...] = (0.0,) * 9
-    """True minus believed, in the order of camera.PARAMETERS."""
+    lens: tuple[tuple[str, float], ...] = ()
+    """Names of camera.PARAMETERS, and by how much the true one is more than the believed one."""
     rolling_px: float = 0.0
     """By how much the last row is shifted against the first in x."""
     slip: tuple[float, float] = (0.0, 0.0)
@@ -88,7 +88,8 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     share = (depth - depth.mean()) / max(float(np.ptp(depth)), 1e-9)
     focal = np.exp(faults.focal_by_distance * share + faults.focal_scatter * rng.normal(size=images))
     focal *= np.where(np.arange(images) < images / 2, 1.0, 1 + faults.zoom)
-    camera = with_parameters(LENS, parameters(LENS) + np.array(faults.lens))
+    off = dict(faults.lens)
+    camera = with_parameters(LENS, parameters(LENS) + np.array([off.get(name, 0.0) for name in PARAMETERS]))
     image, point, pixels = [], [], []
     for k in range(images):
         x_in_camera = apply(inverse(cameras[k]), points)
