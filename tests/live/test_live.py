@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from jcr.live.asks import Ask, pose_of_numbers
 from jcr.live.camera import Frame, opened
 from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
-from jcr.live.line_server import MAX_LINE, Listen, bound, served_poses
+from jcr.live.line_server import MAX_LINE, MOST_REFUSED, Listen, bound, served_poses
 from jcr.live.look import picture
 from jcr.live.typed import typed_poses
 from jcr.simulate.ur import SimulatedUr
@@ -213,6 +214,31 @@ def test_others_need_the_token(tabletop: Path):
         friend = Client(port)
         assert friend.ask({"token": "sesame"}) == {"accepted": True}
         assert friend.ask({"base_from_gripper": poses(tabletop)[0].tolist()}) == {"accepted": True}
+        friend.close()
+    assert len(heard) == 1
+
+
+def test_a_client_that_drips_or_floods_is_dropped_and_others_are_served(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("jcr.live.line_server.LINE_S", 0.4)
+    with serving(Listen(port=0, timeout_s=20.0)) as (port, heard):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as dripping:
+            begun = time.monotonic()
+            with pytest.raises(OSError):
+                while time.monotonic() - begun < 10:
+                    dripping.sendall(b" ")
+                    time.sleep(0.1)
+            assert time.monotonic() - begun < 5
+        flooding = Client(port)
+        answers = [flooding.ask({"pose": k}) for k in range(MOST_REFUSED)]
+        assert not any(answer["accepted"] for answer in answers)
+        assert "in a row were refused" in flooding.ask({"pose": 0})["reason"]
+        assert flooding.lines.readline() == ""
+        flooding.close()
+        friend = Client(port)
+        half = json.dumps({"base_from_gripper": [0.4, 0, 0.5, 0, np.pi, 0]})
+        friend.socket.sendall(half[:20].encode())
+        time.sleep(0.1)
+        assert friend.ask(half[20:]) == {"accepted": True}
         friend.close()
     assert len(heard) == 1
 
