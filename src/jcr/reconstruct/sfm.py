@@ -7,7 +7,9 @@ Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 
 import math
 import os
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -26,6 +28,13 @@ from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
 from jcr.reconstruct.depth.dense import SparseModel
 from jcr.records import Intrinsics, Tracks
+
+if (
+    threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+):
+    # pycolmap's logger answers it with a page of C++ frames.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 HALF_PIXEL = 0.5
 BYTES_OF_FEATURES = 330
