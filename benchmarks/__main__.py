@@ -39,6 +39,9 @@ BENCHES = {
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
     ),
+    "robots": Bench(
+        "arms with systematic errors: is the answer within its sigma, and nearer than others'", draws=True
+    ),
     "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
     "attack": Bench("captures with one silent fault: named, refused, or wrong; and false alarms"),
     "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jcr.calibration.bundle import adjust
+from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
@@ -101,7 +102,8 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     """What structure from motion makes of the observations with the believed intrinsics, or its own."""
     cameras, m = found.base_from_camera, len(found.base_from_camera)
     start = np.eye(4), 1.0, np.eye(4)
-    sfm = adjust(cameras, start, cameras, found.lens, found.tracks, LOOSE, refine_lens=estimated)
+    free = prior_of(found.lens, ESTIMATED) if estimated else HELD
+    sfm = adjust(cameras, start, cameras, found.lens, found.tracks, LOOSE, free)
     lens = sfm.bundle.camera
     capture = Capture(
         Path("."),

@@ -95,7 +95,8 @@ def _claims(rows: Sequence[Row]) -> list[str]:
 def _rows(folder: Path, board: str | None) -> list[Row]:
     capture = read_capture(folder)
     how = "pictures alone" if board is None else f"`{board}`"
-    reference, _ = read_hand_eye(folder / "reference.json")
+    known = read_hand_eye(folder / "reference.json")
+    reference = known.gripper_from_camera
     options = RunOptions(ReconstructOptions(board=board))
     begun = time.perf_counter()
     try:

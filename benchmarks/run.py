@@ -23,7 +23,7 @@ def run() -> str:
     """Markdown: error, median seconds of each stage and of the whole, and peak memory of the process."""
     if not (CAPTURE / "capture.json").is_file():
         raise InputError(f"bench run: {CAPTURE} is not here; run it in the root of the project")
-    true, _ = read_hand_eye(CAPTURE)
+    true = read_hand_eye(CAPTURE).gripper_from_camera
     whole, peak, stages, found = [], [], [], true
     for _ in range(REPEATS):
         with tempfile.TemporaryDirectory() as out:
@@ -31,7 +31,7 @@ def run() -> str:
             whole.append(seconds)
             peak.append(mib)
             stages.append(json.loads((Path(out) / "calibration.json").read_text())["timings_s"])
-            found, _ = read_hand_eye(Path(out))
+            found = read_hand_eye(Path(out)).gripper_from_camera
     off_mm = 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
     off_deg = float(rotation_between_deg(found[:3, :3], true[:3, :3]))
     helped = [_measured("--help")[0] for _ in range(5)]

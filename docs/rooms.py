@@ -9,7 +9,11 @@ from pathlib import Path
 ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("cli/", "one module a command, imported when it is asked for", 1),),
     (("view/", "a run in the browser", 1),),
-    (("batch.py", "many captures", 1), ("verify.py", "has the camera moved?", 1)),
+    (
+        ("batch.py", "many captures", 1),
+        ("verify.py", "has the camera moved?", 1),
+        ("touch.py", "does the tip agree?", 1),
+    ),
     (("pipeline.py", "the stages in order, each timed", 1),),
     (("mapping.py", "the map stage", 1), ("report/", "the page a person reads", 1)),
     (

@@ -28,7 +28,7 @@ LAYERS = [
     {"results"},
     {"mapping", "report"},
     {"pipeline"},
-    {"batch", "verify"},
+    {"batch", "touch", "verify"},
     {"view"},
     {"cli"},
     {"__main__"},

@@ -43,6 +43,8 @@ class Capture:
     """Width, height in pixels after EXIF rotation; the same for all images."""
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
+    intrinsics_std: Float[ndarray, "9"] | None = None
+    """Standard deviations of the given ones, in the order of camera.PARAMETERS; None: not stated."""
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
@@ -194,6 +196,39 @@ class RobotNoise:
     estimated: bool
     given: tuple[float, float] | None = None
     """m, rad: what the user said of it; counted where the residuals say no more."""
+    systematic: float = 0.0
+    """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
+    systematic_left: tuple[float, float] = (0.0, 0.0)
+    """m, rad: systematic errors of these poses per axis, after the effective hand-eye transform took its part."""
+
+    @property
+    def together(self) -> tuple[float, float]:
+        """m, rad: random and systematic errors of a gripper pose per axis."""
+        metres, radians = np.hypot((self.translation, self.rotation), self.systematic_left)
+        return float(metres), float(radians)
+
+
+@dataclass(frozen=True)
+class JointOffsets:
+    """By how much each joint of the arm seems off."""
+
+    offset: Float[ndarray, " dof"]
+    """rad: true angle less the reported one."""
+    std: Float[ndarray, " dof"]
+    prior_std: float
+    """rad: of any joint, before its own poses are asked."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
+
+    robot_random: Float[ndarray, "7 7"]
+    robot_systematic: Float[ndarray, "7 7"]
+    intrinsics: Float[ndarray, "7 7"]
+    """What would go if they were known."""
+    images: Float[ndarray, "7 7"]
+    """Camera poses and features; and what no motion shows."""
 
 
 @dataclass(frozen=True)
@@ -246,6 +281,8 @@ class HandEye:
     warnings: tuple[str, ...] = ()
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
+    intrinsics_covariance: Float[ndarray, "9 9"] | None = None
+    """In the order of camera.PARAMETERS; None where they were not refined."""
     held_out: HeldOut | None = None
     reasons: tuple[str | None, ...] = ()
     """Per pose: why it was rejected, None when used."""
@@ -258,6 +295,15 @@ class HandEye:
     and in the covariance. None where nothing speaks against the lens."""
     refinement: "Refinement | None" = None
     """None where camera poses alone decided."""
+    systematic_p: float | None = None
+    """Chance of residuals like these where the robot's errors are random alone."""
+    joint_offsets: JointOffsets | None = None
+    """None where the arm is not known."""
+    angle_ratio: tuple[float, float] | None = None
+    """Rotation angles between cameras over those between grippers, 1 whatever gripper_from_camera is, and its standard
+    deviation."""
+    budget: Budget | None = None
+    """Of the covariance, without what `lens_shift` adds to it."""
     excitation: Excitation | None = None
     """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
     next_poses: tuple[NextPose, ...] = ()

@@ -15,6 +15,7 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
+from jcr.handeye.equation import Poses
 from jcr.handeye.fit import PoseFit, fit_poses
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -126,10 +127,12 @@ def verify(
     if shared:
         places = [place for place in located if isinstance(place, Located)]
         found = drift(
-            fitted(calibration, capture, reconstruction, options_then.calibrate),
-            new.base_from_gripper[shared],
-            np.stack([place.recon_from_camera for place in places]),
-            np.stack([place.covariance for place in places]),
+            *fitted(calibration, capture, reconstruction, options_then.calibrate),
+            (
+                new.base_from_gripper[shared],
+                np.stack([place.recon_from_camera for place in places]),
+                np.stack([place.covariance for place in places]),
+            ),
             options.alpha,
         )
         return _judged(found, options, tuple(new.images[k] for k in shared), tuple(lost), "in the old scene")
@@ -143,16 +146,19 @@ def verify(
 
 def fitted(
     calibration: CalibrationFile, capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
-) -> PoseFit:
-    """The calibration's poses fitted again, for the joint covariance that its file does not keep.
+) -> tuple[PoseFit, tuple[Poses, Poses]]:
+    """The calibration's poses fitted again, for the joint covariance that its file does not keep; and the poses.
 
     Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame.
     """
     row_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
     noise = options.robot_noise
-    return fit_poses(
+    poses = (
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
+    )
+    fit = fit_poses(
+        *poses,
         (
             np.array(calibration.gripper_from_camera),
             calibration.scale or 1.0,
@@ -160,7 +166,9 @@ def fitted(
         ),
         np.ones(int(row_used.sum()), bool),
         None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+        averaged=False,
     )
+    return fit, poses
 
 
 def _judged(

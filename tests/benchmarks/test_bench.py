@@ -123,3 +123,13 @@ def test_benches_run_as_a_package_of_their_own_and_are_not_installed(tmp_path: P
 def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["bench", "pairs", "captures"]) == 2
     assert "takes no folder of captures" in capsys.readouterr().err
+
+
+def test_the_bench_of_robots_tells_what_each_way_of_knowing_them_is_worth():
+    from benchmarks.robots import KNOWN, PEER, measure, page
+
+    rows = measure(("ur5e",), ("poor",), (8,), draws=2)
+    assert [row.known for row in rows] == [*KNOWN, PEER]
+    assert all(row.beyond_5 == 0 and row.accepted == 1 for row in rows[:3])
+    text = page(rows, 2)
+    assert text.startswith(CLAIM) and text.count("| poor | 8 |") == 5

@@ -492,6 +492,7 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
         (run / name).symlink_to(done / name)
     content = json.loads((done / "calibration.json").read_text())
     content |= {"converged": False, "warnings": [DOUBT, "and another"]}
+    content["robot_errors"]["joints"] = 6 * [{"offset_deg": 0.1, "std_deg": 0.05}]
     (run / "calibration.json").write_text(json.dumps(content))
     for row in FORMATS:
         if row.name == "rerun":

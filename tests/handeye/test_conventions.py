@@ -68,7 +68,9 @@ def test_each_mistake_is_named(mistake: str):
     found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
     assert found is not None
     assert re.search(words, explained(found))
-    assert found[0].translation_mm < 1.0 < found[1].translation_mm
+    # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
+    assert found[0].misfit < 1.0 and found[0].translation_mm < 0.5
+    assert found[1].misfit > 10.0
 
 
 @pytest.mark.slow

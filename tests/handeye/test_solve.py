@@ -3,14 +3,15 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 import jcr
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
-from jcr.handeye.equation import residuals, residuals_by_camera
-from jcr.handeye.fit import Cues, fit_poses
-from jcr.handeye.noise import NoiseShare, widened
+from jcr.handeye.components import Equations, solve
+from jcr.handeye.equation import PRIOR_STD, residuals, residuals_by_camera
+from jcr.handeye.fit import Cues, fit_poses, left_out
+from jcr.handeye.systematic import smooth_errors
 from jcr.simulate.problem import error, hand_eye_problem, unit_similarity
 
 NOISE = (5e-4, np.radians(0.1))
@@ -116,8 +117,8 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_the_95_percent_ellipsoid_covers_95_percent(given):
-    inside = np.zeros(2)
-    runs = 250
+    inside, larger = np.zeros(2), []
+    runs = 150
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([7, seed]), 10, robot_noise=NOISE)
         solved = jcr.solve_hand_eye(
@@ -127,7 +128,22 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
         for k, part in enumerate((slice(0, 7), slice(0, 6))):
             squared = missed[part] @ np.linalg.solve(solved.covariance[part, part], missed[part])
             inside[k] += squared < chi2.ppf(0.95, part.stop)
-    assert (inside / runs >= 0.90).all() and (inside / runs <= 0.98).all()
+        _, jacobian = residuals(
+            solved.gripper_from_camera,
+            solved.scale,
+            solved.base_from_recon,
+            problem.base_from_gripper,
+            problem.recon_from_camera,
+        )
+        whitened = jacobian.reshape(-1, 13) / np.tile(np.repeat(NOISE, 3), 10)[:, None]
+        straight = np.linalg.inv(whitened.T @ whitened)[:7, :7]
+        larger.append(np.sqrt(np.diag(solved.covariance) / np.diag(straight)))
+    assert (inside / runs >= 0.90).all()
+    if given:
+        # That a robot repeats so well does not say that it is straight: sigma stays larger than that of a straight one.
+        assert np.median(larger) < 1.2
+    else:
+        assert (inside / runs <= 0.98).all()
 
 
 @pytest.mark.slow
@@ -161,22 +177,11 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
         missed = error(problem, solved.gripper_from_camera, solved.scale)
         inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
-        assert solved.robot_noise.estimated
+        # Whether at random or alike, six images hardly tell.
+        assert min(np.divide(solved.robot_noise.together, given)) > 1.5
         assert any("more than the robot noise that was given" in warning for warning in solved.warnings)
     # Binomial: 47.5 ± 1.5; none where the given noise is believed.
     assert inside >= 42
-
-
-def test_a_covariance_is_widened_by_what_hangs_on_the_noise_and_how_little_is_known_of_it():
-    root = np.random.default_rng(9).normal(size=(7, 7)) * np.logspace(-4, 0, 7)[:, None]
-    covariance, none, nu = root @ root.T, np.zeros((7, 7)), 5.0
-    of_log = np.diag([2 / nu, 1e6])
-    alone = widened(covariance, NoiseShare(np.stack([covariance, none]), of_log))
-    assert np.allclose(alone, covariance * 7 * f.ppf(0.99, 7, nu) / chi2.ppf(0.99, 7), rtol=1e-6)
-    # A noise of which nothing is known widens nothing where nothing hangs on it.
-    assert np.allclose(widened(covariance, NoiseShare(np.stack([none, none]), of_log)), covariance, rtol=1e-6)
-    both = widened(covariance, NoiseShare(np.stack([covariance / 2, covariance / 2]), np.eye(2) * 2 / nu))
-    assert np.allclose(both, covariance * 7 * f.ppf(0.99, 7, 2 * nu) / chi2.ppf(0.99, 7), rtol=1e-6)
 
 
 def test_the_equations_jacobians_match_finite_differences():
@@ -216,19 +221,35 @@ def test_covariance_matches_a_jackknife_over_images():
 
 
 def test_held_out_error_is_that_of_a_fit_without_the_image():
+    """Of errors that poses near each other share, the others tell a part of the one that is left out."""
     problem = hand_eye_problem(np.random.default_rng(9), 8, robot_noise=NOISE)
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
     full = jcr.solve_hand_eye(gripper, camera)
-    start = (full.gripper_from_camera, full.scale, full.base_from_recon)
-    noise = (full.robot_noise.translation, full.robot_noise.rotation)
-    missed = [
-        np.linalg.norm(
-            fit_poses(gripper, camera, start, ~np.eye(8, dtype=bool)[k], noise).translation_residual[k]
+    unknowns = full.gripper_from_camera, full.scale, full.base_from_recon
+    residual, jacobian = (of.reshape(48, -1) for of in residuals(*unknowns, gripper, camera))
+    prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
+    alike, sizes = smooth_errors(gripper), np.log([4e-4, 2e-3, 2e-3])
+
+    def of_rows(rows):
+        return Equations(
+            residual[rows, 0], jacobian[rows], prior, np.zeros(13), None, alike[np.ix_(rows, rows)]
         )
-        for k in range(8)
-    ]
+
+    everything = of_rows(np.arange(48))
+    missed, covariance = left_out(everything, solve(everything, sizes), NOISE)
+    v = everything.covariance(sizes)
+    for k in range(8):
+        mine, others = np.arange(6 * k, 6 * k + 6), np.delete(np.arange(48), np.arange(6 * k, 6 * k + 6))
+        without = solve(of_rows(others), sizes)
+        gain = v[np.ix_(mine, others)] @ np.linalg.inv(v[np.ix_(others, others)])
+        by_unknown = jacobian[mine] - gain @ jacobian[others]
+        expected = residual[mine, 0] - gain @ residual[others, 0] + by_unknown @ without.step
+        own = v[np.ix_(mine, mine)] - gain @ v[np.ix_(others, mine)]
+        spread = own + by_unknown @ without.covariance @ by_unknown.T
+        assert np.allclose(missed[k], expected, rtol=1e-4, atol=1e-9)
+        assert np.allclose(covariance[k], spread, rtol=1e-4, atol=1e-4 * np.abs(spread).max())
     assert full.held_out is not None
-    assert full.held_out.translation_mm == pytest.approx(1e3 * np.mean(missed), rel=0.03)
+    assert 0.5 * 1e3 * np.sqrt(3) * NOISE[0] < full.held_out.translation_mm < 4 * 1e3 * np.sqrt(3) * NOISE[0]
 
 
 UNSEEN = {
@@ -262,7 +283,7 @@ def test_motions_that_show_too_little_are_named(pattern, deviation_deg, noise):
 
 @pytest.mark.slow
 def test_general_motion_is_never_called_degenerate():
-    for seed in range(200):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, int(rng.integers(5, 16)), robot_noise=NOISE)
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
@@ -316,7 +337,7 @@ def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
 def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
     """The larger half of what three images leave open is how far the robot's poses scatter."""
     noise = (5e-4, np.radians(0.1))
-    trusted = {"estimated": 0, "given": 0}
+    trusted, surer = {"estimated": 0, "given": 0}, []
     for seed in range(12):
         problem = hand_eye_problem(np.random.default_rng(seed), 3, robot_noise=noise)
         poses = problem.base_from_gripper, problem.recon_from_camera
@@ -329,4 +350,5 @@ def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
             if answer.converged:
                 off = error(problem, answer.gripper_from_camera, answer.scale)
                 assert (np.abs(off) < 5 * np.sqrt(np.diag(answer.covariance))).all()
-    assert trusted["given"] > 2 * trusted["estimated"]
+        surer.append(np.sqrt(np.trace(given.covariance[:3, :3]) / np.trace(estimated.covariance[:3, :3])))
+    assert trusted["given"] >= trusted["estimated"] and np.median(surer) < 0.9

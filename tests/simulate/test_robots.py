@@ -61,11 +61,11 @@ def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
     physical = hand_eye_on(arm, rng)
     about_z = transform(rotation_exp(np.array([0.0, 0.0, 0.01])), np.zeros(3))
     # The last joint turns the flange about its z: to the user the camera sits turned. The first turns the base.
-    last = effective_hand_eye_about(only(arm, "joint 6", 0.01), physical, rng)
+    last = effective_hand_eye_about(only(arm, "joint 6", 0.01), physical, 12, rng)
     np.testing.assert_allclose(last, about_z @ physical, atol=1e-9)
-    first = effective_hand_eye_about(only(arm, "joint 1", 0.01), physical, rng)
+    first = effective_hand_eye_about(only(arm, "joint 1", 0.01), physical, 12, rng)
     np.testing.assert_allclose(first, physical, atol=1e-9)
-    elbow = effective_hand_eye_about(only(arm, "joint 3", 0.01), physical, rng)
+    elbow = effective_hand_eye_about(only(arm, "joint 3", 0.01), physical, 12, rng)
     assert rotation_angle(elbow[:3, :3] @ physical[:3, :3].T) > 1e-3
 
 
@@ -74,7 +74,8 @@ def test_effective_hand_eye_predicts_the_camera_better_than_the_physical_one():
     better = []
     for seed in range(6):
         problem = bent_problem(arm_named("panda"), "poor", 8, seed, (0.0, 0.0))
-        joints = views(problem.bent.arm, 60, problem.physical_gripper_from_camera, np.random.default_rng(99))
+        physical, others = problem.physical_gripper_from_camera, np.random.default_rng(99)
+        joints = np.concatenate([views(problem.bent.arm, 8, physical, others) for _ in range(8)])
         reported = problem.bent.reported(joints)
         cameras = problem.bent.true(joints) @ problem.physical_gripper_from_camera
         costs = []

@@ -1,9 +1,11 @@
-"""Hand-eye bundle adjustment: reprojection error over X, the lens, the points and the gripper poses.
+"""Hand-eye bundle adjustment: reprojection error over X, the intrinsics, the points and the gripper poses.
 
-The robot's poses are measurements with the robot's own noise, so metric scale comes from the robot and the
-camera's sub-millimetre geometry from the images. Points are eliminated by the Schur complement and the rest
-is a small dense system, solved by Levenberg-Marquardt: least_squares.py without that elimination would hold a matrix
-of thousands of points. Between solutions the robot's and the images' noise are estimated.
+The robot's poses are measurements with the robot's own errors, random and systematic, so metric scale comes from the
+robot and the camera's sub-millimetre geometry from the images. Points are eliminated by the Schur complement and the
+rest is a small dense system, solved by Levenberg-Marquardt: least_squares.py without that elimination would hold a
+matrix of thousands of points. What the images alone say of the cameras, as a normal distribution about the adjusted
+ones, then goes into the same mixed model as poses do (handeye/components.py): it tells the sizes of the robot's errors,
+and the answer is averaged over them.
 """
 
 from dataclasses import dataclass, replace
@@ -13,11 +15,15 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project, with_parameters
-from jcr.geometry import apply, fit_similarity, inverse, retract, step_between
-from jcr.handeye.noise import noise_share, robot_noise, widened
+from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by
+from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
+from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
+from jcr.handeye.components import Equations, most_likely, posterior, solve
+from jcr.handeye.equation import PRIOR_STD, residuals
+from jcr.handeye.fit import left_out
+from jcr.handeye.systematic import Region, smooth_errors
 from jcr.least_squares import loss_weight
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Budget, Intrinsics, Tracks
 
 POINTS_AT_ONCE = 4096
 """Points whose coupling to the cameras is held in memory together."""
@@ -26,9 +32,13 @@ FAR_OFF = 6.0
 """Median residuals; seven sigma."""
 LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
-LENS_STD = {"cx": 0.02, "cy": 0.02, "k1": 0.3, "k2": 0.3}
-"""Prior of what a cheap camera's lens may be: principal point relative to the width, distortion absolute."""
-MIN_OBSERVATIONS_FOR_LENS = 500
+CELLS = 8
+"""Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
+model leaves."""
+ENOUGH = 1e-5
+"""Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
+START_NOISE = (1e-3, np.radians(0.2))
+"""m, rad; of gripper poses, until it is estimated."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,16 @@ class Bundle:
 
 
 @dataclass(frozen=True)
+class PixelErrors:
+    """Errors of image observations."""
+
+    sigma_px: float
+    """Of one coordinate."""
+    inflation: float = 1.0
+    """Of the variance of what many observations say together, because neighbours share errors."""
+
+
+@dataclass(frozen=True)
 class Adjusted:
     """The adjusted bundle and what it knows about itself."""
 
@@ -52,14 +72,25 @@ class Adjusted:
     base_from_recon: Float[ndarray, "4 4"]
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER, widened for an estimated noise."""
+    budget: Budget
+    """Parts of it."""
     noise: tuple[float, float]
+    """σ_t (m) and σ_r (rad) of the random errors of gripper poses."""
+    systematic: float
+    """σ_s (rad) of their systematic errors."""
+    systematic_left: tuple[float, float]
+    """m, rad per axis: what of these is left in the poses."""
     given_noise: tuple[float, float] | None
     """As `adjust` was told it."""
-    sigma_px: float
-    robot_residual: Float[ndarray, "m 6"]
-    """Steps from the reported to the adjusted gripper poses (m, rad), base axes."""
-    robot_hat: Float[ndarray, "m 6 6"]
-    """Posterior covariance of those in units of the noise."""
+    intrinsics_covariance: Float[ndarray, "9 9"]
+    """In the order of camera.PARAMETERS."""
+    pixels: PixelErrors
+    missed: Float[ndarray, "m 6"]
+    """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment that does not use it."""
+    log_sizes: Float[ndarray, "3"]
+    """Of the robot's errors, as most likely (components.py)."""
+    precision: Float[ndarray, "s s"]
+    """Inverse covariance of the gripper poses' errors."""
     problem: "_Problem"
     iterations: int
 
@@ -72,11 +103,13 @@ class _Problem:
     image: Int[ndarray, " k"]
     point: Int[ndarray, " k"]
     x_px: Float[ndarray, "k 2"]
-    lens: Float[ndarray, "9 c"]
-    """Free parameters of the camera, which is start + lens · c in the order of camera.PARAMETERS."""
-    lens_start: Float[ndarray, "9"]
-    lens_std: Float[ndarray, " c"]
+    intrinsics: Intrinsics
+    """Where the camera's parameters start."""
+    free: IntrinsicsPrior
     rows_of_image: list[Int[ndarray, "..."]]
+    systematic: Float[ndarray, "s s"]
+    """Covariance of systematic errors of the gripper poses at 1 rad."""
+    given_noise: tuple[float, float] | None
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3."""
@@ -109,27 +142,28 @@ def adjust(
     intrinsics: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None = None,
-    refine_lens: bool = False,
+    free: IntrinsicsPrior = HELD,
+    systematic: Float[ndarray, "s s"] | None = None,
     max_iterations: int = 60,
 ) -> Adjusted:
     """Adjust from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
-    `noise` is the robot's (m, rad), at least; it is estimated with the rest (restricted maximum likelihood). The
-    lens moves only when `refine_lens`: one focal length, principal point, two radial terms.
+    `noise` is the robot's (m, rad), at least; it is estimated with the rest. `systematic` is the covariance of its
+    systematic errors at 1 rad; None: that of errors smooth over the poses. `free` is what is known of the intrinsics.
     """
     x, scale, z = start
     order = _usable(tracks)
     kept, point = np.unique(tracks.point[order], return_inverse=True)
-    lens, lens_std = _free_lens(intrinsics, refine_lens and len(order) >= MIN_OBSERVATIONS_FOR_LENS)
     problem = _Problem(
         base_from_gripper,
         tracks.image[order],
         point,
         tracks.x_px[order],
-        lens,
-        parameters(intrinsics),
-        lens_std,
+        intrinsics,
+        free,
         [np.flatnonzero(tracks.image[order] == i) for i in range(len(base_from_gripper))],
+        smooth_errors(base_from_gripper) if systematic is None else systematic,
+        noise,
         chi2.ppf(0.5, 2 * np.bincount(point) - 3),
     )
     recon_scaled = recon_from_camera.copy()
@@ -140,24 +174,51 @@ def adjust(
         apply(z, scale * tracks.points_in_recon[kept].astype(np.float64)),
         intrinsics,
     )
-    robot = noise or (1e-3, np.radians(0.2))
+    precision = np.diag(np.tile(np.repeat(noise or START_NOISE, 3) ** -2.0, len(base_from_gripper)))
     view = _view(bundle, problem)
-    sigma_px = _sigma_px(view, problem)
+    pixels, log_sizes = _pixel_errors(view, problem), None
     damping, total = 1e-4, 0
     for _ in range(12):
-        before = (*robot, sigma_px)
-        weights = _weights(view, sigma_px)
+        before = pixels, log_sizes
+        weights = _weights(view, pixels)
         bundle, view, damping, used = _minimise(
-            bundle, view, problem, weights, robot, damping, max_iterations
+            bundle, view, problem, weights, precision, damping, max_iterations
         )
         total += used
-        sigma_px = _sigma_px(view, problem)
-        normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
-        robot = _robot_noise(bundle, problem, np.linalg.inv(normal.schur), robot, noise)
-        change = np.abs(np.log(np.array([*robot, sigma_px]) / before)).max()
-        if change < 0.01:
+        pixels = _pixel_errors(view, problem)
+        equations, _ = _equations(bundle, view, problem, pixels, precision)
+        log_sizes, _ = most_likely(equations, log_sizes)
+        precision = np.linalg.inv(replace(equations, known=None).covariance(log_sizes))
+        change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
+        if max(change, abs(np.log(pixels.sigma_px / before[0].sigma_px))) < 0.01:
             break
-    return _summary(bundle, problem, robot, noise, sigma_px, tracks.points_in_recon[kept], total)
+    equations, region = _equations(bundle, view, problem, pixels, precision)
+    log_sizes, information = most_likely(equations, log_sizes)
+    found = posterior(equations, log_sizes, information, region)
+    sigma_t, sigma_r, sigma_s = np.sqrt(equations.variances(log_sizes)).tolist()
+    missed, _ = left_out(equations, solve(equations, log_sizes), (sigma_t, sigma_r))
+    by_intrinsics = _by_intrinsics(found.covariance)
+    off = off_by(free, intrinsics)
+    more = by_intrinsics @ off @ by_intrinsics.T
+    bundle, scale, base_from_recon = _settled(bundle, found.step, tracks.points_in_recon[kept])
+    return Adjusted(
+        bundle,
+        scale,
+        base_from_recon,
+        found.covariance[:7, :7] + more,
+        replace(found.budget, intrinsics=found.budget.intrinsics + more),
+        (sigma_t, sigma_r),
+        sigma_s,
+        equations.systematic_left(log_sizes),
+        noise,
+        free.directions @ (found.covariance[13:, 13:] + off) @ free.directions.T,
+        pixels,
+        missed,
+        log_sizes,
+        precision,
+        problem,
+        total,
+    )
 
 
 def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
@@ -169,39 +230,26 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
     return order[np.bincount(tracks.point[order])[tracks.point[order]] >= 2]
 
 
-def _free_lens(intrinsics: Intrinsics, refine: bool) -> tuple[Float[ndarray, "9 c"], Float[ndarray, " c"]]:
-    if not refine:
-        return np.zeros((9, 0)), np.zeros(0)
-    width = intrinsics.width
-    # One focal length moves by a share of itself.
-    moves = {"fx": (0, intrinsics.fx), "fy": (0, intrinsics.fy), "cx": (1, width), "cy": (2, width)}
-    moves |= {"k1": (3, 1.0), "k2": (4, 1.0)}
-    lens = np.zeros((len(PARAMETERS), 5))
-    for name, (column, unit) in moves.items():
-        lens[PARAMETERS.index(name), column] = unit
-    return lens, np.array([0.5, LENS_STD["cx"], LENS_STD["cy"], LENS_STD["k1"], LENS_STD["k2"]])
-
-
 def _minimise(
     bundle: Bundle,
     view: _View,
     problem: _Problem,
     weights: Float[ndarray, " k"],
-    robot: tuple[float, float],
+    precision: Float[ndarray, "s s"],
     damping: float,
     max_iterations: int,
 ) -> tuple[Bundle, _View, float, int]:
     """Levenberg-Marquardt with the weights held."""
-    cost = _cost(bundle, view, problem, weights, robot)
+    cost = _cost(bundle, view, problem, weights, precision)
     for iteration in range(1, max_iterations + 1):
-        normal = _normal_equations(bundle, view, problem, weights, robot, damping)
+        normal = _normal_equations(bundle, view, problem, weights, precision, damping)
         moved = _moved(bundle, problem, normal)
         moved_view = _view(moved, problem)
-        new_cost = _cost(moved, moved_view, problem, weights, robot)
+        new_cost = _cost(moved, moved_view, problem, weights, precision)
         if new_cost <= cost:
             gained = cost - new_cost
             bundle, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
-            if gained < 1e-6 * cost + 1e-9:
+            if gained < ENOUGH:
                 return bundle, view, damping, iteration
         else:
             damping *= 10
@@ -221,19 +269,30 @@ def _view(bundle: Bundle, problem: _Problem) -> _View:
     return _View(in_gripper, in_camera, project(bundle.camera, in_camera) - problem.x_px)
 
 
-def _sigma_px(view: _View, problem: _Problem) -> float:
-    """Noise of an image coordinate, from the median point none of whose observations is far off."""
+def _pixel_errors(view: _View, problem: _Problem) -> PixelErrors:
+    """From the median point none of whose observations is far off, and from cells of the images.
+
+    Were errors independent, the squared sum over a cell of what each observation pulls would be, on average, the sum of
+    the squares; what it is times that is what the errors that neighbours share cost of the images' information (the
+    variance inflation of cluster sampling; Liang and Zeger, Biometrika 73, 1986).
+    """
     square = (view.residual**2).sum(1)
     far = square > FAR_OFF**2 * np.median(square)
     squares = np.bincount(problem.point, square) / problem.median_square
     clean = np.bincount(problem.point, far) == 0
-    return max(float(np.sqrt(np.median(squares[clean] if clean.any() else squares))), MIN_SIGMA_PX)
+    sigma_px = max(float(np.sqrt(np.median(squares[clean] if clean.any() else squares))), MIN_SIGMA_PX)
+    pull = _weights(view, PixelErrors(sigma_px))[:, None] * view.residual
+    column, row = (CELLS * problem.x_px / problem.intrinsics.width).astype(int).T
+    _, cell = np.unique(np.stack([problem.image, row, column]), axis=1, return_inverse=True)
+    sums = sum(np.bincount(cell, along) ** 2 for along in pull.T)
+    return PixelErrors(sigma_px, max(1.0, float(np.sum(sums) / (pull**2).sum())))
 
 
-def _weights(view: _View, sigma_px: float) -> Float[ndarray, " k"]:
+def _weights(view: _View, pixels: PixelErrors) -> Float[ndarray, " k"]:
     """Inverse variances under a Cauchy loss; points behind the camera count nothing."""
-    squared = (view.residual**2).sum(1) / sigma_px**2
-    return (view.in_camera[:, 2] > 1e-6) * loss_weight("cauchy", squared / LOSS_SCALE**2) / sigma_px**2
+    squared = (view.residual**2).sum(1) / pixels.sigma_px**2
+    weight = loss_weight("cauchy", squared / LOSS_SCALE**2) / (pixels.sigma_px**2 * pixels.inflation)
+    return (view.in_camera[:, 2] > 1e-6) * weight
 
 
 def _cost(
@@ -241,18 +300,22 @@ def _cost(
     view: _View,
     problem: _Problem,
     weights: Float[ndarray, " k"],
-    robot: tuple[float, float],
+    precision: Float[ndarray, "s s"],
 ) -> float:
     seen = float(weights @ (view.residual**2).sum(1))
-    told = float(
-        ((step_between(problem.reported, bundle.base_from_gripper) / np.repeat(robot, 3)) ** 2).sum()
+    told = step_between(problem.reported, bundle.base_from_gripper).ravel()
+    return (
+        seen
+        + float(told @ precision @ told)
+        + float(((_lens_step(bundle, problem) / problem.free.std) ** 2).sum())
     )
-    return seen + told + float(((_lens_step(bundle, problem) / problem.lens_std) ** 2).sum())
 
 
 def _lens_step(bundle: Bundle, problem: _Problem) -> Float[ndarray, " c"]:
     """How far the free lens parameters have moved from where they began."""
-    return np.linalg.pinv(problem.lens) @ (parameters(bundle.camera) - problem.lens_start)
+    return np.linalg.pinv(problem.free.directions) @ (
+        parameters(bundle.camera) - parameters(problem.intrinsics)
+    )
 
 
 def _normal_equations(
@@ -260,10 +323,10 @@ def _normal_equations(
     view: _View,
     problem: _Problem,
     weights: Float[ndarray, " k"],
-    robot: tuple[float, float],
+    precision: Float[ndarray, "s s"],
     damping: float,
 ) -> _Normal:
-    m, c = len(bundle.base_from_gripper), problem.lens.shape[1]
+    m, c = len(bundle.base_from_gripper), len(problem.free.std)
     shared, size = 6 + c, 6 + c + 6 * m
     root = np.sqrt(weights)
     residual = view.residual * root[:, None]
@@ -277,7 +340,7 @@ def _normal_equations(
         by_gripper_axes, (view.in_gripper - bundle.gripper_from_camera[:3, 3])[:, None]
     )
     if c:
-        by_lens = by_parameters(bundle.camera, view.in_camera) @ problem.lens
+        by_lens = by_parameters(bundle.camera, view.in_camera) @ problem.free.directions
         common[:, :, 6:] = by_lens * root[:, None, None]
     own = np.empty((len(root), 2, 6))
 
@@ -291,13 +354,11 @@ def _normal_equations(
         columns = np.r_[0:shared, shared + 6 * i : shared + 6 * i + 6]
         hessian[np.ix_(columns, columns)] += block.T @ block
         right[columns] -= block.T @ residual[rows].ravel()
-    told = step_between(problem.reported, bundle.base_from_gripper)
-    precision = np.repeat(np.asarray(robot) ** -2.0, 3)
     diagonal = np.arange(size)
-    hessian[diagonal[shared:], diagonal[shared:]] += np.tile(precision, m)
-    right[shared:] -= (told * precision).ravel()
-    hessian[diagonal[6:shared], diagonal[6:shared]] += problem.lens_std**-2.0
-    right[6:shared] -= _lens_step(bundle, problem) / problem.lens_std**2
+    hessian[shared:, shared:] += precision
+    right[shared:] -= precision @ step_between(problem.reported, bundle.base_from_gripper).ravel()
+    hessian[diagonal[6:shared], diagonal[6:shared]] += problem.free.std**-2.0
+    right[6:shared] -= _lens_step(bundle, problem) / problem.free.std**2
     hessian[diagonal, diagonal] *= 1 + damping
 
     chunks = []
@@ -333,124 +394,103 @@ def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
     points = bundle.points_in_base.copy()
     for first, count, v, w, g in normal.point_steps:
         points[first : first + count] += np.linalg.solve(v, -(g + w @ step)[..., None])[..., 0]
-    c = problem.lens.shape[1]
+    c = len(problem.free.std)
     return Bundle(
         retract(bundle.gripper_from_camera, step[:6]),
         retract(bundle.base_from_gripper, step[6 + c :].reshape(-1, 6)),
         points,
-        with_parameters(bundle.camera, parameters(bundle.camera) + problem.lens @ step[6 : 6 + c]),
+        with_parameters(bundle.camera, parameters(bundle.camera) + problem.free.directions @ step[6 : 6 + c]),
     )
 
 
-def _robot_noise(
+def _equations(
     bundle: Bundle,
+    view: _View,
     problem: _Problem,
-    covariance: Float[ndarray, "d d"],
-    robot: tuple[float, float],
-    given: tuple[float, float] | None,
-) -> tuple[float, float]:
-    """Restricted maximum likelihood of the robot's noise, one step."""
-    told = step_between(problem.reported, bundle.base_from_gripper)
-    m = len(told)
-    spread = np.diag(covariance)[-6 * m :].reshape(m, 6)
-    squares = float((told[:, :3] ** 2).sum()), float((told[:, 3:] ** 2).sum())
-    dof = (
-        max(3 * m - float(spread[:, :3].sum()) / robot[0] ** 2, 0.1),
-        max(3 * m - float(spread[:, 3:].sum()) / robot[1] ** 2, 0.1),
+    pixels: PixelErrors,
+    precision: Float[ndarray, "s s"],
+) -> tuple[Equations, Region]:
+    """What the images alone say of the cameras, as linear equations of X, a similarity and the intrinsics.
+
+    The recon frame is here the base frame in which the cameras were adjusted; the unknowns are those of equation.py,
+    then the free parameters of the camera. Images see cameras, not X and grippers apart: with X where it is, they say
+    how each gripper would move, up to one similarity.
+    """
+    normal = _normal_equations(bundle, view, problem, _weights(view, pixels), precision, 0.0)
+    told = step_between(problem.reported, bundle.base_from_gripper).ravel()
+    c = len(problem.free.std)
+    of_lens, of_poses = slice(6, 6 + c), slice(6 + c, None)
+    seen = normal.schur[of_poses, of_poses] - precision
+    by_images = normal.right[of_poses] + precision @ told
+    x = bundle.gripper_from_camera
+    _, by_unknown = residuals(x, 1.0, np.eye(4), problem.reported, bundle.base_from_gripper @ x)
+    by_unknown = by_unknown.reshape(-1, 13)
+    unseen = np.linalg.qr(by_unknown[:, 6:])[0]  # the similarity
+    known = np.linalg.inv(seen + float(np.trace(seen)) / len(seen) * unseen @ unseen.T)
+    known = (known + known.T) / 2
+    coupling = normal.schur[of_lens, of_poses]
+    by_lens = -known @ coupling.T
+    prior = np.zeros((13 + c, 13 + c))
+    prior[range(7), range(7)] = PRIOR_STD**-2.0
+    prior[13:, 13:] = normal.schur[of_lens, of_lens] + coupling @ by_lens
+    gradient = np.concatenate([np.zeros(13), coupling @ (known @ by_images) - normal.right[of_lens]])
+    jacobian = np.concatenate([by_unknown, by_lens], axis=1)
+    region = Region.of_poses(jacobian)
+    return (
+        Equations(
+            told + known @ by_images,
+            jacobian,
+            prior,
+            gradient,
+            known,
+            region.left(problem.systematic),
+            problem.given_noise,
+        ),
+        region,
     )
-    return robot_noise(squares, dof, robot, given)
 
 
-def _summary(
-    bundle: Bundle,
-    problem: _Problem,
-    robot: tuple[float, float],
-    given: tuple[float, float] | None,
-    sigma_px: float,
-    points_in_recon: Float[ndarray, "p 3"],
-    iterations: int,
-) -> Adjusted:
-    view = _view(bundle, problem)
-    normal = _normal_equations(bundle, view, problem, _weights(view, sigma_px), robot, 0.0)
-    camera_covariance = np.linalg.inv(normal.schur)
-    m = len(problem.reported)
+def _settled(
+    bundle: Bundle, step: Float[ndarray, " p"], points_in_recon: Float[ndarray, "k 3"]
+) -> tuple[Bundle, float, Float[ndarray, "4 4"]]:
+    """The bundle after a step of X, a similarity and the intrinsics, and scale and frame of the reconstruction in it.
 
-    # Scale is that of the adjusted points against the reconstruction's, so its error is theirs along the
-    # outward direction: d log λ = Σ a·dp, with points weighed down where the two disagree.
-    points = bundle.points_in_base
-    weight = np.ones(len(points))
-    recon = points_in_recon.astype(np.float64)
+    The step is what averaging over the sizes of the robot's errors moves; the intrinsics keep the most likely value.
+    """
+    base_from_adjusted, grown = retract(np.eye(4), step[7:13]), float(np.exp(step[6]))
+    x = retract(bundle.gripper_from_camera, step[:6])
+    cameras = scale_translation(bundle.base_from_gripper @ bundle.gripper_from_camera, grown)
+    points = apply(base_from_adjusted, grown * bundle.points_in_base)
+    # Scale is that of the adjusted points against the reconstruction's, weighed down where the two disagree.
+    recon, weight = points_in_recon.astype(np.float64), np.ones(len(points))
     base_from_recon, scale = fit_similarity(points, recon, weight)
     for _ in range(5):
         gap = np.linalg.norm(apply(base_from_recon, scale * recon) - points, axis=1)
         weight = 1 / (1 + (gap / max(float(np.median(gap)), 1e-9)) ** 2)
         base_from_recon, scale = fit_similarity(points, recon, weight)
-    outward = points - np.average(points, axis=0, weights=weight)
-    outward *= (weight / (weight @ (outward**2).sum(1)))[:, None]
-    variance, coupling = 0.0, np.zeros(len(camera_covariance))
-    for first, count, v, w, _ in normal.point_steps:
-        a = outward[first : first + count]
-        solved = np.linalg.solve(v, a[..., None])[..., 0]
-        variance += float((a * solved).sum())
-        coupling += np.einsum("pi,pij->j", solved, w)
-    cross = -camera_covariance @ coupling
-    covariance = np.zeros((7, 7))
-    covariance[:6, :6] = camera_covariance[:6, :6]
-    covariance[:6, 6] = covariance[6, :6] = cross[:6]
-    covariance[6, 6] = variance - coupling @ cross
-
-    gain, told = _passed_on(camera_covariance, robot, m)
-    gain = np.concatenate([gain[:6], -coupling[None] @ gain])
-
-    hat = np.stack(
-        [camera_covariance[i : i + 6, i : i + 6] for i in range(len(cross) - 6 * m, len(cross), 6)]
-    )
-    sigma = np.repeat(robot, 3)
-    return Adjusted(
-        bundle,
-        scale,
-        base_from_recon,
-        widened(covariance, noise_share(gain, told, robot, given)),
-        robot,
-        given,
-        sigma_px,
-        step_between(problem.reported, bundle.base_from_gripper),
-        hat / sigma[:, None] / sigma[None],
-        problem,
-        iterations,
-    )
+    settled = Bundle(x, base_from_adjusted @ cameras @ inverse(x), points, bundle.camera)
+    return settled, float(scale), base_from_recon
 
 
-def _passed_on(
-    covariance: Float[ndarray, "d d"], robot: tuple[float, float], m: int
-) -> tuple[Float[ndarray, "d r"], Float[ndarray, "r r"]]:
-    """How errors of the m reported poses pass into the unknowns, and P of noise.noise_share."""
-    precision = np.tile(np.repeat(np.asarray(robot) ** -2.0, 3), m)
-    gain = covariance[:, -6 * m :] * precision
-    return gain, np.diag(precision) - precision[:, None] * gain[-6 * m :]
+def _by_intrinsics(covariance: Float[ndarray, "p p"]) -> Float[ndarray, "7 c"]:
+    """How X and scale follow the intrinsics, from the joint covariance."""
+    return np.linalg.solve(covariance[13:, 13:], covariance[13:, :7]).T
 
 
-def free_lens(
-    adjusted: Adjusted, intrinsics: Intrinsics
-) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]] | None:
-    """The camera one Gauss-Newton step on, with its lens free and before it at `intrinsics`, and the covariance.
+def freed_intrinsics(
+    adjusted: Adjusted, free: IntrinsicsPrior
+) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]]:
+    """The camera one Gauss-Newton step on, with another prior about where its parameters started, and the covariance.
 
-    In the order of camera.PARAMETERS; the covariance is widened for an estimated noise. None where there
-    are too few observations to free a lens.
+    In the order of camera.PARAMETERS.
     """
-    problem, bundle = adjusted.problem, adjusted.bundle
-    if len(problem.image) < MIN_OBSERVATIONS_FOR_LENS:
-        return None
-    lens, lens_std = _free_lens(intrinsics, True)
-    problem = replace(problem, lens=lens, lens_std=lens_std)
+    problem, bundle = replace(adjusted.problem, free=free), adjusted.bundle
     view = _view(bundle, problem)
-    weights = _weights(view, adjusted.sigma_px)
-    normal = _normal_equations(bundle, view, problem, weights, adjusted.noise, 0.0)
-    covariance, free = np.linalg.inv(normal.schur), slice(6, 6 + lens.shape[1])
-    step = covariance[free] @ normal.right
-    gain, told = _passed_on(covariance, adjusted.noise, len(problem.reported))
-    share = noise_share(gain[free], told, adjusted.noise, adjusted.given_noise)
-    return parameters(bundle.camera) + lens @ step, lens @ widened(covariance[free, free], share) @ lens.T
+    equations, _ = _equations(bundle, view, problem, adjusted.pixels, adjusted.precision)
+    solution = solve(equations, adjusted.log_sizes)
+    covariance = solution.covariance[13:, 13:] + off_by(free, problem.intrinsics)
+    covariance = free.directions @ covariance @ free.directions.T
+    return parameters(bundle.camera) + free.directions @ solution.step[13:], covariance
 
 
 def median_reprojection(

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -74,6 +75,24 @@ class Residuals(_Part):
     rotation: float
 
 
+class Share(_Part):
+    """One sigma per axis, root mean square over the axes: squares of shares add up to that of the whole."""
+
+    translation_mm: Spread
+    rotation_deg: Spread
+    covariance: Covariance | None = None
+    """In the order of `uncertainty`; the parts' sum is the whole."""
+
+
+class UncertaintyBudget(_Part):
+    """What the uncertainty of the camera on the gripper comes from."""
+
+    robot_random: Share
+    robot_systematic: Share
+    intrinsics: Share
+    images: Share
+
+
 class Uncertainty(_Part):
     """One-sigma uncertainty; axes of the gripper frame."""
 
@@ -84,6 +103,7 @@ class Uncertainty(_Part):
     order: Annotated[list[str], AfterValidator(_order)]
     worst: str
     """The least certain direction of the offset in words, and its size."""
+    budget: UncertaintyBudget | None = None
 
 
 class HeldOutError(_Part):
@@ -105,6 +125,34 @@ class Noise(_Part):
     estimated: bool
 
 
+class JointOffset(_Part):
+    """True angle of a joint less the reported one."""
+
+    offset_deg: float
+    std_deg: Spread
+
+
+class RobotErrors(_Part):
+    """Systematic errors of the gripper poses, as estimated."""
+
+    systematic_deg: Spread
+    """Of joint offsets where the arm is known, else of the gripper's rotation."""
+    translation_mm: Spread
+    """What of them is left in the poses per axis, after the effective hand-eye transform took its part."""
+    rotation_deg: Spread
+    p: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Chance of residuals like these where the robot's errors are random alone."""
+    joints: list[JointOffset] | None = None
+    """From the base on; null where the arm is not known."""
+
+
+class AngleRatio(_Part):
+    """Rotation angles between cameras over those between grippers: 1 of a straight arm and the right intrinsics."""
+
+    ratio: float
+    std: Spread
+
+
 class Image(_Part):
     image: str
     used: bool
@@ -122,6 +170,8 @@ class Lens(_Part):
     distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
     width: Pixels
     height: Pixels
+    std: Annotated[list[Spread], Field(min_length=9, max_length=9)] | None = None
+    """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
 
 
 class NetworkScale(_Part):
@@ -161,6 +211,8 @@ class CalibrationFile(_Part):
     version: str
     next_poses: list[Proposal] = []
     scale_check: NetworkScale | None = None
+    robot_errors: RobotErrors | None = None
+    angle_ratio: AngleRatio | None = None
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
 
@@ -204,6 +256,7 @@ def calibration_file(
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     std = np.sqrt(np.diag(hand_eye.covariance))
     held_out, check = hand_eye.held_out, hand_eye.scale_check
+    offsets, ratio = hand_eye.joint_offsets, hand_eye.angle_ratio
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     return CalibrationFile(
         gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
@@ -223,6 +276,7 @@ def calibration_file(
             covariance=hand_eye.covariance.tolist(),
             order=list(COVARIANCE_ORDER),
             worst=worst_direction(hand_eye),
+            budget=_budget(hand_eye),
         ),
         held_out=None if held_out is None else HeldOutError(**vars(held_out)),
         observability=Observed(
@@ -235,7 +289,7 @@ def calibration_file(
             rotation_deg=float(np.degrees(hand_eye.robot_noise.rotation)),
             estimated=hand_eye.robot_noise.estimated,
         ),
-        intrinsics=_lens(hand_eye.intrinsics),
+        intrinsics=_lens(hand_eye.intrinsics, hand_eye.intrinsics_covariance),
         warnings=[*hand_eye.warnings, *reconstruction.notes],
         timings_s=timings_s,
         version=version,
@@ -248,6 +302,21 @@ def calibration_file(
             for pose in hand_eye.next_poses
         ],
         scale_check=None if check is None else NetworkScale(**vars(check)),
+        robot_errors=RobotErrors(
+            systematic_deg=float(np.degrees(hand_eye.robot_noise.systematic)),
+            translation_mm=1e3 * hand_eye.robot_noise.systematic_left[0],
+            rotation_deg=float(np.degrees(hand_eye.robot_noise.systematic_left[1])),
+            p=hand_eye.systematic_p,
+            joints=None
+            if offsets is None
+            else [
+                JointOffset(offset_deg=off, std_deg=std)
+                for off, std in zip(
+                    np.degrees(offsets.offset).tolist(), np.degrees(offsets.std).tolist(), strict=True
+                )
+            ],
+        ),
+        angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
         attempts=list(attempts),
     )
 
@@ -317,6 +386,28 @@ def image_verdicts(
     return verdicts
 
 
+def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
+    if (parts := hand_eye.budget) is None:
+        return None
+    shift = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
+    by_intrinsics = parts.intrinsics + np.outer(shift, shift)
+    return UncertaintyBudget(
+        robot_random=_share(parts.robot_random),
+        robot_systematic=_share(parts.robot_systematic),
+        intrinsics=_share(by_intrinsics),
+        images=_share(parts.images),
+    )
+
+
+def _share(covariance: Float[ndarray, "7 7"]) -> Share:
+    metres, radians = np.sqrt(np.diag(covariance)[:6].reshape(2, 3).mean(1))
+    return Share(
+        translation_mm=1e3 * float(metres),
+        rotation_deg=float(np.degrees(radians)),
+        covariance=covariance.tolist(),
+    )
+
+
 def worst_direction(hand_eye: HandEye) -> str:
     """The least certain direction of the offset in words, e.g. "along the optical axis: ±4.0 mm"."""
     variance, vectors = np.linalg.eigh(hand_eye.covariance[:3, :3])
@@ -348,8 +439,22 @@ def read_calibration(path: Path) -> CalibrationFile:
     return _validated(_content(file), file)
 
 
-def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 7"] | None]:
-    """gripper_from_camera, and its covariance where the file has one; InputError where there is neither."""
+@dataclass(frozen=True)
+class Known:
+    """A calibration as a file of anybody's states it."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "6 6"] | None
+    """Of the first six of COVARIANCE_ORDER; None where the file has none."""
+    parts: dict[str, Float[ndarray, "6 6"]]
+    """Of the covariance, by cause; empty where the file names none."""
+
+
+def read_hand_eye(path: Path) -> Known:
+    """gripper_from_camera, and its covariance where the file has one; InputError where there is no transform.
+
+    A reference.json may state `std_mm` and `std_deg`, along the axes of the gripper.
+    """
     file = path
     if path.is_dir():
         names = ("calibration.json", "reference.json")
@@ -366,12 +471,24 @@ def read_hand_eye(path: Path) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "7 
     if found.gripper_from_camera is None:
         raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
     transform = require_rigid(np.array(found.gripper_from_camera), f"{file}: gripper_from_camera")
-    return transform, None if found.uncertainty is None else np.array(found.uncertainty.covariance)
+    if (uncertainty := found.uncertainty) is not None:
+        budget = {} if uncertainty.budget is None else vars(uncertainty.budget)
+        parts = {name: share.covariance for name, share in budget.items()}
+        return Known(
+            transform,
+            np.array(uncertainty.covariance)[:6, :6],
+            {name: np.array(part)[:6, :6] for name, part in parts.items() if part is not None},
+        )
+    if found.std_mm is not None and found.std_deg is not None:
+        std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]
+        return Known(transform, np.diag(std**2), {})
+    return Known(transform, None, {})
 
 
 class _Known(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False)
     covariance: Covariance
+    budget: UncertaintyBudget | None = None
 
 
 class _Transform(BaseModel):
@@ -380,6 +497,8 @@ class _Transform(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False)
     gripper_from_camera: Matrix | None = None
     uncertainty: _Known | None = None
+    std_mm: Spread3 | None = None
+    std_deg: Spread3 | None = None
 
 
 def _content(file: Path) -> dict[str, object]:
@@ -406,10 +525,11 @@ def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
 
 
-def _lens(intrinsics: Intrinsics | None) -> Lens | None:
+def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "9 9"] | None = None) -> Lens | None:
     if intrinsics is None:
         return None
-    return Lens.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion)})
+    std = None if covariance is None else np.sqrt(np.diag(covariance)).tolist()
+    return Lens.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion), "std": std})
 
 
 def intrinsics_of(lens: Lens) -> Intrinsics:

@@ -49,19 +49,27 @@ def length_cue(
 
     Raises InputError when the image or a surface at either pixel is not there.
     """
+    first, second = (surface_at(capture, reconstruction, image, end, "--known-length") for end in ends_px)
+    return length / float(np.linalg.norm(second - first)), LENGTH_STD
+
+
+def surface_at(
+    capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
+) -> Float[ndarray, "3"]:
+    """The surface point (recon frame) that a pixel of an image shows.
+
+    Raises InputError, which names who asked, when the image or a surface at that pixel is not there.
+    """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
-        raise InputError(f"--known-length: {image} is not among the registered images; choose another")
-    x_px = project(reconstruction.pointmap_intrinsics, unproject(reconstruction.intrinsics, ends_px))
-    column, row = np.round(x_px).astype(int).T
+        raise InputError(f"{asked_by}: {image} is not among the registered images; choose another")
+    x_px = project(reconstruction.pointmap_intrinsics, unproject(reconstruction.intrinsics, x_px))
+    column, row = np.round(x_px).astype(int)
     height, width = reconstruction.confidence.shape[1:]
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    if not inside.all() or not (reconstruction.confidence[rows[0], row, column] > 0).all():
-        raise InputError(
-            f"--known-length: no surface was found at both pixels of {image}; choose textured places"
-        )
-    first, second = reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
-    return length / float(np.linalg.norm(second - first)), LENGTH_STD
+    inside = 0 <= column < width and 0 <= row < height
+    if not inside or not reconstruction.confidence[rows[0], row, column] > 0:
+        raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
+    return reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
 
 
 def scale_contradiction(free: HandEye, metric_std: float) -> str | None:

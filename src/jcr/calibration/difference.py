@@ -1,31 +1,59 @@
-"""How far apart two calibrations are."""
+"""How far apart two calibrations are, whether what both report explains it, and which of its causes would."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.stats import chi2
 
+from jcr.calibration.calibration_json import Known
 from jcr.geometry import step_between
+
+OTHER = "reference"
+"""Names the covariance of a calibration that does not say what it comes from."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """From one gripper_from_camera to a reference, in gripper axes."""
+    """From one gripper_from_camera to another, in gripper axes."""
 
     translation_m: Float[ndarray, "3"]
     rotation_vector: Float[ndarray, "3"]
-    """rad: R_reference = exp(r)·R."""
+    """rad: R_other = exp(r)·R."""
     sigmas: Float[ndarray, "6"] | None
-    """Size on each axis in the standard deviations that the first one reports; None where it reports none."""
+    """Size on each axis in standard deviations of the difference; None where neither states any."""
+    chi2: float | None
+    """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
+    p_value: float | None
+    explained_by: dict[str, float]
+    """Shares of it, by cause, largest first; their sum is 1."""
 
 
-def difference(
-    gripper_from_camera: Float[ndarray, "4 4"],
-    covariance: Float[ndarray, "7 7"] | None,
-    reference: Float[ndarray, "4 4"],
-) -> Difference:
-    """The difference of a reference from a calibration, whose covariance is in records.COVARIANCE_ORDER."""
-    step = step_between(gripper_from_camera, reference)
-    sigmas = None if covariance is None else np.abs(step) / np.sqrt(np.diag(covariance)[:6])
-    return Difference(step[:3], step[3:], sigmas)
+def difference(ours: Known, other: Known) -> Difference:
+    """The difference of one calibration from another, held against the covariances that they state.
+
+    A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
+    """
+    step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
+    parts: dict[str, Float[ndarray, "6 6"]] = {}
+    for known in (ours, other):
+        if known.covariance is None:
+            continue
+        for name, part in (known.parts or {OTHER: known.covariance}).items():
+            parts[name] = parts.get(name, np.zeros((6, 6))) + part
+    if not parts:
+        return Difference(step[:3], step[3:], None, None, None, {})
+    together = sum(parts.values(), np.zeros((6, 6)))
+    std = np.sqrt(np.diag(together))
+    weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
+    squared = float(step @ weighed)
+    shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items()}
+    return Difference(
+        step[:3],
+        step[3:],
+        np.abs(step) / std,
+        squared,
+        float(chi2.sf(squared, 6)),
+        dict(sorted(shares.items(), key=lambda item: -item[1])),
+    )

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import LENS_STD, Adjusted, adjust, free_lens
+from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
+from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
@@ -23,7 +24,7 @@ SURE = 5.0
 true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
 """Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
-OFF_CENTRE = LENS_STD["cx"]
+OFF_CENTRE = ESTIMATED["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
@@ -35,7 +36,7 @@ class LensDoubt:
 
     text: str
     shift: Float[ndarray, "7"]
-    """By how much the calibration moves when the lens is freed; in records.COVARIANCE_ORDER."""
+    """By how much the calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
 
 
 def lens_doubt(
@@ -45,6 +46,7 @@ def lens_doubt(
     held: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None,
+    systematic: Float[ndarray, "s s"],
     adjusted: Adjusted | None,
 ) -> LensDoubt | None:
     """What the used images say against the lens that was held; None where they say nothing.
@@ -55,27 +57,26 @@ def lens_doubt(
     if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
     start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
-    freed = adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, refine_lens=True)
+
+    def adjusted_with(free: IntrinsicsPrior) -> Adjusted:
+        return adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, free, systematic)
+
+    freed = adjusted_with(prior_of(held, ESTIMATED))
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
-    shift = np.r_[
-        step_between(hand_eye.gripper_from_camera, freed.bundle.gripper_from_camera),
-        np.log(freed.scale / hand_eye.scale),
-    ]
+    as_given = adjusted_with(HELD)
+    shift = step_between(as_given.bundle.gripper_from_camera, freed.bundle.gripper_from_camera)
     return LensDoubt(
         f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
         "(null) to have them estimated",
-        shift,
+        np.append(shift, np.log(freed.scale / as_given.scale)),
     )
 
 
 def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
     """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
-    found = free_lens(adjusted, held)
-    if found is None:
-        return []
-    camera, covariance = found
+    camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED))
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))
     off = []

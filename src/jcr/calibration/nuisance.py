@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.stats import f as f_distribution
 
 from jcr.calibration.bundle import Adjusted
-from jcr.camera import PARAMETERS, by_parameters, by_point, project
+from jcr.camera import PARAMETERS, by_parameters, by_point, parameters, project
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
 
@@ -103,10 +103,11 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
     in_gripper = np.einsum("kji,kj->ki", gripper[:, :3, :3], points[point] - gripper[:, :3, 3])
     in_camera = (in_gripper - x_offset) @ x_rotation
     residual = project(camera, in_camera) - x_px
-    squared = (residual**2).sum(1) / adjusted.sigma_px**2
-    weight = (in_camera[:, 2] > 1e-6) / (1 + squared / LOSS_SCALE**2) / adjusted.sigma_px**2
+    pixels = adjusted.pixels
+    squared = (residual**2).sum(1) / pixels.sigma_px**2
+    weight = (in_camera[:, 2] > 1e-6) / (1 + squared / LOSS_SCALE**2) / pixels.sigma_px**2 / pixels.inflation
 
-    lens, lens_std = problem.lens, problem.lens_std
+    lens, lens_std = problem.free.directions, problem.free.std
     by_gripper = by_point(camera, in_camera) @ x_rotation.T
     by_base = np.einsum("kai,kji->kaj", by_gripper, gripper[:, :3, :3])
     by_camera = by_parameters(camera, in_camera)
@@ -131,11 +132,12 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
 
     hessian, right = _eliminated(j, by_base, residual, weight, point, len(points))
     told = step_between(problem.reported, bundle.base_from_gripper).ravel()
-    precision = np.tile(np.repeat(np.asarray(adjusted.noise) ** -2.0, 3), m)
-    poses = np.arange(6 + c, base)
-    hessian[poses, poses] += precision
-    right[poses] -= precision * told
+    poses = slice(6 + c, base)
+    hessian[poses, poses] += adjusted.precision
+    right[poses] -= adjusted.precision @ told
+    moved = np.linalg.pinv(lens) @ (parameters(camera) - parameters(problem.intrinsics))
     hessian[range(6, 6 + c), range(6, 6 + c)] += lens_std**-2.0
+    right[6 : 6 + c] -= moved / lens_std**2
     weak = [WEAK.get(name, WEAK_DISTORTION) for name in PARAMETERS]
     weak += [WEAK_SHEAR, *[WEAK_FOCAL] * m, *[WEAK_SHEAR] * m]
     hessian[range(base, len(hessian)), range(base, len(hessian))] += np.square(weak) ** -1.0

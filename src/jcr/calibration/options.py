@@ -10,6 +10,9 @@ class CalibrateOptions:
 
     robot_noise: tuple[float, float] | None = None
     """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    robot: str | None = None
+    """Name of the arm (see `jcr simulate --help`), whose joint offsets and link errors then count as such; else the one
+    that the capture names."""
     known_height: float | None = None
     """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
     known_length: tuple[str, float, float, float, float, float] | None = None

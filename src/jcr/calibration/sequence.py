@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.interpolate import CubicSpline
+from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.stats import f as f_distribution
 
@@ -45,12 +46,14 @@ def sequence_fault(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
     images: Sequence[str],
+    systematic: Float[ndarray, "r r"],
     time_s: Float[ndarray, " m"] | None = None,
     still: bool = False,
 ) -> Fault | None:
     """What the order of the images says against one calibration of them; None where it says nothing.
 
-    `images` are their names in the order of taking, `time_s` when they were taken; without, delay is counted in
+    `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
+    poses at 1 rad, `time_s` when they were taken; without, delay is counted in
     intervals between images. `still`: the arm is known to have stood at each, and nothing can be read late.
     """
     m = len(base_from_gripper)
@@ -63,9 +66,15 @@ def sequence_fault(
         base_from_gripper,
         recon_from_camera,
     )
-    noise = np.repeat((hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation), 3)
-    flat, design = (residual / noise).ravel(), (by / noise[:, None]).reshape(6 * m, 13)
-    of_x = (by[:, :, [*range(*TRANSLATION.indices(13)), *range(*ROTATION.indices(13))]]) / noise[:, None]
+    robot = hand_eye.robot_noise
+    white = np.diag(np.tile(np.repeat((robot.translation, robot.rotation), 3), m) ** 2)
+    factor = np.linalg.cholesky(white + robot.systematic**2 * systematic)
+
+    def whitened(columns: Float[ndarray, "m 6 p"]) -> Float[ndarray, "r p"]:
+        return solve_triangular(factor, columns.reshape(6 * m, -1), lower=True)
+
+    flat, design = whitened(residual[..., None])[:, 0], whitened(by)
+    of_x = by[:, :, [*range(*TRANSLATION.indices(13)), *range(*ROTATION.indices(13))]]
     std = np.sqrt(np.diag(hand_eye.covariance)[:6])
 
     places = np.unique(
@@ -74,16 +83,15 @@ def sequence_fault(
     slips = []
     for k in places.tolist():
         after = (np.arange(m) >= k).astype(float)
-        slips.append((_tested(flat, design, (of_x * after[:, None, None]).reshape(6 * m, 6)), k))
+        slips.append((_tested(flat, design, whitened(of_x * after[:, None, None])), k))
     slip, k = min(slips, key=lambda one: one[0].log_p)
     evenly = np.linspace(-0.5, 0.5, m)
-    drift = _tested(flat, design, (of_x * evenly[:, None, None]).reshape(6 * m, 6))
+    drift = _tested(flat, design, whitened(of_x * evenly[:, None, None]))
     found = [(slip.log_p + np.log(len(places)), slip, "slip"), (drift.log_p, drift, "drift")]
     if not still:
         ordered = time_s is not None and (np.diff(time_s) > 0).all()
         moment = time_s if time_s is not None and ordered else np.arange(m, dtype=float)
-        moving = _velocity(base_from_gripper, moment) / noise
-        delay = _tested(flat, design, moving.reshape(6 * m, 1))
+        delay = _tested(flat, design, whitened(_velocity(base_from_gripper, moment)[..., None]))
         found.append((delay.log_p, delay, "delay"))
     log_p, best, kind = min(found, key=lambda one: one[0])
     if log_p > LOG_P:

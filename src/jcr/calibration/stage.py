@@ -4,26 +4,32 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import lens_doubt
+from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
 from jcr.capture.checks import how_turned
+from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
+from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.fit import Cues, deleted_residuals
+from jcr.handeye.fit import Cues, exceeds
+from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import excitation
-from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.residuals import angle_ratio, paper_residuals
+from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.solve import judged, solve_hand_eye
+from jcr.handeye.systematic import arm_errors, posed, systematic_errors
 from jcr.records import (
     Capture,
     HandEye,
@@ -42,6 +48,8 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+MIN_EXAMINED = 4
+"""Images from which something may be said of the robot's own errors."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
@@ -58,8 +66,22 @@ def calibrate(
     its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
-    hand_eye = _calibrated(capture, reconstruction, options or CalibrateOptions())
-    hand_eye = _in_sequence(hand_eye, capture, reconstruction)
+    systematic, posed_arm, unused = _systematic(capture, options := options or CalibrateOptions())
+    systematic = _of_poses(systematic, reconstruction.image_index)
+    hand_eye = _calibrated(capture, reconstruction, options, systematic)
+    if posed_arm is not None:
+        arm, joints = posed_arm
+        posed_arm = arm, joints[reconstruction.image_index]
+    hand_eye = _robot_examined(
+        hand_eye,
+        capture.base_from_gripper[reconstruction.image_index],
+        reconstruction.recon_from_camera,
+        systematic,
+        posed_arm,
+    )
+    if unused is not None:
+        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, unused))
+    hand_eye = _in_sequence(hand_eye, capture, reconstruction, systematic)
     if (turned := how_turned(capture)) is not None:
         hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, turned))
     # A unit that somebody vouches for was used for the scale, and is no check of it.
@@ -97,7 +119,12 @@ def _proposals(hand_eye: HandEye, used: Float[ndarray, "k 4 4"]) -> list[NextPos
     return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
 
 
-def _calibrated(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> HandEye:
+def _calibrated(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    systematic: Float[ndarray, "r r"],
+) -> HandEye:
     gripper = capture.base_from_gripper[reconstruction.image_index]
     evidence = reconstruction.evidence
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
@@ -109,11 +136,18 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     camera_covariance = None if evidence is None else evidence.covariance
     contradiction = None
     if cues is None and (metric_std := reconstruction.metric_std) is not None:
-        free = solve_hand_eye(gripper, camera, robot_noise=noise, camera_covariance=camera_covariance)
+        free = solve_hand_eye(
+            gripper, camera, robot_noise=noise, camera_covariance=camera_covariance, systematic=systematic
+        )
         contradiction = scale_contradiction(free, metric_std)
         cues = Cues(scale=(1.0, metric_std))
     hand_eye = solve_hand_eye(
-        gripper, camera, robot_noise=noise, cues=cues, camera_covariance=camera_covariance
+        gripper,
+        camera,
+        robot_noise=noise,
+        cues=cues,
+        camera_covariance=camera_covariance,
+        systematic=systematic,
     )
     hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
     if contradiction is not None:
@@ -140,13 +174,16 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
             reconstruction.intrinsics,
             tracks,
             noise,
-            refine_lens=capture.intrinsics is None,
+            _intrinsics_prior(capture, reconstruction.intrinsics),
+            _of_poses(systematic, np.flatnonzero(used)),
         )
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
     if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
-        faults = _camera_faults(hand_eye, capture, reconstruction, tracks, noise, adjusted, options)
+        faults = _camera_faults(
+            hand_eye, capture, reconstruction, tracks, noise, adjusted, options, systematic
+        )
         if options.focus == "varies" and hand_eye.converged:
             hand_eye = _refined(hand_eye, faults.adjusted, gripper, camera, reconstruction)
             hand_eye.covariance[:6, :6] += faults.more_covariance
@@ -162,7 +199,14 @@ def _calibrated(capture: Capture, reconstruction: Reconstruction, options: Calib
     ):
         return hand_eye
     doubt = lens_doubt(
-        hand_eye, gripper[used], camera[used], reconstruction.intrinsics, tracks, noise, adjusted
+        hand_eye,
+        gripper[used],
+        camera[used],
+        reconstruction.intrinsics,
+        tracks,
+        noise,
+        _of_poses(systematic, np.flatnonzero(used)),
+        adjusted,
     )
     return (
         hand_eye if doubt is None else _with_faults(hand_eye, [Fault(doubt.text, doubt.shift, of_lens=True)])
@@ -195,6 +239,7 @@ def _camera_faults(
     noise: tuple[float, float] | None,
     adjusted: Adjusted | None,
     options: CalibrateOptions,
+    systematic: Float[ndarray, "r r"],
 ) -> CameraFaults:
     """What the used images say against one camera, whether or not their calibration is accepted."""
     used, start = hand_eye.inliers, (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon)
@@ -209,7 +254,8 @@ def _camera_faults(
             intrinsics,
             observations,
             noise,
-            refine_lens=estimated,
+            _intrinsics_prior(capture, intrinsics),
+            _of_poses(systematic, np.flatnonzero(used)),
         )
 
     if adjusted is None:
@@ -222,13 +268,15 @@ def _camera_faults(
     )
 
 
-def _in_sequence(hand_eye: HandEye, capture: Capture, reconstruction: Reconstruction) -> HandEye:
+def _in_sequence(
+    hand_eye: HandEye, capture: Capture, reconstruction: Reconstruction, systematic: Float[ndarray, "r r"]
+) -> HandEye:
     """With a slip, a drift or a delay that the order of the images shows, where no fault of the camera does."""
     if hand_eye.lens_shift is not None or any(CAMERA_FAULT in text for text in hand_eye.warnings):
         return hand_eye
     rows, camera = reconstruction.image_index, reconstruction.recon_from_camera
     names = [capture.images[row] for row in rows]
-    fault = sequence_fault(hand_eye, capture.base_from_gripper[rows], camera, names)
+    fault = sequence_fault(hand_eye, capture.base_from_gripper[rows], camera, names, systematic)
     return hand_eye if fault is None else _with_faults(hand_eye, [fault])
 
 
@@ -270,9 +318,13 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
-    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues(offset=offset))
+    systematic = systematic_errors(gripper, None if options.robot is None else arm_named(options.robot))
+    hand_eye = solve_hand_eye(
+        gripper, camera, robot_noise=noise, cues=Cues(offset=offset), systematic=systematic
+    )
     if pairs.is_metric and not hand_eye.observability.observable:
-        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=Cues((1.0, METRIC_STD), offset))
+        cues = Cues((1.0, METRIC_STD), offset)
+        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
         remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
         return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     if not hand_eye.converged:
@@ -291,6 +343,73 @@ def is_one(hand_eye: HandEye) -> bool:
     """Whether the scale is 1 within what is known of it."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
+
+
+def _robot_examined(
+    hand_eye: HandEye,
+    gripper: Float[ndarray, "m 4 4"],
+    camera: Float[ndarray, "m 4 4"],
+    systematic: Float[ndarray, "r r"],
+    posed_arm: tuple[Arm, Joints] | None,
+) -> HandEye:
+    """With what the used poses tell of the robot itself."""
+    used = np.flatnonzero(hand_eye.inliers)
+    if len(used) < MIN_EXAMINED or not hand_eye.observability.observable:
+        return hand_eye
+    before = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
+    of_used = before, gripper[used], camera[used], _of_poses(systematic, used)
+    hand_eye = replace(
+        hand_eye,
+        systematic_p=systematic_p_value(*of_used),
+        angle_ratio=angle_ratio(gripper[used], camera[used]),
+    )
+    if posed_arm is None:
+        return hand_eye
+    arm, joints = posed_arm
+    return replace(hand_eye, joint_offsets=joint_offsets(*of_used, arm, joints[used]))
+
+
+def _systematic(
+    capture: Capture, options: CalibrateOptions
+) -> tuple[Float[ndarray, "r r"], tuple[Arm, Joints] | None, str | None]:
+    """Covariance of the systematic errors of the capture's gripper poses, the arm with its tool and joint angles, and
+    why an arm is not used.
+
+    InputError where the poses are not those of the arm that the user named; what a capture says of itself is only
+    doubted.
+    """
+    gripper = capture.base_from_gripper
+    try:
+        arm = _arm(capture, options)
+        if arm is None:
+            return systematic_errors(gripper), None, None
+        posed_arm = posed(arm, capture.joints, gripper)
+        return arm_errors(*posed_arm), posed_arm, None
+    except InputError as error:
+        if options.robot is not None:
+            raise InputError(f"--robot {options.robot}: {error}") from None
+        return systematic_errors(gripper), None, f"the capture's robot is not used: {error}"
+
+
+def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
+    name = options.robot or capture.robot
+    if name is not None:
+        return arm_named(name)
+    if capture.urdf is None or capture.joints is None:
+        return None
+    return read_chain(capture.urdf, capture.joints.shape[1])
+
+
+def _of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
+    """The covariance of some of the poses."""
+    rows = (6 * poses[:, None] + np.arange(6)).ravel()
+    return covariance[np.ix_(rows, rows)]
+
+
+def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
+    if capture.intrinsics is None:
+        return prior_of(found, ESTIMATED)
+    return prior_of(found, MEASURED if capture.intrinsics_std is None else capture.intrinsics_std)
 
 
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
@@ -358,10 +477,18 @@ def _refined(
         covariance=adjusted.covariance,
         translation_residual_m=metres,
         rotation_residual_rad=radians,
-        robot_noise=RobotNoise(*adjusted.noise, adjusted.noise != adjusted.given_noise, adjusted.given_noise),
+        robot_noise=RobotNoise(
+            *adjusted.noise,
+            exceeds(adjusted.noise, adjusted.given_noise),
+            adjusted.given_noise,
+            adjusted.systematic,
+            adjusted.systematic_left,
+        ),
+        budget=adjusted.budget,
         residual_translation=delta_t,
         residual_rotation=delta_r,
         intrinsics=adjusted.bundle.camera,
+        intrinsics_covariance=adjusted.intrinsics_covariance,
         held_out=_held_out(adjusted),
         reprojection_px=reprojection,
         refinement=refinement,
@@ -369,12 +496,11 @@ def _refined(
 
 
 def _held_out(adjusted: Adjusted) -> HeldOut | None:
-    """Each image's robot pose predicted by an adjustment that was not told it."""
-    m = len(adjusted.robot_residual)
+    """Each image's gripper pose predicted by an adjustment that does not use it."""
+    m = len(adjusted.missed)
     if m < 4:
         return None
-    sigma = np.repeat(adjusted.noise, 3)
-    missed = deleted_residuals(adjusted.robot_residual / sigma, adjusted.robot_hat) * sigma
+    missed = adjusted.missed
     metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
     pixels = median_reprojection(adjusted, retract(adjusted.bundle.base_from_gripper, -missed))
     return HeldOut(

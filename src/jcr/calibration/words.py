@@ -8,7 +8,20 @@ from jcr.records import Attempt, HeldOut, ScaleCheck
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile, HeldOutError, NetworkScale
+    from jcr.calibration.calibration_json import (
+        CalibrationFile,
+        HeldOutError,
+        NetworkScale,
+        UncertaintyBudget,
+    )
+
+CLEAR = 0.01
+"""Chance of residuals by random errors alone, below which systematic ones are spoken of."""
+SURE = 2.5
+"""Standard deviations from which a joint's offset, or a ratio of angles, is named."""
+NOTABLE_RATIO = 0.003
+NOTHING = 0.02
+"""Of the largest part of a budget: its square is nothing beside that of the whole."""
 
 
 def summary(content: "CalibrationFile") -> str:
@@ -18,6 +31,15 @@ def summary(content: "CalibrationFile") -> str:
     if content.next_poses:
         then = " ".join(significant(1e3 * std) for std in content.next_poses[-1].expected_std[:3])
         near = ", ".join(pose.like for pose in content.next_poses)
+        if (
+            content.uncertainty is not None
+            and content.uncertainty.budget is not None
+            and not more_images_help(content.uncertainty.budget)
+        ):
+            lines.append(
+                "most of ± is systematic error of the robot: more images of the same region will hardly help, another "
+                "region of the workspace or its joint angles (capture.json: joints and robot) would"
+            )
         lines.append(
             f"{len(content.next_poses)} more views, like {near} but turned (next_poses in calibration.json), "
             f"would give ± {then} mm"
@@ -40,11 +62,74 @@ def found(content: "CalibrationFile") -> list[str]:
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
         f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
+    if uncertainty.budget is not None:
+        parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
+        lines.insert(-1, f"  of which: {parts}")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
+    lines += robot_in_words(content)
     if (held_out := content.held_out) is not None:
         lines.append(f"held out: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
+
+
+def robot_in_words(content: "CalibrationFile") -> list[str]:
+    """What the poses tell of the robot itself, where they tell it clearly."""
+    lines = []
+    if (errors := content.robot_errors) is not None and errors.p is not None and errors.p < CLEAR:
+        chance = f"p = {errors.p:.1g}" if errors.p > 1e-6 else "p < 1e-6"
+        off = [
+            (k, joint)
+            for k, joint in enumerate(errors.joints or [], start=1)
+            if abs(joint.offset_deg) > SURE * joint.std_deg
+        ]
+        if off:
+            named = _joined([f"{k}" for k, _ in off])
+            sizes = _joined([f"{joint.offset_deg:+.2f} ± {joint.std_deg:.2f}°" for _, joint in off])
+            lines.append(f"robot: joint{'s' * (len(off) > 1)} {named} seem off by {sizes} ({chance})")
+        else:
+            lines.append(
+                f"robot: poses near each other err alike, by {errors.translation_mm:.2g} mm and "
+                f"{errors.rotation_deg:.2g}° per axis ({chance}): joint offsets or link errors"
+            )
+    if (angles := content.angle_ratio) is not None and abs(angles.ratio - 1) > max(
+        SURE * angles.std, NOTABLE_RATIO
+    ):
+        lines.append(
+            f"cameras turn by {100 * (angles.ratio - 1):+.2f} ± {100 * angles.std:.2f} % of what the gripper does: "
+            "the focal length or the robot's joints are off"
+        )
+    return lines
+
+
+def _joined(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def more_images_help(budget: "UncertaintyBudget") -> bool:
+    """Whether more images of the same region shrink the uncertainty, most of which is then not systematic."""
+    others = [budget.robot_random, budget.intrinsics, budget.images]
+    return budget.robot_systematic.translation_mm**2 < sum(share.translation_mm**2 for share in others)
+
+
+def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
+    """What the uncertainty comes from, largest first, each with its size; negligible parts are left out."""
+    named = {
+        "random robot errors": budget.robot_random,
+        "systematic robot errors": budget.robot_systematic,
+        "intrinsics": budget.intrinsics,
+        "images": budget.images,
+    }
+    ranked = sorted(named.items(), key=lambda item: -item[1].translation_mm)
+    least_mm, least_deg = (
+        NOTHING * max(getattr(share, unit) for share in named.values())
+        for unit in ("translation_mm", "rotation_deg")
+    )
+    return {
+        name: f"{share.translation_mm:.2f} mm {share.rotation_deg:.3f}°"
+        for name, share in ranked
+        if share.translation_mm > least_mm or share.rotation_deg > least_deg
+    }
 
 
 def log(content: "CalibrationFile") -> str:

@@ -9,13 +9,18 @@ import tyro
 
 from jcr.cli.output import Output
 
+UNLIKELY = 1e-3
+"""Of a difference that the reported errors explain."""
+
 
 @dataclass(frozen=True)
 class Arguments:
-    """The difference of a calibration from a reference, in mm and degrees.
+    """The difference of two calibrations in mm and degrees, and whether what both report explains it.
 
     Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's
-    reference.json, or the folder that holds one).
+    reference.json, or the folder that holds one; with `std_mm` and `std_deg` where its own errors are known).
+    χ² is the squared distance in standard deviations of both, p its chance where nothing else is wrong; of two
+    calibrations of one arm, systematic errors that both share make p too large.
 
     examples:
       jcr compare out/tabletop examples/tabletop
@@ -30,13 +35,11 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Print the difference, and how many of the calibration's own sigmas it is where they are known."""
+    """Print the difference, χ² and p where standard deviations are known, and what explains it."""
     from jcr.calibration.calibration_json import read_hand_eye
     from jcr.calibration.difference import difference
 
-    ours, covariance = read_hand_eye(arguments.out)
-    reference, _ = read_hand_eye(arguments.reference)
-    found = difference(ours, covariance, reference)
+    found = difference(read_hand_eye(arguments.out), read_hand_eye(arguments.reference))
     result: dict[str, object] = {
         "translation_mm": 1e3 * float(np.linalg.norm(found.translation_m)),
         "rotation_deg": float(np.degrees(np.linalg.norm(found.rotation_vector))),
@@ -44,7 +47,18 @@ def main(arguments: Arguments) -> int:
     }
     text = f"{result['translation_mm']:.3f} mm, {result['rotation_deg']:.4f}°"
     if found.sigmas is not None:
-        result["sigmas"] = found.sigmas.tolist()
-        text += f"; at most {found.sigmas.max():.1f} of its reported standard deviations on any axis"
+        result |= {"sigmas": found.sigmas.tolist(), "chi2": found.chi2, "p": found.p_value}
+        result["explained_by"] = found.explained_by
+        text += (
+            f"; at most {found.sigmas.max():.1f} of the reported standard deviations on any axis; "
+            f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}"
+        )
+        if len(found.explained_by) > 1:
+            shares = [
+                f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in found.explained_by.items()
+            ]
+            text += f"\nwould be explained by: {', '.join(shares)}"
+        if found.p_value is not None and found.p_value < UNLIKELY:
+            text += "\nmore than what both report: something has moved, or is not in their errors"
     arguments.output.result(text + "\n", result)
     return 0

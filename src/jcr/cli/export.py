@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 FormatName = Literal[
-    "ros2", "moveit", "urdf", "xacro", "easy_handeye2", "covariance", "camera_info", "ply", "glb", "octomap",
-    "esdf", "spheres", "nerfstudio", "colmap", "rerun",
+    "ros2", "moveit", "urdf", "xacro", "easy_handeye2", "covariance", "camera_info", "joint_offsets", "ply", "glb",
+    "octomap", "esdf", "spheres", "nerfstudio", "colmap", "rerun",
 ]  # fmt: skip
 
 
@@ -229,6 +229,16 @@ def _camera_info(run: Run, path: Path) -> None:
     write_text(path, ros.camera_info(run.mount, run.lens))
 
 
+def _joint_offsets(run: Run, path: Path) -> None:
+    errors = run.calibration.robot_errors
+    if errors is None or errors.joints is None:
+        raise InputError(
+            f"{run.arguments.out}: no joint offsets were estimated; name the arm (--robot, or robot in capture.json)"
+        )
+    offsets = [(joint.offset_deg, joint.std_deg) for joint in errors.joints]
+    write_text(path, ros.joint_offsets(offsets, errors.p, run.doubt))
+
+
 def _ply(run: Run, path: Path) -> None:
     from jcr.represent.cloud_ply import write_cloud
 
@@ -303,6 +313,9 @@ FORMATS = (
         _of_mount(ros.pose_with_covariance),
     ),
     Format("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _camera_info),
+    Format(
+        "joint_offsets", "joint_offsets.yaml", "by how much each joint of the arm seems off", _joint_offsets
+    ),
     Format("ply", "cloud.ply", "points, colours, labels", _ply),
     Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
     Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),

@@ -4,6 +4,7 @@ Every text names its frames and units, and says so where the calibration is not 
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -195,6 +196,26 @@ def easy_handeye2(mount: CameraMount, name: str) -> str:
         },
     }
     return _yaml(mount, content, flow=False)
+
+
+def joint_offsets(
+    offset_and_std_deg: Sequence[tuple[float, float]], p: float | None, doubt: str | None = None
+) -> str:
+    """YAML of what to add to each reported joint angle (rad), with its standard deviation, from the base on.
+
+    `p` is the chance of the residuals without any systematic error.
+    """
+    content = {
+        "joint_offsets_rad": [float(np.radians(offset)) for offset, _ in offset_and_std_deg],
+        "std_rad": [float(np.radians(std)) for _, std in offset_and_std_deg],
+        "p": p,
+    }
+    about = (
+        "true joint angle = reported + offset; what no pose shows keeps the standard deviation of any joint"
+    )
+    if doubt is not None:
+        about += f"\n# NOT TO BE TRUSTED: {doubt}"
+    return f"# {about}\n{yaml.safe_dump(content, sort_keys=False)}"
 
 
 def pose_with_covariance(mount: CameraMount) -> str:

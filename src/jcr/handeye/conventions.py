@@ -44,7 +44,7 @@ class Reading:
 
     name: str
     translation_mm: float
-    """Noise per axis that the fit leaves; infinite when nothing fits."""
+    """Errors per axis that the fit leaves, random and systematic; infinite when nothing fits."""
     rotation_deg: float
     used: int
     """Images that agree."""
@@ -103,11 +103,11 @@ def explained(found: tuple[Reading, Reading]) -> str:
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
     solved = solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
-    noise = solved.robot_noise
+    metres, radians = solved.robot_noise.together
     return Reading(
         candidate.name,
-        1e3 * noise.translation,
-        float(np.degrees(noise.rotation)),
+        1e3 * metres,
+        float(np.degrees(radians)),
         int(solved.inliers.sum()),
     )
 

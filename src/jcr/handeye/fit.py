@@ -1,24 +1,39 @@
-"""Maximum-likelihood hand-eye calibration from poses: the robot's reported poses are noisy, each image once.
+"""Maximum-likelihood hand-eye calibration from poses: the robot's reported poses err, each image at random and all
+alike.
 
-The reported gripper pose of image i differs from `base_from_recon · S_λ(recon_from_camera) · X⁻¹` by the
-robot's own noise: σ_t per axis of position, σ_r per axis of orientation. Both are estimated with the rest
-unless given (restricted maximum likelihood), so the covariance is that of the robot at hand. Working with
-images instead of motions keeps their errors independent, and makes the result blind to their order.
+The reported gripper pose of image i differs from `base_from_recon · S_λ(recon_from_camera) · X⁻¹` by a random error,
+σ_t per axis of position and σ_r per axis of rotation, and by a systematic one that it shares with poses near it
+(systematic.py). Their sizes are estimated with the rest (components.py), so the covariance is that of the robot at
+hand. Working with images instead of motions keeps the random errors independent, and makes the result blind to their
+order.
 
 Camera poses are taken as exact beside the robot's, unless their joint covariance is given: then both errors count
 (generalised least squares), which is what kinematic alignment does, to first order and with the robot's noise
 estimated. Few images, or a robot better than the cameras, need it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
+from scipy.linalg import cho_solve
 
 from jcr.geometry import retract
-from jcr.handeye.equation import PRIOR_STD, TRANSLATION, Poses, residuals, residuals_by_camera
-from jcr.handeye.noise import NoiseShare, noise_share, robot_noise, widened
+from jcr.handeye.components import Equations, Solution, most_likely, posterior, solve
+from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals, residuals_by_camera
+from jcr.handeye.systematic import Region, smooth_errors
+from jcr.records import Budget
+
+LEAST_FREEDOM, MOST_FREEDOM = 0.1, 1e6
+SHOWN = 1.1
+"""Times the noise that was given: so much more is the residuals' doing."""
+LARGEST_TURN = 0.5
+"""rad, and of the logarithm of scale: a poor start on nearly unobservable motions must not throw rotations around the
+circle."""
+
+Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]
+"""gripper_from_camera, scale, base_from_recon."""
 
 
 @dataclass(frozen=True)
@@ -41,188 +56,196 @@ class PoseFit:
     translation_residual: Float[ndarray, "n 3"]
     """Predicted minus reported gripper position (m), base axes; of every pose, used or not."""
     rotation_residual: Float[ndarray, "n 3"]
-    """Rotation vector from reported to predicted gripper (rad), base axes."""
+    """Rotation vector from reported to predicted gripper (rad), gripper axes."""
     noise: tuple[float, float]
-    """σ_t (m) and σ_r (rad) per axis, given or estimated."""
+    """σ_t (m) and σ_r (rad) per axis of the random errors, given or estimated."""
     noise_estimated: bool
+    given_noise: tuple[float, float] | None
+    systematic: float
+    """σ_s (rad) of the systematic errors."""
+    systematic_left: tuple[float, float]
+    """m, rad per axis: what of them is left in the used poses."""
     degrees_of_freedom: tuple[float, float]
-    """Of the two estimates; infinite where a noise was given that explains the residuals."""
-    hessian: Float[ndarray, "13 13"]
-    """Of the negative log likelihood, prior included."""
-    noise_share: NoiseShare
-    """In the inverse of `hessian`."""
+    """Of the two estimates of the noise."""
+    covariance: Float[ndarray, "7 7"]
+    """In records.COVARIANCE_ORDER."""
+    budget: Budget | None
+    """Its parts; None of a fit that is not averaged."""
     missed: Float[ndarray, "n 6"]
-    """By how much a fit without it misses each pose: translation (m) and rotation (rad), base axes."""
+    """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
     missed_covariance: Float[ndarray, "n 6 6"]
     """What to expect of that, the pose's own noise included."""
-
-    @property
-    def covariance(self) -> Float[ndarray, "7 7"]:
-        """Covariance in records.COVARIANCE_ORDER, widened for an estimated noise."""
-        share = self.noise_share
-        of_seven = NoiseShare(share.by_log_variance[:, :7, :7], share.log_variance_covariance)
-        return widened(np.linalg.inv(self.hessian)[:7, :7], of_seven)
-
-
-def deleted_residuals(residual: Float[ndarray, "n 6"], hat: Float[ndarray, "n 6 6"]) -> Float[ndarray, "n 6"]:
-    """Residuals of each pose from the fit without it, from those of the fit with it: (I − H)⁻¹ r."""
-    return np.linalg.solve(np.eye(6) - hat + 1e-9 * np.eye(6), residual[..., None])[..., 0]
 
 
 def fit_poses(
     base_from_gripper: Poses,
     recon_from_camera: Poses,
-    start: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],
+    start: Unknowns,
     used: Bool[ndarray, " n"],
     noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
+    systematic: Float[ndarray, "r r"] | None = None,
+    averaged: bool = True,
     iterations: int = 50,
 ) -> PoseFit:
-    """Gauss-Newton from `start` (gripper_from_camera, scale, base_from_recon) on the `used` poses.
+    """Gauss-Newton from `start` on the `used` poses; the answer is the effective hand-eye transform.
 
-    Between two steps the noise is estimated, and with it the residuals' covariance: what falls is no sum of squares that
-    least_squares.py could watch.
+    Between two steps the sizes of the errors are estimated, and with them the residuals' covariance: what falls is no
+    sum of squares that least_squares.py could watch.
 
-    `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the
-    cameras, as records.CameraEvidence has it; None where they are exact beside the robot.
+    `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the steps
+    of the cameras (geometry.retract, recon axes); None where the cameras are exact beside the robot. `systematic` is
+    the covariance of the systematic errors at 1 rad; None: that of errors smooth over the poses. Without `averaged`
+    the sizes of the errors are taken at their most likely values, which is faster and claims too much.
     """
-    unknowns, cues = start, cues or Cues()
-    robot, dof = noise or (5e-4, np.radians(0.1)), (np.inf, np.inf)
-    poses = (base_from_gripper, recon_from_camera, used, camera_covariance, cues)
+    cues = cues or Cues()
+    if systematic is None:
+        systematic = smooth_errors(base_from_gripper)
+    problem = _Problem(base_from_gripper, recon_from_camera, used, noise, cues, camera_covariance, systematic)
+    unknowns, log_sizes = start, None
     for _ in range(iterations):
-        system = _system(unknowns, robot, *poses)
-        before, (robot, dof) = robot, _estimated_noise(system, robot, noise)
-        settled = bool(np.allclose(robot, before, rtol=1e-6, atol=0.0))
-        system = _system(unknowns, robot, *poses)
-        step = -np.linalg.solve(system.hessian, system.gradient)
-        # A wild start on nearly unobservable motions must not throw rotations around the circle.
-        step *= min(1.0, 0.5 / max(np.abs(step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300))
+        linear = _linearised(problem, unknowns)
+        log_sizes, information = most_likely(linear.equations, log_sizes)
+        solution = solve(linear.equations, log_sizes)
+        step = solution.step * min(
+            1.0, LARGEST_TURN / max(np.abs(solution.step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300)
+        )
+        settled = float(((solution.information_root.T @ step) ** 2).sum()) < (1e-14 if averaged else 1e-6)
         unknowns = _moved(*unknowns, step)
-        if settled and float(step @ system.hessian @ step) < 1e-14:
+        if settled:
             break
-    system = _system(unknowns, robot, *poses)
-    missed, missed_covariance = _missed(system, robot)
-    share = noise_share(*system.passed_on(), robot, noise)
+    linear = _linearised(problem, unknowns)
+    log_sizes, information = most_likely(linear.equations, log_sizes)
+    solution = solve(linear.equations, log_sizes)
+    if averaged:
+        found = posterior(linear.equations, log_sizes, information, linear.region)
+        unknowns, covariance, budget = _moved(*unknowns, found.step), found.covariance, found.budget
+    else:
+        covariance = solution.covariance
+        budget = None
+    sigma_t, sigma_r, sigma_s = (float(x) for x in np.sqrt(linear.equations.variances(log_sizes)))
+    missed, missed_covariance = _missed(problem, linear, solution, (sigma_t, sigma_r), sigma_s)
+    # Of log σ²; a given part of it is known.
+    estimated = np.exp(2 * log_sizes[:2]) / np.square((sigma_t, sigma_r))
+    uncertain = 4 * estimated**2 * np.diag(np.linalg.inv(information))[:2]
+    freedom = np.clip(2 / uncertain, LEAST_FREEDOM, MOST_FREEDOM)
+    residual = residuals(*unknowns, base_from_gripper, recon_from_camera)[0]
     return PoseFit(
         *unknowns,
-        system.residual[:, :3],
-        system.residual[:, 3:],
-        robot,
-        robot != noise,
-        dof if share.log_variance_covariance.any() else (np.inf, np.inf),
-        system.hessian,
-        share,
+        residual[:, :3],
+        residual[:, 3:],
+        (sigma_t, sigma_r),
+        exceeds((sigma_t, sigma_r), noise),
+        noise,
+        sigma_s,
+        linear.equations.systematic_left(log_sizes),
+        (float(freedom[0]), float(freedom[1])),
+        covariance[:7, :7],
+        budget,
         missed,
         missed_covariance,
     )
 
 
+def exceeds(noise: tuple[float, float], given: tuple[float, float] | None) -> bool:
+    """Whether a noise is the residuals' doing, and not the one that was given."""
+    return given is None or any(size > SHOWN * known for size, known in zip(noise, given, strict=True))
+
+
 @dataclass(frozen=True)
-class _System:
-    """The equations at one value of the unknowns; r = 6 times the used poses, s = 6n."""
+class _Problem:
+    """What stays while the unknowns move; r = 6n."""
+
+    base_from_gripper: Poses
+    recon_from_camera: Poses
+    used: Bool[ndarray, " n"]
+    noise: tuple[float, float] | None
+    cues: Cues
+    camera_covariance: Float[ndarray, "r r"] | None
+    systematic: Float[ndarray, "r r"]
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The equations at one value of the unknowns, of all poses and of the used ones."""
 
     residual: Float[ndarray, "n 6"]
     jacobian: Float[ndarray, "n 6 13"]
-    used: Bool[ndarray, " n"]
-    spread: Float[ndarray, "s s"] | None
-    """Covariance that the cameras' errors give the residuals."""
-    weight: Float[ndarray, " r"] | Float[ndarray, "r r"]
-    """Inverse covariance of the used residuals; its diagonal where they are independent."""
-    hessian: Float[ndarray, "13 13"]
-    gradient: Float[ndarray, "13"]
-
-    def weighed(self, x: Float[ndarray, "r *k"]) -> Float[ndarray, "r *k"]:
-        """`weight` times x."""
-        return (self.weight * x.T).T if self.weight.ndim == 1 else self.weight @ x
-
-    def projected(self) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
-        """P r, and the diagonal blocks of P = W - W J H⁻¹ Jᵀ W: what residuals say once the unknowns are fitted
-        (Searle et al., "Variance components", 1992, section 6.6)."""
-        m = int(self.used.sum())
-        by_unknown = self.weighed(self.jacobian[self.used].reshape(6 * m, 13)).reshape(m, 6, 13)
-        if self.weight.ndim == 1:
-            own = self.weight.reshape(m, 6, 1) * np.eye(6)
-        else:
-            own = self.weight.reshape(m, 6, m, 6)[range(m), :, range(m)]
-        explained = by_unknown @ np.linalg.inv(self.hessian) @ np.swapaxes(by_unknown, 1, 2)
-        return self.weighed(self.residual[self.used].ravel()).reshape(m, 6), own - explained
-
-    def passed_on(self) -> tuple[Float[ndarray, "13 r"], Float[ndarray, "r r"]]:
-        """H⁻¹ Jᵀ W, by which errors of the used poses pass into the unknowns, and P = W - W J H⁻¹ Jᵀ W."""
-        by_unknown = self.weighed(self.jacobian[self.used].reshape(-1, 13))
-        gain = np.linalg.solve(self.hessian, by_unknown.T)
-        weight = np.diag(self.weight) if self.weight.ndim == 1 else self.weight
-        return gain, weight - by_unknown @ gain
+    shared: Float[ndarray, "r r"]
+    """Covariance that the cameras give the residuals of all poses; 0 where they are exact."""
+    systematic: Float[ndarray, "r r"]
+    """Of what systematic errors leave in all poses, at 1 rad."""
+    region: Region
+    equations: Equations
 
 
-def _system(
-    unknowns: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],
-    robot: tuple[float, float],
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    used: Bool[ndarray, " n"],
-    camera_covariance: Float[ndarray, "r r"] | None,
-    cues: Cues,
-) -> _System:
-    residual, jacobian = residuals(*unknowns, base_from_gripper, recon_from_camera)
-    variance = np.tile(np.repeat(np.square(robot), 3), used.sum())
-    spread, weight = None, 1.0 / variance
-    if camera_covariance is not None:
-        n = len(used)
-        by_camera = residuals_by_camera(*unknowns, recon_from_camera)
-        blocks = camera_covariance.reshape(n, 6, n, 6).swapaxes(1, 2)
-        spread = by_camera[:, None] @ blocks @ np.swapaxes(by_camera, 1, 2)
-        spread = spread.swapaxes(1, 2).reshape(6 * n, 6 * n)
-        rows = np.repeat(used, 6)
-        weight = np.linalg.inv(spread[np.ix_(rows, rows)] + np.diag(variance))
-    prior_hessian, prior_gradient = _prior(*unknowns[:2], cues)
-    system = _System(residual, jacobian, used, spread, weight, prior_hessian, prior_gradient)
-    j = jacobian[used].reshape(-1, 13)
-    weighed = system.weighed(j)
-    return replace(
-        system,
-        hessian=weighed.T @ j + prior_hessian,
-        gradient=weighed.T @ residual[used].ravel() + prior_gradient,
+def _linearised(problem: _Problem, unknowns: Unknowns) -> _Linearised:
+    used, n = problem.used, len(problem.used)
+    rows = np.repeat(used, 6)
+    residual, jacobian = residuals(*unknowns, problem.base_from_gripper, problem.recon_from_camera)
+    stacked = jacobian.reshape(6 * n, 13)
+    region = Region.of_poses(stacked[rows])
+    fit = np.zeros((12, 6 * n))
+    fit[:, rows] = region.fit
+    systematic = Region(np.delete(stacked, SCALE, axis=1), fit).left(problem.systematic)
+    shared = np.zeros((6 * n, 6 * n))
+    if problem.camera_covariance is not None:
+        by_camera = residuals_by_camera(*unknowns, problem.recon_from_camera)
+        blocks = problem.camera_covariance.reshape(n, 6, n, 6).swapaxes(1, 2)
+        shared = (
+            (by_camera[:, None] @ blocks @ np.swapaxes(by_camera, 1, 2)).swapaxes(1, 2).reshape(6 * n, 6 * n)
+        )
+    among = np.ix_(rows, rows)
+    equations = Equations(
+        residual[used].ravel(),
+        stacked[rows],
+        *_prior(*unknowns[:2], problem.cues),
+        None if problem.camera_covariance is None else shared[among],
+        systematic[among],
+        problem.noise,
     )
-
-
-def _estimated_noise(
-    system: _System, robot: tuple[float, float], given: tuple[float, float] | None
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """One step of restricted maximum likelihood for the robot's noise, and its degrees of freedom."""
-    told, own = system.projected()
-    variance = np.repeat(np.square(robot), 3)
-    squares = ((variance * told) ** 2).sum(0)
-    degrees = (variance * np.einsum("mii->mi", own)).sum(0)
-    dof = max(float(degrees[:3].sum()), 0.1), max(float(degrees[3:].sum()), 0.1)
-    return robot_noise((float(squares[:3].sum()), float(squares[3:].sum())), dof, robot, given), dof
+    return _Linearised(residual, jacobian, shared, systematic, region, equations)
 
 
 def _missed(
-    system: _System, robot: tuple[float, float]
+    problem: _Problem, linear: _Linearised, solution: Solution, noise: tuple[float, float], systematic: float
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
-    """Each pose's residual from a fit without it, and its covariance; of a used pose P_ii⁻¹ (P r)_i and P_ii⁻¹."""
-    sigma, used = np.repeat(robot, 3), system.used
-    missed, covariance = np.empty_like(system.residual), np.empty((len(used), 6, 6))
-    told, own = system.projected()
-    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
-    missed[used] = sigma * np.einsum("mij,mj->mi", without, sigma * told)
-    covariance[used] = sigma[:, None] * without * sigma
-    inverse_hessian = np.linalg.inv(system.hessian)
+    """Each pose's residual from a fit without it, and its covariance."""
+    equations, used = linear.equations, problem.used
+    missed, covariance = np.empty_like(linear.residual), np.empty((len(used), 6, 6))
+    missed[used], covariance[used] = left_out(equations, solution, noise)
+    weight = cho_solve((solution.root, True), np.eye(len(equations.residual)))
+    # What the other poses' errors tell of an unused one's (best linear unbiased prediction).
+    alike = linear.shared + systematic**2 * linear.systematic
     rows = np.repeat(used, 6)
     for i in np.flatnonzero(~used):
-        residual, jacobian, own_spread = system.residual[i], system.jacobian[i], np.diag(sigma**2)
-        if system.spread is not None:
-            # What the other cameras' errors tell of this one's (best linear unbiased prediction).
-            shared = system.spread[6 * i : 6 * i + 6, rows]
-            gain = shared @ system.weight
-            residual = residual - gain @ system.residual[used].ravel()
-            jacobian = jacobian - gain @ system.jacobian[used].reshape(-1, 13)
-            own_spread = own_spread + system.spread[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] - gain @ shared.T
-        missed[i] = residual
-        covariance[i] = own_spread + jacobian @ inverse_hessian @ jacobian.T
+        mine = slice(6 * i, 6 * i + 6)
+        gain = alike[mine, rows] @ weight
+        jacobian = linear.jacobian[i] - gain @ equations.jacobian
+        missed[i] = linear.residual[i] - gain @ equations.residual
+        own_spread = alike[mine, mine] - gain @ alike[mine, rows].T
+        own_noise = np.diag(np.repeat(np.square(noise), 3))
+        covariance[i] = own_spread + own_noise + jacobian @ solution.covariance @ jacobian.T
     return missed, covariance
+
+
+def left_out(
+    equations: Equations, solution: Solution, noise: tuple[float, float]
+) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
+    """Each used pose's residual from a fit without it, P_ii⁻¹ (P r)_i with P = V⁻¹ − V⁻¹J C JᵀV⁻¹, and its covariance
+    P_ii⁻¹.
+
+    `noise` (m, rad) sets the units in which the matrices are inverted.
+    """
+    sigma, m = np.repeat(noise, 3), len(equations.residual) // 6
+    weight = cho_solve((solution.root, True), np.eye(6 * m))
+    left = weight @ (equations.residual + equations.jacobian @ solution.step)
+    projection = weight - solution.weighed @ solution.gain
+    own = projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
+    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
+    missed = sigma * np.einsum("mij,mj->mi", without, sigma * left.reshape(m, 6))
+    return missed, sigma[:, None] * without * sigma
 
 
 def _prior(
@@ -243,5 +266,5 @@ def _prior(
 
 def _moved(
     x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], step: Float[ndarray, "13"]
-) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
+) -> Unknowns:
     return retract(x, step[:6]), float(scale * np.exp(step[6])), retract(z, step[7:])

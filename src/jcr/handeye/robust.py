@@ -18,7 +18,10 @@ from jcr.geometry import ARM, rotation_angle, transform
 from jcr.handeye.closed_form import closed_form, initial_estimate, motions, sine_axis
 from jcr.handeye.equation import predict
 from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
+from jcr.handeye.systematic import smooth_errors
 
+LARGER = 2.0
+"""Times the errors of the trusted images: wrong poses are farther off than that."""
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
 MAX_TRIPLES = 1500
@@ -37,11 +40,13 @@ def robust_fit(
     noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
+    systematic: Float[ndarray, "r r"] | None = None,
 ) -> tuple[PoseFit, Bool[ndarray, " n"]]:
     """The fit to the images that agree with each other, and which those are.
 
-    With fewer than five images there is nothing to vote with, and all are kept. Solved in a frame at the middle of the
-    cameras and in their extent as unit: a frame far away makes a rotation about its origin look like a translation.
+    With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of fit_poses.
+    Solved in a frame at the middle of the cameras and in their extent as unit: a frame far away makes a rotation about
+    its origin look like a translation.
     """
     n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
     middle = centers.mean(0)
@@ -53,44 +58,44 @@ def robust_fit(
     if camera_covariance is not None:
         per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
         camera_covariance = per_unit[:, None] * camera_covariance * per_unit
-    fit, trusted = _solved(base_from_gripper, recon_from_camera, noise, cues, camera_covariance)
+    given = (
+        noise,
+        cues,
+        camera_covariance,
+        smooth_errors(base_from_gripper) if systematic is None else systematic,
+    )
+
+    def fitted(trusted: Bool[ndarray, " n"], averaged: bool) -> PoseFit:
+        start = initial_estimate(base_from_gripper, recon_from_camera, trusted.astype(float))
+        return fit_poses(base_from_gripper, recon_from_camera, start, trusted, *given, averaged=averaged)
+
+    trusted = np.ones(n, dtype=bool)
+    if n >= 5:
+        trusted = _least_trimmed(base_from_gripper, recon_from_camera)
+        for _ in range(10):
+            agreeing = _agreeing(fitted(trusted, averaged=False))
+            if agreeing.sum() < 4 or (agreeing == trusted).all():
+                break
+            trusted = agreeing
+        if not trusted.all() and _alike(
+            fitted(np.ones_like(trusted), averaged=False), fitted(trusted, averaged=False)
+        ):
+            trusted = np.ones_like(trusted)
+    fit = fitted(trusted, averaged=True)
     scale, z = fit.scale / unit, fit.base_from_recon
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
     return replace(fit, scale=scale, base_from_recon=z), trusted
 
 
-def _solved(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    noise: tuple[float, float] | None,
-    cues: Cues | None,
-    camera_covariance: Float[ndarray, "r r"] | None,
-) -> tuple[PoseFit, Bool[ndarray, " n"]]:
-    n, given = len(base_from_gripper), (noise, cues, camera_covariance)
-    if n < 5:
-        everything = np.ones(n, dtype=bool)
-        return _fit(base_from_gripper, recon_from_camera, everything, *given), everything
-    trusted = _least_trimmed(base_from_gripper, recon_from_camera)
-    fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
-    for _ in range(10):
-        agreeing = _agreeing(fit)
-        if agreeing.sum() < 4 or (agreeing == trusted).all():
-            break
-        trusted = agreeing
-        fit = _fit(base_from_gripper, recon_from_camera, trusted, *given)
-    return fit, trusted
+def _alike(everything: PoseFit, trusted: PoseFit) -> bool:
+    """Whether all images agree among each other with errors hardly larger than those of the trusted ones.
 
-
-def _fit(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    trusted: Bool[ndarray, " n"],
-    noise: tuple[float, float] | None,
-    cues: Cues | None,
-    camera_covariance: Float[ndarray, "r r"] | None,
-) -> PoseFit:
-    start = initial_estimate(base_from_gripper, recon_from_camera, trusted.astype(float))
-    return fit_poses(base_from_gripper, recon_from_camera, start, trusted, noise, cues, camera_covariance)
+    Images that were trusted first are those that a bent arm bends least: the others of a sound capture are farther off
+    than these let expect.
+    """
+    sizes, before = ((*fit.noise, fit.systematic) for fit in (everything, trusted))
+    larger = max(size / least for size, least in zip(sizes, before, strict=True))
+    return larger < LARGER and bool(_agreeing(everything).all())
 
 
 def _agreeing(fit: PoseFit) -> Bool[ndarray, " n"]:

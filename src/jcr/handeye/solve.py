@@ -9,10 +9,13 @@ from numpy.typing import ArrayLike
 
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
+from jcr.handeye.arms import arm_named
 from jcr.handeye.fit import Cues, PoseFit
 from jcr.handeye.observability import observability
 from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.robust import robust_fit
+from jcr.handeye.systematic import systematic_errors
 from jcr.records import HandEye, HeldOut, RobotNoise
 
 MAX_NOISE = (0.02, np.radians(3.0))
@@ -33,15 +36,24 @@ def solve_hand_eye(
     robot_noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
+    joints: ArrayLike | None = None,
+    robot: str | Arm | None = None,
+    systematic: Float[ndarray, "r r"] | None = None,
 ) -> HandEye:
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
     Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
     the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
     (m, rad), at least: the residuals may say more. `camera_covariance` (6n,6n) is that of the camera poses where
-    they are not exact beside the gripper's, as records.CameraEvidence defines it. Raises InputError on shapes, values or
-    counts that cannot be poses; motion that shows too little is an answer (`observability`, `converged`), not an
-    exception.
+    they are not exact beside the gripper's, as records.CameraEvidence defines it.
+
+    `robot` names the arm (jcr.handeye.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), from the base on:
+    they tell how its joint offsets and link errors bend the poses. Of a robot alone the angles are found from the
+    poses; with neither, errors are those that poses near each other share. `systematic` is their covariance where it is
+    known already (systematic.py).
+
+    Raises InputError on shapes, values or counts that cannot be poses, and on poses or angles that are not of the robot;
+    motion that shows too little is an answer (`observability`, `converged`), not an exception.
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
@@ -60,14 +72,20 @@ def solve_hand_eye(
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
 
+    if systematic is None:
+        systematic = systematic_errors(gripper, *_checked_arm(robot, joints, n))
+
     # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image
     # that was given twice is one: its error counted as two would pass for agreement.
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+    rows = (6 * order[:, None] + np.arange(6)).ravel()
+    among = np.ix_(rows, rows)
     if camera_covariance is not None:
-        rows = (6 * order[:, None] + np.arange(6)).ravel()
-        camera_covariance = camera_covariance[np.ix_(rows, rows)]
-    fit, used_sorted = robust_fit(gripper[order], camera[order], robot_noise, cues, camera_covariance)
+        camera_covariance = camera_covariance[among]
+    fit, used_sorted = robust_fit(
+        gripper[order], camera[order], robot_noise, cues, camera_covariance, systematic[among]
+    )
     used = used_sorted[back]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     held_out = _held_out(fit, used_sorted)
@@ -81,11 +99,14 @@ def solve_hand_eye(
         translation_residual_m=np.linalg.norm(fit.translation_residual, axis=1)[back],
         rotation_residual_rad=np.linalg.norm(fit.rotation_residual, axis=1)[back],
         observability=seen,
-        robot_noise=RobotNoise(*fit.noise, fit.noise_estimated, robot_noise),
+        robot_noise=RobotNoise(
+            *fit.noise, fit.noise_estimated, robot_noise, fit.systematic, fit.systematic_left
+        ),
         residual_translation=delta_t,
         residual_rotation=delta_r,
         converged=False,
         held_out=held_out,
+        budget=fit.budget,
     )
     return judged(replace(hand_eye, reasons=_reasons(hand_eye)))
 
@@ -109,10 +130,11 @@ def _doubts(hand_eye: HandEye):
             f"only {used} of {n} images agree on one calibration; check that images and poses are paired, "
             "and the convention of the poses (jcr check)"
         )
-    if noise.translation > MAX_NOISE[0] or noise.rotation > MAX_NOISE[1]:
+    metres, radians = noise.together
+    if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
         yield (
-            f"gripper poses and pictures disagree by {1e3 * noise.translation:.0f} mm and "
-            f"{np.degrees(noise.rotation):.1f}° per axis; check the pairing and the convention of the poses "
+            f"gripper poses and pictures disagree by {1e3 * metres:.0f} mm and "
+            f"{np.degrees(radians):.1f}° per axis; check the pairing and the convention of the poses "
             "(jcr check)"
         )
     if hand_eye.observability.observable:
@@ -136,17 +158,18 @@ def _doubts(hand_eye: HandEye):
 def _remarks(hand_eye: HandEye):
     """What a user should know of an answer that may still be trusted."""
     noise = hand_eye.robot_noise
+    metres, radians = _disagreement(hand_eye)
     if noise.given is not None and (
-        noise.translation > SURPRISE * noise.given[0] or noise.rotation > SURPRISE * noise.given[1]
+        metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         yield (
-            f"gripper poses and pictures disagree by {1e3 * noise.translation:.2g} mm and "
-            f"{np.degrees(noise.rotation):.2g}° per axis, more than the robot noise that was given "
+            f"gripper poses and pictures disagree by {1e3 * metres:.2g} mm and "
+            f"{np.degrees(radians):.2g}° per axis, more than the robot noise that was given "
             f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
         )
     held_out = hand_eye.held_out
     if held_out is not None:
-        typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.translation
+        typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.together[0]
         if held_out.translation_mm > max(3 * typical, 2.0):
             yield (
                 f"images left out are missed by {held_out.translation_mm:.1f} mm though the fit's residual "
@@ -156,9 +179,21 @@ def _remarks(hand_eye: HandEye):
         yield f"{len(hand_eye.inliers)} images cannot outvote a wrong one; take 8 or more"
 
 
+def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
+    """Root mean square residual of the used images per axis (m, rad), made up for the 13 unknowns that were fitted."""
+    used = hand_eye.inliers
+    count = 6 * int(used.sum())
+    fitted = count / max(count - 13, 1)
+    metres, radians = (
+        float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
+        for residual in (hand_eye.translation_residual_m, hand_eye.rotation_residual_rad)
+    )
+    return metres, radians
+
+
 def _reasons(hand_eye: HandEye) -> tuple[str | None, ...]:
-    typical_mm = 1e3 * hand_eye.robot_noise.translation
-    typical_deg = np.degrees(hand_eye.robot_noise.rotation)
+    metres, radians = hand_eye.robot_noise.together
+    typical_mm, typical_deg = 1e3 * metres, np.degrees(radians)
     return tuple(
         None
         if used
@@ -180,6 +215,29 @@ def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
     return HeldOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )
+
+
+def _checked_arm(
+    robot: str | Arm | None, joints: ArrayLike | None, count: int
+) -> tuple[Arm | None, Joints | None]:
+    if robot is None:
+        if joints is not None:
+            raise InputError("joints: of which robot? name it (robot=), or leave the joint angles out")
+        return None, None
+    arm = arm_named(robot) if isinstance(robot, str) else robot
+    if joints is None:
+        return arm, None
+    try:
+        angles = np.asarray(joints, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("joints: not numbers; give an array (n,dof) in rad") from None
+    if angles.shape != (count, arm.dof):
+        raise InputError(
+            f"joints: shape {angles.shape}; {count} poses of a {arm.name} need {(count, arm.dof)}"
+        )
+    if not np.isfinite(angles).all():
+        raise InputError("joints: NaN or infinite; give the angle of every joint at every image")
+    return arm, angles
 
 
 def _checked(transforms: ArrayLike, name: str) -> Float[ndarray, "n 4 4"]:

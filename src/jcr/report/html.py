@@ -7,7 +7,7 @@ from importlib import metadata
 from typing import Any
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.words import attempt_in_words, missed, pixels
+from jcr.calibration.words import attempt_in_words, budget_in_words, missed, pixels
 from jcr.extras import is_installed
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import Capture
@@ -189,6 +189,8 @@ def _details(
             "principal point": f"{lens.cx:.2f}, {lens.cy:.2f} px",
             "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
         }
+    if (uncertainty := calibration.uncertainty) is not None and uncertainty.budget is not None:
+        blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)
     if map_history:
         blocks["Map"] = dict(map_history)
     for stage, chosen in options.items():

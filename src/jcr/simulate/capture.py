@@ -140,7 +140,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
         reference = {
             "gripper_from_camera": arm.effective.tolist(),
             "physical_gripper_from_camera": arm.physical.tolist(),
-            "how": f"simulated: best for the reported poses of {EFFECTIVE_POSES} other views, exact cameras",
+            "how": f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras",
         }
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
     frames: list[dict[str, object]] = [
@@ -180,7 +180,7 @@ def _arm(options: SimulateOptions, robot: RobotName, motion: np.random.Generator
     target = table_center(bent.arm)
     physical = hand_eye_on(bent.arm, motion)
     joints = patterned(bent.arm, options.pattern, options.images, target, physical, motion)
-    effective = effective_hand_eye_about(bent, physical, elsewhere, target)
+    effective = effective_hand_eye_about(bent, physical, options.images, elsewhere, target)
     return _Arm(bent, joints, physical, effective)
 
 

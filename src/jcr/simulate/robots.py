@@ -249,11 +249,17 @@ def patterned(
 def effective_hand_eye_about(
     bent: BentArm,
     gripper_from_camera: Float[ndarray, "4 4"],
+    count: int,
     rng: np.random.Generator,
     target_in_base: Float[ndarray, "3"] | None = None,
 ) -> Float[ndarray, "4 4"]:
-    """The effective gripper_from_camera (4,4) of a bent arm over `views` other than the capture's about the target."""
-    joints = views(bent.arm, EFFECTIVE_POSES, gripper_from_camera, rng, target_in_base)
+    """The effective gripper_from_camera (4,4) of a bent arm over the workspace of a capture of `count` `views`.
+
+    Other poses of the same views: a capture of few does not reach where the pattern's later ones are.
+    """
+    captures = -(-EFFECTIVE_POSES // count)
+    others = [views(bent.arm, count, gripper_from_camera, rng, target_in_base) for _ in range(captures)]
+    joints = np.concatenate(others)
     cameras = bent.true(joints) @ gripper_from_camera
     return effective_hand_eye(bent.reported(joints), cameras, gripper_from_camera)
 
@@ -302,7 +308,7 @@ def bent_problem(
     bent = bend(arm, errors.sizes, arms)
     joints = views(arm, count, physical, motion)
     true = bent.true(joints)
-    effective = effective_hand_eye_about(bent, physical, elsewhere)
+    effective = effective_hand_eye_about(bent, physical, count, elsewhere)
     recon_from_base = transform(rotation_exp(noise.normal(size=3)), noise.normal(size=3))
     scale = float(np.exp(noise.uniform(-2, 2)))
     cameras = disturbed(recon_from_base @ true @ physical, camera_noise, noise)

@@ -22,7 +22,7 @@ from jcr.geometry import (
     step_between,
 )
 from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.noise import REACH
+from jcr.handeye.systematic import REACH
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import (
     Alignment,

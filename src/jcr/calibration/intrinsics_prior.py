@@ -1,0 +1,92 @@
+"""What is known of a camera before its images are asked: intrinsics that were measured once, or those of any camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.camera import PARAMETERS
+from jcr.records import Intrinsics
+
+MEASURED = {
+    "f": 5e-3,
+    "aspect": 1e-3,
+    "cx": 5e-3,
+    "cy": 5e-3,
+    "k1": 0.02,
+    "k2": 0.05,
+    "p1": 1e-3,
+    "p2": 1e-3,
+}
+"""Standard deviations of intrinsics that were given without any: focal length and its aspect relative, principal point
+relative to the width, distortion absolute. Factory values and calibrations of another day are off by 0.3 to 0.9 % and a
+few pixels (docs/results/real.md)."""
+ESTIMATED = {
+    "f": 0.5,
+    "aspect": 3e-3,
+    "cx": 0.02,
+    "cy": 0.02,
+    "k1": 0.3,
+    "k2": 0.3,
+    "p1": 3e-3,
+    "p2": 3e-3,
+}
+"""Of a cheap camera that nobody calibrated, about what the reconstruction found."""
+FROM_FEATURES = {
+    "f": 1.5e-3,
+    "aspect": 2e-4,
+    "cx": 2e-3,
+    "cy": 2e-3,
+    "k1": 0.003,
+    "k2": 0.003,
+    "p1": 5e-4,
+    "p2": 5e-4,
+}
+"""By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
+from other features of the same pictures differ by the square root of two times that (docs/results/real.md)."""
+LEAST = 1e-12
+"""A standard deviation below it leaves a parameter as it is."""
+
+
+@dataclass(frozen=True)
+class IntrinsicsPrior:
+    """Independent directions in which intrinsics may differ from where they start, with their standard deviations."""
+
+    directions: Float[ndarray, "9 c"]
+    """In the order of camera.PARAMETERS."""
+    std: Float[ndarray, " c"]
+
+
+def prior_of(
+    intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, "9"] = MEASURED
+) -> IntrinsicsPrior:
+    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS."""
+    if not isinstance(std, dict):
+        free = np.flatnonzero(np.asarray(std) > LEAST)
+        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], np.asarray(std)[free])
+    fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
+    moves = {
+        "f": {"fx": fx, "fy": fy},
+        "aspect": {"fx": fx / 2, "fy": -fy / 2},
+        "cx": {"cx": width},
+        "cy": {"cy": width},
+    }
+    directions = np.zeros((len(PARAMETERS), len(std)))
+    for column, name in enumerate(std):
+        for parameter, unit in moves.get(name, {name: 1.0}).items():
+            directions[PARAMETERS.index(parameter), column] = unit
+    return IntrinsicsPrior(directions, np.array(list(std.values())))
+
+
+def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c c"]:
+    """Covariance, in the directions of the prior, by which what images show is off; no more than the prior's own."""
+    features = prior_of(intrinsics, FROM_FEATURES)
+    spread = (features.directions * features.std**2) @ features.directions.T
+    to_prior = np.linalg.pinv(prior.directions)
+    information = np.linalg.inv(to_prior @ spread @ to_prior.T + LEAST * np.diag(prior.std**2))
+    return np.linalg.inv(information + np.diag(prior.std**-2.0))
+
+
+HELD = IntrinsicsPrior(np.zeros((len(PARAMETERS), 0)), np.zeros(0))
+"""Of intrinsics that are exact."""

@@ -1,0 +1,64 @@
+"""`jcr touch`: is the map where the robot's tip feels it?"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jcr.cli.output import Output
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """The error in task space: points touched with a calibrated tip, against the same points of the map.
+
+    OUT is the folder of a run, POINTS a CSV with a line per point: image, x_px, y_px (the pixel of an image of the run
+    that shows the point) and x_m, y_m, z_m (the tip in the base frame as it touches it). Three points or more, spread
+    over the scene; corners and printed marks are best. Exit status 3 when the errors are more than the reported
+    uncertainty explains.
+
+    examples:
+      jcr touch out/table touched.csv
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    points: Annotated[Path, tyro.conf.Positional]
+    """The touched points, .csv."""
+    output: Output = field(default_factory=Output)
+
+
+def main(arguments: Arguments) -> int:
+    """Print each error beside what was expected."""
+    from jcr.errors import NotTrustedError
+    from jcr.touch import UNLIKELY, touch
+
+    found = touch(arguments.out, arguments.points)
+    lines = [
+        f"{image}: {1e3 * error[0]:+.2f} {1e3 * error[1]:+.2f} {1e3 * error[2]:+.2f} mm "
+        f"(± {1e3 * std[0]:.2f} {1e3 * std[1]:.2f} {1e3 * std[2]:.2f})"
+        for image, error, std in zip(found.images, found.error, found.std, strict=True)
+    ]
+    x, y, z = 1e3 * found.common
+    lines.append(
+        f"{1e3 * found.rms:.2f} mm (rms) where {1e3 * found.expected:.2f} mm are expected, p = {found.p_value:.2g}; "
+        f"mean {x:+.2f} {y:+.2f} {z:+.2f} mm"
+    )
+    content = {
+        "rms_mm": 1e3 * found.rms,
+        "expected_mm": 1e3 * found.expected,
+        "p": found.p_value,
+        "mean_mm": (1e3 * found.common).tolist(),
+        "points": [
+            {"image": image, "error_mm": (1e3 * error).tolist(), "std_mm": (1e3 * std).tolist()}
+            for image, error, std in zip(found.images, found.error, found.std, strict=True)
+        ],
+    }
+    arguments.output.result("\n".join(lines) + "\n", content)
+    if found.p_value < UNLIKELY:
+        raise NotTrustedError(
+            "the tip and the map are farther apart than the reported uncertainty: check the tip's calibration "
+            "(a constant error), then calibrate the camera anew (jcr run)"
+        )
+    return 0

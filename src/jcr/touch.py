@@ -1,0 +1,122 @@
+"""How well the map is where the robot's tip feels it: the error in task space that `jcr touch` reports."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.stats import chi2
+
+from jcr.calibration.cues import surface_at
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse, skew
+from jcr.run_folder import RunFolder
+
+COLUMNS = ("image", "x_px", "y_px", "x_m", "y_m", "z_m")
+LEAST = 3
+"""Points that tell a wrong calibration from one bad touch."""
+UNLIKELY = 1e-3
+"""Chance of such errors where what is reported holds, below which it is said not to."""
+
+
+@dataclass(frozen=True)
+class Touched:
+    """Touched points against the map."""
+
+    images: tuple[str, ...]
+    error: Float[ndarray, "k 3"]
+    """m, base axes: where the tip was less where the map has the point."""
+    std: Float[ndarray, "k 3"]
+    """m: what the calibration and the robot's errors let expect."""
+    p_value: float
+    """Chance of errors like these or larger, all points together."""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the errors (m)."""
+        return float(np.sqrt((self.error**2).sum(1).mean()))
+
+    @property
+    def expected(self) -> float:
+        """What it should be by the reported uncertainty (m)."""
+        return float(np.sqrt((self.std**2).sum(1).mean()))
+
+    @property
+    def common(self) -> Float[ndarray, "3"]:
+        """m: the mean error, which a wrong tip or tool offset would cause."""
+        return self.error.mean(0)
+
+
+def touch(out: Path, points: Path) -> Touched:
+    """Compare points that the tip touched with the surface that the images show at their pixels.
+
+    `points` is a CSV with the columns image, x_px, y_px (where an image of the run shows the point) and x_m, y_m, z_m
+    (the tip in the base frame as it touched). Expected errors: the covariance of the calibration, which all points
+    share, and of each touch the robot's random and systematic errors. Raises InputError on fewer than three points, an
+    image that is not in the run, or a pixel without a surface.
+    """
+    folder = RunFolder(out)
+    calibration, reconstruction = folder.calibrated()
+    capture = folder.capture()
+    assert (
+        calibration.uncertainty is not None and calibration.scale is not None
+    )  # wherever there is a transform
+    rows = _rows(points)
+    x, scale = np.array(calibration.gripper_from_camera), calibration.scale
+    base_from_recon = np.array(calibration.base_from_recon)
+    found = np.array([surface_at(capture, reconstruction, image, px, points.name) for image, px, _ in rows])
+    mapped = apply(base_from_recon, scale * found)
+    row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}
+    jacobian = np.empty((len(rows), 3, 7))
+    for k, (image, _, _) in enumerate(rows):
+        seen_by = row_of[image]
+        arm = x[:3, :3] @ (scale * apply(inverse(reconstruction.recon_from_camera[seen_by]), found[k]))
+        rotation = capture.base_from_gripper[reconstruction.image_index[seen_by], :3, :3]
+        jacobian[k] = rotation @ np.column_stack([np.eye(3), -skew(arm), arm])
+    stacked = jacobian.reshape(-1, 7)
+    covariance = stacked @ np.array(calibration.uncertainty.covariance) @ stacked.T
+    covariance += _touch_variance(calibration) * np.eye(len(covariance))
+    error = np.array([tip for _, _, tip in rows]) - mapped
+    squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
+    return Touched(
+        tuple(image for image, _, _ in rows),
+        error,
+        np.sqrt(np.diag(covariance)).reshape(-1, 3),
+        float(chi2.sf(squared, error.size)),
+    )
+
+
+def _touch_variance(calibration) -> float:
+    """m² per axis of a single gripper position, random and systematic."""
+    noise, errors = calibration.robot_noise, calibration.robot_errors
+    systematic_mm = 0.0 if errors is None else errors.translation_mm
+    return (noise.translation_mm**2 + systematic_mm**2) / 1e6
+
+
+def _rows(path: Path) -> list[tuple[str, Float[ndarray, "2"], Float[ndarray, "3"]]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
+    rows = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                raise InputError(f"{path}: has no column {', '.join(missing)}; give {', '.join(COLUMNS)}")
+            for line, row in enumerate(reader, start=2):
+                try:
+                    numbers = np.array([float(row[name]) for name in COLUMNS[1:]])
+                except (TypeError, ValueError):
+                    raise InputError(
+                        f"{path}: line {line}: {', '.join(COLUMNS[1:])} must be numbers"
+                    ) from None
+                if not np.isfinite(numbers).all() or np.abs(numbers[2:]).max() > 100:
+                    raise InputError(f"{path}: line {line}: positions are finite and in metres")
+                rows.append((row["image"].strip(), numbers[:2], numbers[2:]))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no CSV ({error})") from None
+    if len(rows) < LEAST:
+        raise InputError(f"{path}: {len(rows)} points; touch {LEAST} or more, spread over the scene")
+    return rows
