@@ -18,7 +18,7 @@ from jcr.geometry import step_between
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
-DRAWS, FEW, CLEAN = 20, 8, 200
+DRAWS, FEW, CLEAN = 20, 6, 200
 """Of what is random by itself, of what only the noise makes random, and of nothing wrong."""
 IMAGES = 12
 LOOSE = (3.0, 3.0)

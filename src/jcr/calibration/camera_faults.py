@@ -35,8 +35,8 @@ LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
-MOST_ROUNDS, SETTLED = 8, 0.3
-"""Adjustments with a fault corrected, and standard deviations of it below which they end."""
+MOST_ROUNDS, SETTLED = 8, 3e-4
+"""Adjustments with a fault corrected, and its change by which they end: a fifth of a pixel at an image's edge."""
 FOCUS = {"distance", "scatter", "zoom"}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
@@ -83,6 +83,11 @@ class _Hypothesis:
     """Image before a change."""
 
     @property
+    def of_lens(self) -> bool:
+        """The same intrinsics would be right for all images."""
+        return self.kind in ("lens", "aspect")
+
+    @property
     def both(self) -> Float[ndarray, "e r"]:
         """All that it frees."""
         return np.concatenate([self.beside, self.free], axis=1)
@@ -114,6 +119,7 @@ def camera_faults(
     if len(np.unique(tracks.point)) > MOST_POINTS:
         tracks = _some(tracks, seed)
         adjusted = readjust(tracks, used)
+    given = adjusted.problem.intrinsics
     found: list[_Hypothesis] = []
     named: list[Fault] = []
     equations, total = nuisance(adjusted, used), np.zeros(nuisance_columns(m))
@@ -146,8 +152,8 @@ def camera_faults(
             continue
         found.append(best)
         last = tested(equations, best.free, _all(found[:-1], equations, best.beside))
-        text = _in_words(best, total, last, alone.log_p, equations, used, images)
-        named.append(Fault(text, shift, of_lens=best.kind in ("lens", "aspect")))
+        text = _in_words(best, total, last, alone.log_p, equations, given, adjusted.bundle.camera, images)
+        named.append(Fault(text, shift, of_lens=best.of_lens))
     if not found:
         return CameraFaults((), adjusted, np.zeros((6, 6)))
     if tracks is not all_tracks and focus_varies:
@@ -224,19 +230,19 @@ def _settled(
 
     Not in one step: the robot's noise was estimated with the fault in it, and the cameras are far from where they were.
     """
-    free, camera = _all(found, equations), adjusted.bundle.camera
-    given = with_parameters(camera, parameters(camera) - equations.units * total[: len(PARAMETERS)])
+    free, lens = _all(found, equations), any(one.of_lens for one in found)
+    intrinsics = adjusted.problem.intrinsics
     for _ in range(MOST_ROUNDS):
         step = tested(equations, free)
-        total = total + free @ step.value
-        moved = with_parameters(given, parameters(given) + equations.units * total[: len(PARAMETERS)])
-        adjusted = readjust(_corrected(tracks, total, moved), moved)
-        # Intrinsics that are free move in the adjustment, and what was given moves with them.
-        given = with_parameters(
-            given, parameters(adjusted.bundle.camera) - equations.units * total[: len(PARAMETERS)]
-        )
+        by = free @ step.value
+        if lens:
+            # From where they are now: what was known of them before is what the images contradict.
+            camera = adjusted.bundle.camera
+            intrinsics = with_parameters(camera, parameters(camera) + equations.units * by[: len(PARAMETERS)])
+        total = total + by
+        adjusted = readjust(_corrected(tracks, total, intrinsics), intrinsics)
         equations = nuisance(adjusted, used)
-        if (np.abs(step.value) < SETTLED * np.sqrt(np.diag(step.covariance))).all():
+        if np.abs(by if lens else by[len(PARAMETERS) :]).max() < SETTLED:
             break
     return adjusted, equations, total
 
@@ -282,13 +288,14 @@ def _in_words(
     last: Tested,
     log_p: float,
     equations: Nuisance,
-    used: Intrinsics,
+    given: Intrinsics,
+    now: Intrinsics,
     images: Sequence[str],
 ) -> str:
     p = f"p = {np.exp(max(log_p + np.log(fault.places), -700)):.0e}"
     value = np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    camera = used
+    camera = given
     if fault.kind == "distance":
         log_distance = np.log(equations.distance)
         span = float(np.ptp(log_distance))
@@ -322,21 +329,20 @@ def _in_words(
             f"each image is sheared by itself, {px:.1f} px from top to bottom (rms, {p}), as a rolling shutter does of "
             "a camera that moves: take the images at rest"
         )
-    return _lens_in_words(LENS if fault.kind == "lens" else ASPECT, value, std, camera, p)
+    units = dict(zip(PARAMETERS, equations.units, strict=True))
+    names = LENS if fault.kind == "lens" else ASPECT
+    return _lens_in_words({name: std[k] * units[name] for k, name in enumerate(names)}, given, now, p)
 
 
-def _lens_in_words(
-    names: tuple[str, ...], value: Float[ndarray, " p"], std: Float[ndarray, " p"], used: Intrinsics, p: str
-) -> str:
-    """Each parameter that differs surely, as it is and as it was used."""
-    unit = {"fx": used.fx, "fy": used.fy, "cx": used.width, "cy": used.width}
-    old: dict[str, float] = dict(zip(PARAMETERS, parameters(used), strict=True))
-    by = {name: value[k] * unit.get(name, 1.0) for k, name in enumerate(names)}
-    error = {name: std[k] * unit.get(name, 1.0) for k, name in enumerate(names)}
+def _lens_in_words(error: dict[str, float], given: Intrinsics, now: Intrinsics, p: str) -> str:
+    """Each parameter that differs surely, as it is and as it was given."""
+    old: dict[str, float] = dict(zip(PARAMETERS, parameters(given), strict=True))
+    new: dict[str, float] = dict(zip(PARAMETERS, parameters(now), strict=True))
+    by = {name: new[name] - old[name] for name in error}
     said = []
-    if {"fx", "fy"} <= by.keys() and _is_common(value, std):
-        new, sure = used.fx + by["fx"], significant(error["fx"])
-        said.append(f"a focal length of {new:.1f} ± {sure} px where {used.fx:.1f} is given")
+    if {"fx", "fy"} <= by.keys() and _is_common(by, error, given):
+        sure = significant(error["fx"])
+        said.append(f"a focal length of {new['fx']:.1f} ± {sure} px where {given.fx:.1f} is given")
     for pair, (what, px), digits in (
         (("fx", "fy"), ("focal lengths of", " px"), 1),
         (("cx", "cy"), ("a principal point of", " px"), 1),
@@ -347,10 +353,10 @@ def _lens_in_words(
         if pair == ("fx", "fy") and said:
             continue
         if any(abs(by[name]) > SURE * error[name] for name in known):
-            new = ", ".join(f"{old[name] + by.get(name, 0.0):.{digits}f}" for name in pair)
+            found = ", ".join(f"{new[name]:.{digits}f}" for name in pair)
             was = ", ".join(f"{old[name]:.{digits}f}" for name in pair)
             most = significant(max(error[name] for name in known))
-            said.append(f"{what} ({new}) ± {most}{px} where ({was}) is given")
+            said.append(f"{what} ({found}) ± {most}{px} where ({was}) is given")
     said = said or ["other intrinsics than those used, no one of them surely by itself"]
     return (
         f"the pictures show {' and '.join(said)} ({p}); calibrate the lens again at this resolution, or give no "
@@ -358,7 +364,8 @@ def _lens_in_words(
     )
 
 
-def _is_common(value: Float[ndarray, " p"], std: Float[ndarray, " p"]) -> bool:
-    """Whether fx and fy, the first two, are off by one factor, surely."""
-    sure = (np.abs(value[:2]) > SURE * std[:2]).all()
-    return bool(sure and abs(value[0] - value[1]) < max(0.2 * abs(value[0]), 2e-3))
+def _is_common(by: dict[str, float], error: dict[str, float], given: Intrinsics) -> bool:
+    """Whether fx and fy are off by one factor, surely."""
+    x, y = by["fx"] / given.fx, by["fy"] / given.fy
+    sure = abs(by["fx"]) > SURE * error["fx"] and abs(by["fy"]) > SURE * error["fy"]
+    return sure and abs(x - y) < max(0.2 * abs(x), 2e-3)
