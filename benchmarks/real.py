@@ -20,7 +20,7 @@ from jcr.geometry import (
     inverse,
     nearest_rotation,
     rotation_between_deg,
-    rotation_log,
+    step_between,
     transform,
 )
 from jcr.pipeline import RunOptions, calibrate
@@ -40,6 +40,8 @@ class Row:
     off_deg: float | None = None
     sigmas: float | None = None
     """Largest distance on any axis in reported standard deviations; the reference's own error is in it."""
+    joint_sigmas: float | None = None
+    """The same in standard deviations of both, where the reference states its own."""
     std_mm: float | None = None
     std_deg: float | None = None
     held_out: HeldOutError | None = None
@@ -69,11 +71,12 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         *_claims(rows),
         "",
         "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
-        "own. σ: the largest reported standard deviation of an axis. Held out: each gripper pose predicted by the other "
-        "images; where two calibrations predict alike, the pictures cannot tell which is the better one.",
+        "own. σ: the largest reported standard deviation of an axis; joint: that of the reference, where it states "
+        "one, counted as well (white noise of its board poses alone). Held out: each gripper pose predicted by the "
+        "other images; where two calibrations predict alike, the pictures cannot tell which is the better one.",
         "",
-        "| capture | from | images used | off: mm | ° | in σ | ±σ: mm | ° | held out: mm / ° | trusted | s |",
-        "|---" * 11 + "|",
+        "| capture | from | images used | off: mm | ° | in σ | joint | ±σ: mm | ° | held out: mm / ° | trusted | s |",
+        "|---" * 12 + "|",
         *map(_line, rows),
         "",
         *(f"- {row.capture}, {row.how}: {row.says}" for row in rows if row.says),
@@ -88,8 +91,10 @@ def _claims(rows: Sequence[Row]) -> list[str]:
         if row.trusted and row.off_mm is not None and row.off_deg is not None
     ]
     refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
+    joint = [row.joint_sigmas for row in rows if row.trusted and row.joint_sigmas is not None]
+    beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
     told = f" Not trusted, and said so: {', '.join(refused)}." if refused else ""
-    return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}"]
+    return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}{beyond}"]
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:
@@ -109,9 +114,9 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     x, uncertainty = result.hand_eye.gripper_from_camera, result.calibration.uncertainty
     assert uncertainty is not None
     off_mm, off_deg = _off(x, reference)
-    error = np.concatenate(
-        [reference[:3, 3] - x[:3, 3], rotation_log(reference[:3, :3] @ x[:3, :3].T)]
-    ) / np.sqrt(np.diag(result.hand_eye.covariance)[:6])
+    std = np.sqrt(np.diag(result.hand_eye.covariance)[:6])
+    error = step_between(x, reference) / std
+    joint = std if known.covariance is None else np.hypot(std, np.sqrt(np.diag(known.covariance)))
     row = Row(
         folder.name,
         how if board else f"{how} ({result.calibration.backend})",
@@ -119,6 +124,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
         off_mm,
         off_deg,
         float(np.abs(error).max()),
+        None if known.covariance is None else float(np.abs(error * std / joint).max()),
         max(uncertainty.translation_std_mm),
         max(uncertainty.rotation_std_deg),
         result.calibration.held_out,
@@ -206,6 +212,7 @@ def _line(row: Row) -> str:
         shown(row.off_mm, 2),
         shown(row.off_deg, 3),
         shown(row.sigmas, 1),
+        shown(row.joint_sigmas, 1),
         shown(row.std_mm, 2),
         shown(row.std_deg, 3),
         held,

@@ -44,7 +44,7 @@ class Capture:
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
     intrinsics_std: Float[ndarray, "9"] | None = None
-    """Standard deviations of the given ones, in the order of camera.PARAMETERS; None: not stated."""
+    """Standard deviations of the given ones, in the order of camera.PARAMETERS, not a number where one is not stated."""
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None

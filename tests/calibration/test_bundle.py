@@ -8,7 +8,8 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.calibration.bundle import adjust, median_reprojection
-from jcr.calibration.intrinsics_prior import ESTIMATED, prior_of
+from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, prior_of
+from jcr.camera import parameters, with_parameters
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
@@ -90,3 +91,21 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         estimates.append(np.hypot(adjusted.noise, adjusted.systematic_left))
     assert inside / runs >= 0.88
     assert np.mean(estimates, axis=0) == pytest.approx(noise, rel=0.2)
+
+
+def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_lets_them():
+    rng = np.random.default_rng(5)
+    problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, np.radians(0.03)))
+    tracks = observed(problem, rng, 300, 0.3)
+    off = with_parameters(LENS, parameters(LENS) + np.r_[3.0, 3.0, 4.0, 4.0, np.zeros(5)])
+    exact, usual = (solved(problem, tracks, off, free=prior_of(off, std)) for std in (np.zeros(9), MEASURED))
+    assert exact.bundle.camera == off
+    std = np.sqrt(np.diag(usual.intrinsics_covariance))
+    assert abs(usual.bundle.camera.fx - LENS.fx) < 3 * std[0] < abs(off.fx - LENS.fx) * 3
+    missed = [error(problem, found.bundle.gripper_from_camera, found.scale)[:6] for found in (exact, usual)]
+    sigmas = [
+        np.abs(gap / np.sqrt(np.diag(found.covariance)[:6])).max()
+        for gap, found in zip(missed, (exact, usual), strict=True)
+    ]
+    assert sigmas[1] < 3 < sigmas[0]
+    assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()

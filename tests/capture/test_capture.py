@@ -60,6 +60,29 @@ def test_a_sound_capture_is_read_as_it_is(capture: Path):
     assert len(jcr.read_capture(capture / "capture.json")) == 4
 
 
+def test_standard_deviations_of_intrinsics_are_read_as_far_as_they_are_stated_and_written_again(
+    capture: Path, tmp_path: Path
+):
+    edit(
+        capture,
+        lambda content: content.update(intrinsics_std={"fx": 2.0, "fy": 3.0, "distortion": [0.01, 0]}),
+    )
+    read = jcr.read_capture(capture)
+    expected = [2.0, 3.0, np.nan, np.nan, 0.01, 0.0, np.nan, np.nan, np.nan]
+    np.testing.assert_array_equal(read.intrinsics_std, expected)
+    capture_json.write(capture, read)
+    np.testing.assert_array_equal(jcr.read_capture(capture).intrinsics_std, expected)
+
+
+@pytest.mark.parametrize(
+    "given", [{"fx": -1}, {"focal": 2}, {"distortion": "none"}, {"cx": "2"}, [1, 2], {"fx": True}]
+)
+def test_standard_deviations_of_intrinsics_that_cannot_be_are_refused(capture: Path, given):
+    edit(capture, lambda content: content.update(intrinsics_std=given))
+    with pytest.raises(jcr.InputError, match="intrinsics_std"):
+        jcr.read_capture(capture)
+
+
 def test_unknown_intrinsics_and_other_keys_are_fine(capture: Path):
     edit(capture, lambda c: c.update(intrinsics=None, anything={"else": 1}))
     assert jcr.read_capture(capture).intrinsics is None

@@ -34,12 +34,12 @@ ESTIMATED = {
 }
 """Of a cheap camera that nobody calibrated, about what the reconstruction found."""
 FROM_FEATURES = {
-    "f": 1.5e-3,
+    "f": 2e-3,
     "aspect": 2e-4,
-    "cx": 2e-3,
-    "cy": 2e-3,
-    "k1": 0.003,
-    "k2": 0.003,
+    "cx": 3e-3,
+    "cy": 3e-3,
+    "k1": 0.005,
+    "k2": 0.005,
     "p1": 5e-4,
     "p2": 5e-4,
 }
@@ -61,10 +61,16 @@ class IntrinsicsPrior:
 def prior_of(
     intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, "9"] = MEASURED
 ) -> IntrinsicsPrior:
-    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS."""
+    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS.
+
+    One that is not a number is that of MEASURED.
+    """
     if not isinstance(std, dict):
-        free = np.flatnonzero(np.asarray(std) > LEAST)
-        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], np.asarray(std)[free])
+        usual = prior_of(intrinsics)
+        spread = np.sqrt(usual.directions**2 @ usual.std**2)
+        std = np.where(np.isnan(std), spread, std)
+        free = np.flatnonzero(std > LEAST)
+        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {
         "f": {"fx": fx, "fy": fy},

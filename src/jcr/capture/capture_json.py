@@ -48,9 +48,11 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     capture = checked_capture(folder, images, np.reshape(poses, (-1, 4, 4)), str(file))
     joints = _joints(frames, images, file)
     robot, notes = _robot(content.get("robot"), joints, file)
+    lens = read_lens(content.get("intrinsics"), capture.image_size, file)
     return replace(
         capture,
-        intrinsics=read_lens(content.get("intrinsics"), capture.image_size, file),
+        intrinsics=lens,
+        intrinsics_std=_intrinsics_std(content.get("intrinsics_std"), lens, file),
         notes=notes,
         joints=joints,
         robot=robot,
@@ -72,6 +74,29 @@ def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None
     return checked_lens(focal_and_centre, distortion, size, where)
 
 
+def _intrinsics_std(given: Any, lens: Intrinsics | None, file: Path) -> Float[ndarray, " p"] | None:
+    """Standard deviations in the units of "intrinsics", some or all; 0 is exact."""
+    if given is None:
+        return None
+    where = f"{file}: intrinsics_std"
+    if lens is None:
+        raise InputError(f"{where}: there are no intrinsics whose errors these could be; give both or none")
+    names = ("fx", "fy", "cx", "cy")
+    if not isinstance(given, dict) or not given.keys() <= {*names, "distortion"}:
+        raise InputError(f"{where}: need some of fx, fy, cx, cy (px) and distortion [k1,k2,p1,p2,k3]")
+    distortion = given.get("distortion") or []
+    if not isinstance(distortion, list) or len(distortion) > len(lens.distortion):
+        raise InputError(f"{where}: distortion must be a list of at most {len(lens.distortion)} numbers")
+    values = [given.get(name) for name in names] + distortion
+    if not all(
+        value is None or (type(value) in (int, float) and 0 <= value < lens.width) for value in values
+    ):
+        raise InputError(f"{where}: standard deviations are numbers of 0 or more, or null")
+    std = np.full(4 + len(lens.distortion), np.nan)
+    std[: len(values)] = [np.nan if value is None else value for value in values]
+    return std
+
+
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     """Write capture.json for images that lie in `folder` already; `remarks` are keys that readers ignore."""
     frames: list[dict[str, Any]] = [
@@ -90,9 +115,13 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     lens = None
     if capture.intrinsics is not None:
         lens = {key: getattr(capture.intrinsics, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
-    write_text(
-        folder / FILE, json.dumps({"frames": frames, "intrinsics": lens} | arm | remarks, indent=1) + "\n"
-    )
+    stated: dict[str, Any] = {"frames": frames, "intrinsics": lens}
+    if capture.intrinsics_std is not None:
+        std = [None if np.isnan(value) else value for value in capture.intrinsics_std.tolist()]
+        stated["intrinsics_std"] = dict(zip(("fx", "fy", "cx", "cy"), std, strict=False)) | {
+            "distortion": std[4:]
+        }
+    write_text(folder / FILE, json.dumps(stated | arm | remarks, indent=1) + "\n")
 
 
 def kept(capture: Capture, folder: Path) -> Capture:

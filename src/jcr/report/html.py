@@ -185,12 +185,14 @@ def _details(
     if (lens := calibration.intrinsics) is not None:
         blocks["Lens"] = {
             "size": f"{lens.width} × {lens.height} px",
-            "focal length": f"{lens.fx:.2f}, {lens.fy:.2f} px",
-            "principal point": f"{lens.cx:.2f}, {lens.cy:.2f} px",
+            "focal length": f"{lens.fx:.2f}, {lens.fy:.2f}{_plus_minus(lens.std, 0)} px",
+            "principal point": f"{lens.cx:.2f}, {lens.cy:.2f}{_plus_minus(lens.std, 2)} px",
             "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
         }
     if (uncertainty := calibration.uncertainty) is not None and uncertainty.budget is not None:
         blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)
+    if robot := _robot(calibration):
+        blocks["Robot"] = robot
     if map_history:
         blocks["Map"] = dict(map_history)
     for stage, chosen in options.items():
@@ -203,6 +205,24 @@ def _details(
         items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())
         columns.append(f"<div><h3>{escape(title)}</h3><dl>{items}</dl></div>")
     return f'<section id="details"><h2>Details</h2><div class="columns">{"".join(columns)}</div></section>'
+
+
+def _plus_minus(std: list[float] | None, first: int) -> str:
+    return "" if std is None else f" ± {significant(max(std[first : first + 2]))}"
+
+
+def _robot(calibration: CalibrationFile) -> dict[str, str]:
+    """What the poses tell of the robot itself."""
+    items = {}
+    if (errors := calibration.robot_errors) is not None and errors.p is not None:
+        items["poses near each other err alike"] = (
+            f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis (p = {errors.p:.2g})"
+        )
+        for k, joint in enumerate(errors.joints or [], start=1):
+            items[f"joint {k} off by"] = f"{joint.offset_deg:+.3f} ± {joint.std_deg:.3f}°"
+    if (angles := calibration.angle_ratio) is not None:
+        items["camera angles over gripper angles"] = f"{angles.ratio:.4f} ± {angles.std:.4f} (1 is right)"
+    return items
 
 
 def _value(value: Any) -> str:
