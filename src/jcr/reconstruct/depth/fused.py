@@ -32,7 +32,7 @@ PAIR_CORRELATION = 0.5
 """Of a depth on which two images agree and no third: it counts where it lies on its region's plane, too. Without the
 plane, a third of such depths are off by 5 mm."""
 BOTH_CONFIDENCE = 2.0
-"""Factor of the confidence of a matched depth that lies on its region's plane: a quarter as many or fewer are off by 5 mm."""
+"""Factor of the confidence of a matched depth on its region's plane: at most a quarter as many are off by 5 mm."""
 PRIOR_CONFIDENCE = 0.5
 """Confidence of a prior for each image that agrees, where a matched pixel has its correlation."""
 
