@@ -47,6 +47,9 @@ BENCHES = {
     "density": Bench(
         "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
     ),
+    "depth": Bench(
+        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason", True
+    ),
     "map": Bench(
         "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
     ),

@@ -16,7 +16,7 @@ from places import ROOT
 pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
-    "reconstruct/depth/plane_sweep", "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
+    "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
     "reconstruct/mapanything", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
     "export/mesh", "export/rrd", "export/volume", "view/",
 )  # fmt: skip

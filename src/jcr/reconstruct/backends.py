@@ -84,8 +84,7 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
 def _dense(options: "ReconstructOptions") -> dict[str, Any]:
     """What the options say of dense depth, for the back ends that estimate it without a network."""
-    device = device_of(options) if options.dense else "cpu"
-    return {"dense": options.dense, "device": device, "memory_gb": options.memory_gb}
+    return {"dense": options.dense, "priors": options.priors, "memory_gb": options.memory_gb}
 
 
 @dataclass(frozen=True)
@@ -224,7 +223,7 @@ class ReconstructOptions:
     """auto takes the first of the list that needs no input of its own and whose package and weights are on this
     machine (jcr models), and the next such one where its result is rejected."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks and dense matching run."""
+    """Where networks and the map's training run."""
     seed: int = 0
     """Same seed, same result on the same machine."""
     weights: str | None = None
@@ -242,6 +241,9 @@ class ReconstructOptions:
     dense: bool = True
     """Estimate the dense depth that the map needs; without, a calibration alone comes sooner (networks predict it
     anyway)."""
+    priors: bool = True
+    """Fill plain surfaces with planes that their colour and the matched depth around them speak for. The map takes these
+    for surfaces, never for a view of free space. Networks predict them anyway."""
     memory_gb: float = 8.0
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
@@ -300,6 +302,8 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         points_in_recon=reconstruction.points_in_recon[rows],
         confidence=reconstruction.confidence[rows],
         colors=reconstruction.colors[rows],
+        reason=None if reconstruction.reason is None else reconstruction.reason[rows],
+        depth_std=None if reconstruction.depth_std is None else reconstruction.depth_std[rows],
         tracks=replace(tracks, image=row_of[tracks.image]),
         evidence=evidence,
     )
