@@ -56,6 +56,12 @@ BENCHES = {
     "predictions": Bench(
         "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
     ),
+    "models": Bench(
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment"
+    ),
+    "model_cost": Bench(
+        "seconds and memory of any-view networks with random weights, beside what is estimated", True
+    ),
     "align": Bench(
         "global alignment: fast against adam, kinematic against free, in error, time and memory", True
     ),

@@ -48,6 +48,7 @@ INSIDE = {
         ("direct/", "by colour"),
         ("global_alignment/", "pairs to cameras"),
         ("dust3r/", "predicts pairs"),
+        ("views_at_once/", "predicts all"),
     )
 }
 FLOW = {

@@ -42,7 +42,10 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
         *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
         f"element vertex {len(vertices)}",
-        *(f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}" for name in vertices.dtype.names),
+        *(
+            f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}"
+            for name in vertices.dtype.names or ()
+        ),
         "end_header\n",
     ]
     write_bytes(path, "\n".join(header).encode() + vertices.tobytes())

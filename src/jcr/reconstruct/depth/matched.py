@@ -96,6 +96,7 @@ def match_depth(
         lowest = max(float(reach.min()), LEAST * highest)
         others = neighbours[i][:COMPARED]
         found = asked = None
+        k, score = grid(half), np.empty((half.height, half.width), np.float32)
         for level, color, grey, padded in zip((half, pinhole), (coarse, fine), greys, continued, strict=True):
             near, k = relative(i, others, recon_from_camera, level), grid(level)
             size = (level.width, level.height)
