@@ -21,7 +21,7 @@ MEASURED = {
 }
 """Standard deviations of intrinsics that were given without any: focal length and its aspect relative, principal point
 relative to the width, distortion absolute. Factory values and calibrations of another day are off by 0.3 to 0.9 % and a
-few pixels (docs/results/real.md)."""
+few pixels (docs/architecture.md)."""
 ESTIMATED = {
     "f": 0.5,
     "aspect": 3e-3,
@@ -44,7 +44,7 @@ FROM_FEATURES = {
     "p2": 5e-4,
 }
 """By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
-from other features of the same pictures differ by the square root of two times that (docs/results/real.md)."""
+from other features of the same pictures differ by the square root of two times that (docs/architecture.md)."""
 LEAST = 1e-12
 """A standard deviation below it leaves a parameter as it is."""
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
+from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
 from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
@@ -173,6 +174,19 @@ def _calibrated(
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
+    if (
+        adjusted is None
+        and hand_eye.converged
+        and capture.intrinsics is not None
+        and evidence is None
+        and not tracks.from_pointmaps
+    ):
+        prior = _intrinsics_prior(capture, reconstruction.intrinsics)
+        of_used = _of_poses(systematic, np.flatnonzero(used))
+        considered = with_intrinsics_considered(
+            hand_eye, gripper[used], camera[used], tracks, reconstruction.intrinsics, prior, cues, of_used
+        )
+        hand_eye = judged(considered)
     # Of motions that show too little, what is missing comes first; and pointmaps were made with a lens of their own.
     if (
         capture.intrinsics is None

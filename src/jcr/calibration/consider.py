@@ -1,0 +1,85 @@
+"""What errors of given intrinsics do to a calibration from camera poses alone, which cannot estimate them.
+
+The estimate is kept and its covariance becomes C + S Φ Sᵀ, with Φ that of the intrinsics (the consider covariance of
+Schmidt; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapter 6).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.calibration.intrinsics_prior import IntrinsicsPrior
+from jcr.camera import by_parameters, by_point
+from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
+from jcr.handeye.closed_form import initial_estimate
+from jcr.handeye.fit import Cues, fit_poses
+from jcr.records import HandEye, Intrinsics, Tracks
+
+FEWEST = 6
+"""Observations of an image whose camera's motion with the intrinsics can be told."""
+
+
+def with_intrinsics_considered(
+    hand_eye: HandEye,
+    base_from_gripper: Float[ndarray, "m 4 4"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    tracks: Tracks,
+    intrinsics: Intrinsics,
+    prior: IntrinsicsPrior,
+    cues: Cues | None,
+    systematic: Float[ndarray, "s s"],
+) -> HandEye:
+    """The calibration with the errors of its intrinsics in its covariance and budget.
+
+    All arguments are of the used images. S by solving again with the cameras that one standard deviation of each
+    parameter would have given: those that keep the pixels of `tracks` where they are.
+    """
+    seen = [np.flatnonzero(tracks.image == row) for row in range(len(recon_from_camera))]
+    if hand_eye.budget is None or min(map(len, seen)) < FEWEST:
+        return hand_eye
+    moved = np.array(
+        [
+            _moved(camera, tracks, rows, intrinsics, prior)
+            for camera, rows in zip(recon_from_camera, seen, strict=True)
+        ]
+    )
+    used: Bool[ndarray, " m"] = np.ones(len(recon_from_camera), dtype=bool)
+
+    def solved(camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
+        start = initial_estimate(base_from_gripper, camera, used.astype(float))
+        fit = fit_poses(
+            base_from_gripper, camera, start, used, hand_eye.robot_noise.given, cues, None, systematic, False
+        )
+        return fit.gripper_from_camera, fit.scale
+
+    x, scale = solved(recon_from_camera)
+    shifts = np.zeros((7, len(prior.std)))
+    for k in range(len(prior.std)):
+        x_k, scale_k = solved(moved[:, k])
+        shifts[:, k] = np.append(step_between(x, x_k), np.log(scale_k / scale))
+    considered = shifts @ shifts.T
+    return replace(
+        hand_eye,
+        covariance=hand_eye.covariance + considered,
+        budget=replace(hand_eye.budget, intrinsics=hand_eye.budget.intrinsics + considered),
+    )
+
+
+def _moved(
+    recon_from_camera: Float[ndarray, "4 4"],
+    tracks: Tracks,
+    rows: ndarray,
+    intrinsics: Intrinsics,
+    prior: IntrinsicsPrior,
+) -> Float[ndarray, "c 4 4"]:
+    """The camera as one standard deviation more of each parameter would have placed it, by its own points."""
+    x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
+    by_x = by_point(intrinsics, x_in_camera)
+    by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
+    by_lens = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
+    steps = -np.linalg.lstsq(by_pose, by_lens.reshape(len(by_pose), -1), rcond=None)[0].T
+    return np.array(
+        [recon_from_camera @ inverse(transform(rotation_exp(step[3:]), step[:3])) for step in steps]
+    )

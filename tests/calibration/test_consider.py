@@ -1,0 +1,51 @@
+"""Errors of given intrinsics in a calibration from camera poses that were found with them."""
+
+import cv2
+import numpy as np
+
+import jcr
+from jcr.calibration.consider import with_intrinsics_considered
+from jcr.calibration.intrinsics_prior import prior_of
+from jcr.camera import parameters, with_parameters
+from jcr.geometry import inverse, transform
+from jcr.handeye.fit import Cues
+from jcr.handeye.systematic import smooth_errors
+from jcr.simulate.observations import LENS, observed
+from jcr.simulate.problem import error, hand_eye_problem
+
+
+def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_once_it_is_considered():
+    without, considered = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)))
+        tracks = observed(problem, rng, 120, 0.1)
+        values = parameters(LENS)
+        values[:2] *= 1 + 0.005 * rng.normal()
+        values[2:4] += 0.005 * LENS.width * rng.normal(size=2)
+        given = with_parameters(LENS, values)
+        k = np.array([[given.fx, 0, given.cx], [0, given.fy, given.cy], [0, 0, 1.0]])
+        camera = []
+        for row in range(10):
+            seen = tracks.image == row
+            _, rotation, translation = cv2.solvePnP(
+                tracks.points_in_recon[tracks.point[seen]], tracks.x_px[seen], k, np.array(given.distortion)
+            )
+            camera.append(inverse(transform(cv2.Rodrigues(rotation)[0], translation[:, 0])))
+        cues = Cues(scale=(problem.scale, 1e-3))
+        solved = jcr.solve_hand_eye(problem.base_from_gripper, camera, cues=cues)
+        whole = with_intrinsics_considered(
+            solved,
+            problem.base_from_gripper,
+            np.array(camera),
+            tracks,
+            given,
+            prior_of(given),
+            cues,
+            smooth_errors(problem.base_from_gripper),
+        )
+        off = error(problem, solved.gripper_from_camera, solved.scale)[:6]
+        without.append(np.abs(off / np.sqrt(np.diag(solved.covariance)[:6])).max())
+        considered.append(np.abs(off / np.sqrt(np.diag(whole.covariance)[:6])).max())
+    assert max(considered) < 3 < np.median(without)
+    assert np.median(considered) > 0.3
