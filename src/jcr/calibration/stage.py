@@ -205,7 +205,12 @@ def _calibrated(
         _of_poses(systematic, np.flatnonzero(used)),
         adjusted,
     )
-    return hand_eye if doubt is None else _doubted(hand_eye, doubt)
+    if doubt is None:
+        return hand_eye
+    if hand_eye.refinement is not None:
+        before = hand_eye.refinement.before
+        hand_eye = judged(_refined(before, doubt.as_given, gripper, camera, reconstruction))
+    return _doubted(hand_eye, doubt)
 
 
 def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
