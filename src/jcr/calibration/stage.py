@@ -208,8 +208,7 @@ def _calibrated(
     if doubt is None:
         return hand_eye
     if hand_eye.refinement is not None:
-        before = hand_eye.refinement.before
-        hand_eye = judged(_refined(before, doubt.as_given, gripper, camera, reconstruction))
+        hand_eye = hand_eye.refinement.before
     return _doubted(hand_eye, doubt)
 
 
