@@ -36,8 +36,6 @@ class LensDoubt:
 
     text: str
     shift: Float[ndarray, "7"]
-    as_given: Adjusted
-    """The adjustment with the given ones held: users go on with these."""
     """By how much the calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
 
 
@@ -73,7 +71,6 @@ def lens_doubt(
         f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
         "(null) to have them estimated",
         np.append(shift, np.log(freed.scale / as_given.scale)),
-        as_given,
     )
 
 
