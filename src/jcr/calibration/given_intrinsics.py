@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
-from jcr.geometry import step_between
+from jcr.geometry import ARM, step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
 from jcr.rounding import significant
@@ -36,7 +36,7 @@ class LensDoubt:
 
     text: str
     shift: Float[ndarray, "7"]
-    """By how much the calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
+    """How far a calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
 
 
 def lens_doubt(
@@ -66,11 +66,23 @@ def lens_doubt(
     if not found:
         return None
     as_given = adjusted_with(HELD)
-    shift = step_between(as_given.bundle.gripper_from_camera, freed.bundle.gripper_from_camera)
+    # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
+    shift = max(
+        _shift(hand_eye.gripper_from_camera, hand_eye.scale, freed),
+        _shift(as_given.bundle.gripper_from_camera, as_given.scale, freed),
+        key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
+    )
     return LensDoubt(
         f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
         "(null) to have them estimated",
-        np.append(shift, np.log(freed.scale / as_given.scale)),
+        shift,
+    )
+
+
+def _shift(gripper_from_camera: Float[ndarray, "4 4"], scale: float, freed: Adjusted) -> Float[ndarray, "7"]:
+    """From a calibration to that with the intrinsics found; in records.COVARIANCE_ORDER."""
+    return np.append(
+        step_between(gripper_from_camera, freed.bundle.gripper_from_camera), np.log(freed.scale / scale)
     )
 
 

@@ -195,8 +195,10 @@ def _calibrated(
         or not hand_eye.observability.observable
     ):
         return hand_eye
+    # Where the lens is wrong, bundle adjustment bends the robot's poses to it: the fit to camera poses bends least.
+    kept = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
     doubt = lens_doubt(
-        hand_eye,
+        kept,
         gripper[used],
         camera[used],
         reconstruction.intrinsics,
@@ -205,11 +207,7 @@ def _calibrated(
         _of_poses(systematic, np.flatnonzero(used)),
         adjusted,
     )
-    if doubt is None:
-        return hand_eye
-    if hand_eye.refinement is not None:
-        hand_eye = hand_eye.refinement.before
-    return _doubted(hand_eye, doubt)
+    return hand_eye if doubt is None else _doubted(kept, doubt)
 
 
 def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
