@@ -47,11 +47,20 @@ BENCHES = {
     "density": Bench(
         "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
     ),
+    "depth": Bench(
+        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason", True
+    ),
     "map": Bench(
         "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
     ),
     "predictions": Bench(
         "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
+    ),
+    "models": Bench(
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment"
+    ),
+    "model_cost": Bench(
+        "seconds and memory of any-view networks with random weights, beside what is estimated", True
     ),
     "align": Bench(
         "global alignment: fast against adam, kinematic against free, in error, time and memory", True

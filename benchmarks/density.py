@@ -53,7 +53,7 @@ def run(out: Path | None = None) -> str:
         )
         capture = read_capture(made)
         sparse, swept = _clouds(
-            capture, ReconstructOptions("colmap"), "plane sweep on COLMAP's cameras (ours)"
+            capture, ReconstructOptions("colmap"), "dense depth on COLMAP's cameras (ours)"
         )
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, pairs_of_capture(made, errors=PUBLISHED, seed=SEED)[0])
@@ -71,7 +71,7 @@ def run(out: Path | None = None) -> str:
     swept_table, swept_things = covered[swept.name]
     lines = [
         f"> On a plain table COLMAP's points cover {table:.0f} % of the table and {things:.0f} % of the objects; our "
-        f"plane sweep on its cameras {swept_table:.0f} % and {swept_things:.0f} %, simulated predictions of a network "
+        f"dense depth on its cameras {swept_table:.0f} % and {swept_things:.0f} %, simulated predictions of a network "
         f"{best_table:.0f} % and {best_things:.0f} %.",
         "",
         f"Scene `light8` of seed {SEED} by a webcam, {IMAGES} images, calibrated by ours. Covered: a point of the cloud "

@@ -44,10 +44,11 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
 """From the top down: name, what it is for, share of the row's width."""
 INSIDE = {
     "reconstruct/": (
-        ("depth/", "plane sweep"),
+        ("depth/", "PatchMatch, planes"),
         ("direct/", "by colour"),
         ("global_alignment/", "pairs to cameras"),
         ("dust3r/", "predicts pairs"),
+        ("views_at_once/", "predicts all"),
     )
 }
 FLOW = {

@@ -1,6 +1,10 @@
-"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth."""
+"""The main job on the bundled capture: calibrate, map, and hold the calibration against the truth.
+
+`python examples/demo.py BACKEND`, or `make demo BACKEND=da3`, takes another back end than `auto` (jcr models).
+"""
 
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -13,9 +17,14 @@ from jcr.progress import progress_bars
 
 root = Path(__file__).parent.parent
 start = time.perf_counter()
+backend = sys.argv[1] if len(sys.argv) > 1 else "auto"
 capture = jcr.read_capture(root / "examples/tabletop")
-with progress_bars() as progress:
-    result = jcr.run(capture, root / "out/demo", progress=progress)
+try:
+    with progress_bars() as progress:
+        result = jcr.run(capture, root / "out/demo", backend=backend, progress=progress)
+except jcr.InputError as error:
+    sys.stderr.write(f"error: {error}\n")
+    sys.exit(2)
 seconds = time.perf_counter() - start
 
 hand_eye = result.hand_eye

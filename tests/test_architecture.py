@@ -35,7 +35,7 @@ LAYERS = [
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 TORCH_ROOMS = {"reconstruct", "represent", "segment"}
-BACK_ENDS = ["backends", "from_pairs", "colmap", "mapanything", "marker", "predictions"]
+BACK_ENDS = ["backends", "from_pairs", "colmap", "marker", "predictions"]
 SOLVERS = [
     "least_squares",
     *(f"handeye.{name}" for name in ("closed_form", "fit", "known_scale", "residuals", "robust", "solve")),
@@ -43,9 +43,9 @@ SOLVERS = [
     *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
 ]
 FORBIDDEN = {
-    "reconstruct.global_alignment": ["dust3r", "direct", "depth", *BACK_ENDS],
-    "reconstruct.depth": ["dust3r", "direct", "global_alignment", *BACK_ENDS],
-    "reconstruct.direct": ["dust3r", "global_alignment", *BACK_ENDS],
+    "reconstruct.global_alignment": ["dust3r", "direct", "depth", "views_at_once", *BACK_ENDS],
+    "reconstruct.depth": ["dust3r", "direct", "global_alignment", "views_at_once", *BACK_ENDS],
+    "reconstruct.direct": ["dust3r", "global_alignment", "views_at_once", *BACK_ENDS],
     "report": SOLVERS,
     "cli": SOLVERS,
 }

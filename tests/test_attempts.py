@@ -332,3 +332,21 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says
     assert found["backend"] == "dust3r" and not found["converged"]
     licence = next(text for text in found["warnings"] if "licence" in text)
     assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()
+
+
+def test_one_network_that_sees_all_views_is_asked_between_colmap_and_direct_alignment(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present |= {"da3", "mapanything"}
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good, nothing = problem.recon_from_camera, NotTrustedError("0 of 8 images registered")
+    answers = {"colmap": nothing, "da3": nothing, "direct": good}
+    kept, tried = auto_result(problem, answers, monkeypatch)
+    assert tried == ["colmap", "da3", "direct"] and kept.backend == "direct"
+    kept, tried = auto_result(problem, answers | {"da3": good}, monkeypatch)
+    assert tried == ["colmap", "da3"] and kept.backend == "da3"
+    # A network that cannot run here takes nothing from what the others found.
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    answers = {"colmap": shuffled, "da3": InputError("--memory-gb 1: too little"), "direct": nothing}
+    kept, tried = auto_result(problem, answers, monkeypatch)
+    assert tried == ["colmap", "da3", "direct"] and kept.backend == "colmap"

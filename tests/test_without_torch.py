@@ -16,8 +16,8 @@ from places import ROOT
 pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
-    "reconstruct/depth/plane_sweep", "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
-    "reconstruct/mapanything", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
+    "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
+    "reconstruct/views_at_once/", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
     "export/mesh", "export/rrd", "export/volume", "view/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""

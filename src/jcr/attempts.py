@@ -43,26 +43,36 @@ def choose(
 ) -> Choice:
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
-    `auto` runs the best back end whose weights are on this machine, and the next one when that gives nothing or
-    its calibration is not to be trusted for another reason than the motion. Of two results a trusted one is kept,
-    else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure that the
-    run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
+    `auto` runs the best back end whose weights are on this machine, and the next ones when that
+    gives nothing or its calibration is not to be trusted for another reason than the motion. Of two results a trusted
+    one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure
+    that the run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
-    names = candidates(options)[:2]
+    names = _asked(candidates(options))
     if len(names) == 1:
         only = _tried(capture, for_backend(options, names[0]), calibrate_options, progress, chosen)
         return _choice(only, (only.attempt(),))
-    first, second = (for_backend(options, name) for name in names)
-    one = _tried(capture, first, calibrate_options, progress)
-    if isinstance(one.failure, InputError) and options.weights is not None:
-        raise one.failure
-    if one.hand_eye is not None and (one.hand_eye.converged or not one.hand_eye.observability.observable):
-        kept, attempts = one.noted(_about(names[0])) if BACKENDS[names[0]].hub_id else one, (one.attempt(),)
-    else:
-        kept, attempts = _better(one, _tried(capture, second, calibrate_options, progress))
-    choice = _choice(kept, attempts)
+    kept = _tried(capture, for_backend(options, names[0]), calibrate_options, progress)
+    if isinstance(kept.failure, InputError) and options.weights is not None:
+        raise kept.failure
+    attempts = {kept.backend: kept.attempt()}
+    if kept.is_enough and BACKENDS[names[0]].hub_id:
+        kept = kept.noted(_about(names[0]))
+    for name in names[1:]:
+        if kept.is_enough:
+            break
+        kept, both = _better(kept, _tried(capture, for_backend(options, name), calibrate_options, progress))
+        attempts |= {attempt.backend: attempt for attempt in both}
+    choice = _choice(kept, tuple(attempts.values()))
     chosen(choice.reconstruction)
     return choice
+
+
+def _asked(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Of the candidates the two best, where one network that sees all views does not count; no second such one."""
+    networks = [name for name in names if BACKENDS[name].sees_all_views]
+    asked = tuple(name for name in names if name not in networks[1:])
+    return asked[: 3 if networks else 2]
 
 
 def again(
@@ -98,6 +108,12 @@ class _Tried:
     def missed_m(self) -> float:
         """Error on images left out; infinite where there were too few to leave one out."""
         return missed_m(None if self.hand_eye is None else self.hand_eye.held_out)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether no other back end is asked: this one is trusted, or the motion is at fault."""
+        hand_eye = self.hand_eye
+        return hand_eye is not None and (hand_eye.converged or not hand_eye.observability.observable)
 
     def told(self) -> str:
         """The back end, and its error on images left out."""
@@ -169,7 +185,7 @@ def _about(backend: str) -> str:
 
 def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
     """Which of two is kept, noting why, and the account of both; `one` is known to be doubtful."""
-    if isinstance(other.failure, InputError):
+    if isinstance(other.failure, InputError) and not BACKENDS[other.backend].hub_id:
         raise other.failure
     if one.hand_eye is None:
         nothing = f"{_about(one.backend)}, gave nothing ({one.failure})"

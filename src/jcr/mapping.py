@@ -47,7 +47,7 @@ def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Pro
 
     assert options.map is not None  # or this stage is left out
     device = device_of(options.reconstruct)
-    cloud, notes = _cloud(_extended(result, added, device, options, progress), options, progress)
+    cloud, notes = _cloud(_extended(result, added, options, progress), options, progress)
     give_back()
     scene = build_scene(cloud, options.map, progress, device=device)
     try:
@@ -63,16 +63,14 @@ def measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
     return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
 
 
-def _extended(
-    result: RunResult, added: Capture, device: str, options: RunOptions, progress: Progress
-) -> RunResult:
+def _extended(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> RunResult:
     """With the added images in the reconstruction."""
     if not len(added):
         return result
     from jcr.reconstruct.added import extend
 
     memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
-    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, device, progress, memory_gb)
+    reconstruction = extend(result.reconstruction, result.hand_eye, count, added, progress, memory_gb)
     return replace(result, reconstruction=reconstruction)
 
 

@@ -63,10 +63,10 @@ def calibrate(
 ) -> RunResult:
     """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does.
 
-    Without torch there is no dense depth, which only a later map needs.
+    Without torch and Numba there is no dense depth, which only a later map needs.
     """
     options = _with_backend(options, backend, capture)
-    if not is_installed("torch"):
+    if not (is_installed("torch") and is_installed("numba")):
         options = _with_dense(options, False)
     with held(Path(out)) as folder:
         return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)

@@ -110,6 +110,11 @@ class CameraEvidence:
     of the cameras, which is therefore exact."""
 
 
+NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
+"""What a depth rests on: nothing; images that show the same (or a network's prediction); a plane that the colours
+and the matched depths around it speak for; both."""
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
@@ -134,6 +139,10 @@ class Reconstruction:
     """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
     notes: tuple[str, ...] = ()
     """What the user should know: images not registered, distortion dropped."""
+    reason: UInt8[ndarray, "m h w"] | None = None
+    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
+    depth_std: Float[ndarray, "m h w"] | None = None
+    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
     evidence: CameraEvidence | None = None
     """In the same frame, where the robot's poses had a say in `recon_from_camera` or cameras err beside them."""
 
@@ -347,3 +356,7 @@ class PointCloud:
     """Row of `camera_centers_in_base`."""
     camera_centers_in_base: Float[ndarray, "m 3"]
     label_names: tuple[str, ...] = field(default=("none",))
+    reason: UInt8[ndarray, " n"] | None = None
+    """MATCHED, PRIOR or BOTH; the ray of a PRIOR shows no free space. None: no point is a prior."""
+    depth_std: Float[ndarray, " n"] | None = None
+    """One sigma (m) of the depth in its image; None: not known."""

@@ -459,8 +459,8 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/3": {
-        "about", "colors", "confidence", "image_index", "points_in_recon", "recon_from_camera",
+    "jcr.reconstruction/4": {
+        "about", "colors", "confidence", "depth_std", "image_index", "points_in_recon", "reason", "recon_from_camera",
         "track_image", "track_point", "track_points_in_recon", "track_x_px", "tracks_from_pointmaps",
     }
 }  # fmt: skip
@@ -484,7 +484,7 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/3'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/4'; delete it and run again" in said
 
 
 def in_degrees(pose: np.ndarray) -> np.ndarray:

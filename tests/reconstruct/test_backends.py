@@ -79,8 +79,8 @@ def test_a_new_back_end_is_one_row(
     monkeypatch.setattr(models, "BACKENDS", {"mine": row} | BACKENDS)
     assert dispatch(["models", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["models"][0] == {
-        "backend": "mine", "weights": "", "licence": "MIT", "scale": "metres", "present": "yes",
-        "accuracy": "9 mm",
+        "backend": "mine", "weights": "", "licence": "MIT", "commercial": True, "scale": "metres",
+        "parameters_m": 0, "download_gb": 0.0, "present": "yes", "accuracy": "9 mm",
     }  # fmt: skip
 
     # The help of `jcr run`, were its options these.
@@ -103,12 +103,30 @@ def test_the_best_whose_weights_are_here_comes_first(
 ) -> None:
     assert candidates(ReconstructOptions()) == ("colmap", "direct")
     present |= {"dust3r", "mapanything"}
-    assert candidates(ReconstructOptions()) == ("dust3r", "mapanything", "colmap", "direct")
+    assert candidates(ReconstructOptions()) == ("dust3r", "colmap", "mapanything", "direct")
     present.add("mast3r")
     assert candidates(ReconstructOptions())[0] == "mast3r"
     monkeypatch.setattr(Backend, "is_installed", lambda self: self.name != "mapanything")
     assert candidates(ReconstructOptions()) == ("mast3r", "dust3r", "colmap", "direct")
     assert candidates(ReconstructOptions("colmap")) == ("colmap",)
+
+
+def test_without_weights_the_command_that_gets_them_is_said_in_a_line(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = Capture(Path(), ("a.png",), np.eye(4)[None], (64, 48))
+    for installed, words in (
+        (
+            False,
+            "needs depth_anything_3, .*: pip install .*; then jcr models get da3 downloads .* \\(0.5 GB\\)",
+        ),
+        (True, "its weights are not on this machine; jcr models get da3 downloads"),
+    ):
+        monkeypatch.setattr(Backend, "is_installed", lambda self, there=installed: there)
+        monkeypatch.setattr(backends, "cached_files", lambda *names: [])
+        with pytest.raises(InputError, match=words) as caught:
+            backends.reconstruct(capture, ReconstructOptions("da3"))
+        assert "\n" not in str(caught.value)
 
 
 def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
@@ -128,7 +146,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ("options", "words"),
     [
         (ReconstructOptions("colmap", predictions=Path("p.npz")), "--predictions p.npz: .*--backend predictions"),
-        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or mapanything"),
+        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or .*pi3x"),
         (ReconstructOptions("given", board="b"), "--board b: .*give --backend marker"),
         (ReconstructOptions("mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),

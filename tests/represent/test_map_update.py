@@ -151,7 +151,7 @@ def test_a_thing_that_was_taken_away_leaves_the_map(truth: Truth, capture: Captu
     before, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 6)
     places = np.concatenate([beside(truth, 0, 2), beside(truth, 4, 2)])
     new = added_views(tmp_path, truth, capture, scene_of(truth, without="toolbox"), places)
-    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
     assert len(after.recon_from_camera) == 10
     # The last images of the capture found no place; the new ones are no such image.
     assert after.image_index.tolist() == [0, 1, 2, 3, 4, 5, 10, 11, 12, 13]
@@ -167,7 +167,7 @@ def test_a_thing_that_was_put_down_enters_the_map(truth: Truth, capture: Capture
     before, hand_eye = known_reconstruction(truth, capture, scene_of(truth, without="box"), 6)
     places = np.concatenate([beside(truth, 0, 3), beside(truth, 5, 3)])
     new = added_views(tmp_path, truth, capture, scene_of(truth), places)
-    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
     x = within(truth, "box")
     old, fresh = mapped(truth, capture, before, hand_eye), mapped(truth, capture, after, hand_eye)
     assert (old.query(x, unknown="occupied").occupancy < 0.5).mean() > 0.9
@@ -181,7 +181,7 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
 ):
     before, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 8)
     new = added_views(tmp_path, truth, capture, scene_of(truth), truth.base_from_camera[8:9])
-    after = extend(before, hand_eye, len(capture), new, "cpu", lambda stage, fraction: None)
+    after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
     known = before.confidence > 0
     assert (after.confidence[:8][known] > 0).mean() > 0.98
     camera_from_recon = inverse(after.recon_from_camera[8])

@@ -1,22 +1,38 @@
-"""`jcr models`: back ends, weights present or not, licences."""
+"""`jcr models`: networks and other back ends, their licences, and the weights on this machine; `get` downloads some."""
 
+import sys
 from dataclasses import asdict, dataclass, field
+from typing import Annotated, Literal
+
+import tyro
 
 from jcr.cli.output import Output
-from jcr.reconstruct.backends import BACKENDS, Backend
+from jcr.errors import InputError
+from jcr.progress import progress_bars, silent
+from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """List what can reconstruct a capture, under which licence, and what of it is on this machine.
+    """List what can reconstruct a capture, under which licence, and what of it is on this machine; or get weights.
 
-    Those that `--backend auto` may take come first, in its order. Nothing is downloaded by this command.
+    Those that `--backend auto` may take come first, in its order. The list downloads nothing.
 
     examples:
       jcr models
+      jcr models get da3-small
+      jcr models get dust3r --accept-licence
       jcr models --json
     """
 
+    action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
+    """list, or get: download the weights of one."""
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
+    """For get: the back end whose weights are downloaded."""
+    accept_licence: bool = False
+    """For get: accept a non-commercial licence, which is asked for once otherwise."""
+    revision: str | None = None
+    """For get: a commit of the weights (unset: the one that was downloaded first, or the newest)."""
     markdown: bool = False
     """Print the table of docs/backends.md."""
     output: Output = field(default_factory=Output)
@@ -31,65 +47,133 @@ class Model:
     weights: str
     """Hub id; empty where none are needed."""
     licence: str
+    commercial: bool
     scale: str
+    parameters_m: int
+    """Of the network, in millions; 0 where there is none, or it is not stated."""
+    download_gb: float
     present: str
-    """yes, or what is missing."""
+    """yes, or what is missing and the command that gets it."""
     accuracy: str = ""
     """As measured; empty: not measured here."""
 
 
-OTHERS = {
-    "depth-anything/DA3-BASE": ("Apache-2.0", "camera_from_world"),
-    "depth-anything/DA3-LARGE-1.1": ("non-commercial", "camera_from_world"),
-    "yyfz233/Pi3X": ("non-commercial", "world_from_camera"),
-    "facebook/VGGT-1B": ("non-commercial", "camera_from_world"),
-}
-"""Networks whose output `predictions` reads: licence, and the direction of their poses."""
 SCALES = {True: "metres", False: "arbitrary", None: "your file's is_metric"}
 
 
 def models() -> list[Model]:
-    """The back ends, then networks to be run with their own packages."""
-    rows = [
-        Model(row.name, row.hub_id, row.licence, SCALES[row.metric], _present(row), row.accuracy)
+    """The back ends, in the order of `auto`."""
+    return [
+        Model(
+            row.name,
+            row.hub_id,
+            row.licence,
+            row.commercial,
+            SCALES[row.metric],
+            row.parameters,
+            row.download_gb,
+            _present(row),
+            row.accuracy,
+        )
         for row in BACKENDS.values()
     ]
-    for hub_id, (licence, direction) in OTHERS.items():
-        how = f"run its own package; poses are {direction}"
-        rows.append(Model("predictions", hub_id, licence, "see its page", how))
-    return rows
 
 
 def _present(row: Backend) -> str:
-    if not row.is_installed():
-        return f"no: its package is missing, {row.install}"
-    return "yes" if row.has_weights() else "no: downloaded on first use"
+    missing = [] if row.is_installed() else [f"{row.install}"]
+    if not row.has_weights():
+        missing.append(f"jcr models get {row.name}")
+    return f"no: {'; '.join(missing)}" if missing else "yes"
 
 
 def as_text(rows: list[Model]) -> str:
     """The list for a terminal."""
-    return "".join(
-        f"{row.backend:<12} {row.weights or 'no weights needed'}\n"
-        f"{'':<12} scale: {row.scale}; present: {row.present}\n"
-        f"{'':<12} licence: {row.licence}\n"
-        + (f"{'':<12} accuracy: {row.accuracy}\n" if row.accuracy else "")
-        for row in rows
-    )
+    lines = []
+    for row in rows:
+        size = f", {row.parameters_m} M parameters" if row.parameters_m else ""
+        size += f", {row.download_gb:g} GB" if row.download_gb else ""
+        use = "" if row.commercial else " (not for commercial use)"
+        lines += [
+            f"{row.backend:<12} {row.weights or 'no weights needed'}{size}",
+            f"{'':<12} licence: {row.licence}" + ("" if "non-commercial" in row.licence else use),
+            f"{'':<12} scale: {row.scale}; here: {row.present}",
+        ]
+        if row.accuracy:
+            lines.append(f"{'':<12} accuracy: {row.accuracy}")
+    return "\n".join(lines) + "\n"
 
 
 def as_markdown() -> str:
     """The back ends as a table, without what differs from machine to machine."""
-    lines = ["| back end | options of its own | auto | scale | licence | measured |", "|---" * 6 + "|"]
+    head = [
+        "back end",
+        "options of its own",
+        "auto",
+        "scale",
+        "parameters",
+        "download",
+        "licence",
+        "measured",
+    ]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for row in BACKENDS.values():
         flags = [f"`--{name.replace('_', '-')}`" for name in row.options]
-        cells = [f"`{row.name}`", ", ".join(flags), "yes" if row.auto else "no", SCALES[row.metric]]
-        lines.append(f"| {' | '.join([*cells, row.licence, row.accuracy])} |")
+        cells = [
+            f"`{row.name}`",
+            ", ".join(flags),
+            "yes" if row.auto else "no",
+            SCALES[row.metric],
+            f"{row.parameters} M" if row.parameters else "",
+            f"{row.download_gb:g} GB" if row.download_gb else "",
+            row.licence,
+            row.accuracy,
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def main(arguments: Arguments) -> int:
-    """Print the list."""
+    """Print the list, or get weights."""
+    if arguments.action == "get":
+        return _get(arguments)
+    if arguments.name is not None or arguments.accept_licence or arguments.revision is not None:
+        raise InputError("jcr models: a name, --accept-licence and --revision are for jcr models get NAME")
     rows = models()
     text = as_markdown() if arguments.markdown else as_text(rows)
     arguments.output.result(text, {"models": [asdict(row) for row in rows]})
     return 0
+
+
+def _get(arguments: Arguments) -> int:
+    """The weights of one back end, downloaded, checked, and put where it looks for them."""
+    with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
+    if arguments.name not in with_weights:
+        named = "name one" if arguments.name is None else f"{arguments.name} has none to get"
+        raise InputError(f"jcr models get: {named}; there are {', '.join(with_weights)}")
+    row = BACKENDS[arguments.name]
+    from jcr.reconstruct.hub_download import download, keep_pin, pins
+
+    if not row.commercial and not pins().get(row.hub_id, {}).get("licence_accepted"):
+        if not arguments.accept_licence and not _accepted(row):
+            raise InputError(
+                f"jcr models get {row.name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
+            )
+        keep_pin(row.hub_id, {"licence_accepted": True})
+    with progress_bars() as progress:
+        report = silent if arguments.output.quiet else progress
+        folder = download(row.hub_id, row.files, arguments.revision, report)
+    text = f"{row.hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
+    if not row.is_installed():
+        text += f"its package is missing: {row.install}\n"
+    facts = {"backend": row.name, "weights": row.hub_id, "revision": folder.name, "folder": str(folder)}
+    arguments.output.result(text, facts)
+    return 0
+
+
+def _accepted(row: Backend) -> bool:
+    """Ask, where there is somebody to answer."""
+    if not sys.stdin.isatty():
+        return False
+    sys.stderr.write(f"{weights_command(row)}.\nIts licence: {row.licence}\nDo you accept it? [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in ("y", "yes")

@@ -1,8 +1,8 @@
 """New images of a calibrated camera: their pointmaps, and what they contradict in the older ones.
 
-The camera's place follows from the gripper's, so that nothing is calibrated again. Depth comes from the plane
-sweep, whichever back end made the reconstruction. A scene changes between images; what a later one sees through,
-or sees in the way of an older ray, is taken from the older pointmaps.
+The camera's place follows from the gripper's, so that nothing is calibrated again. Depth is matched, whichever back end
+made the reconstruction, and no plane is assumed. A scene changes between images; what a later one sees through, or sees
+in the way of an older ray, is taken from the older pointmaps.
 """
 
 from dataclasses import replace
@@ -19,12 +19,12 @@ from jcr.geometry import apply, inverse, scale_translation
 from jcr.progress import Progress
 from jcr.reconstruct.depth.dense import dense_pointmaps
 from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Reconstruction, Tracks
 
 NEIGHBOURS = 6
 """Images that a new one is compared with; at most half of them are other new ones."""
 REACH = 1.5
-"""The planes of the sweep span so much more than the known points: a new thing may be taller than all others."""
+"""The planes that span the search reach so much farther than known points: a new thing may be taller than all others."""
 CONTRADICTION = 0.015
 """Relative difference of depths by which one surface lies before another, beyond noise of depth and poses."""
 LEAST_SHARE = 0.005
@@ -36,7 +36,6 @@ def extend(
     hand_eye: HandEye,
     capture_size: int,
     added: Capture,
-    device: str,
     report: Progress,
     memory_gb: float = 8.0,
 ) -> Reconstruction:
@@ -69,18 +68,17 @@ def extend(
         neighbours[row] = near[row][np.isin(near[row], taken)][:NEIGHBOURS]
     planes = sweep_planes(tracks, recon_from_camera)
     middle = planes.mean(1, keepdims=True)
-    points, confidence = dense_pointmaps(
+    dense = dense_pointmaps(
         colors[taken],
         recon_from_camera[taken],
         pinhole,
         [np.searchsorted(taken, neighbours[row]) for row in taken],
         (middle + REACH * (planes - middle))[taken],
-        device,
         report,
         changing=True,
         memory_gb=memory_gb,
     )
-    points, confidence = points[-new:], confidence[-new:]
+    points, confidence = dense.points_in_recon[-new:], dense.confidence[-new:]
     for name, of_image in zip(added.images, confidence, strict=True):
         if (of_image > 0).mean() < LEAST_SHARE:
             raise InputError(
@@ -91,6 +89,9 @@ def extend(
     known = reconstruction.confidence[reconstruction.confidence > 0]
     if len(known):
         confidence = confidence * (np.median(known) / np.median(confidence[confidence > 0]))
+    reason, std = reconstruction.reason, reconstruction.depth_std
+    if reason is None:
+        reason = np.where(reconstruction.confidence > 0, MATCHED, NO_DEPTH).astype(np.uint8)
     points = np.concatenate([reconstruction.points_in_recon, points])
     confidence = np.concatenate([reconstruction.confidence, confidence])
     camera_from_recon = inverse(recon_from_camera)
@@ -109,6 +110,8 @@ def extend(
         points_in_recon=points,
         confidence=confidence,
         colors=colors,
+        reason=np.concatenate([reason, dense.reason[-new:]]),
+        depth_std=None if std is None else np.concatenate([std, dense.depth_std[-new:]]),
     )
 
 

@@ -12,10 +12,14 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
 from jcr.progress import Progress
-from jcr.reconstruct.hub import cached_files
+from jcr.reconstruct.hub import HUB_FILES, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
+
+CC_BY_NC = "CC BY-NC 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc/4.0/)"
+INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
+"""Without what the package asks for beside these, numpy below 2 among it, of which its network uses nothing."""
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -42,14 +46,41 @@ def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress 
     return reconstruct(capture, made, progress)
 
 
-def _mapanything(
+def _views_at_once(
     capture: Capture, options: "ReconstructOptions", progress: Progress | None
 ) -> Reconstruction:
-    extra("torch", "networks", "--backend mapanything")
-    from jcr.reconstruct.mapanything import MapAnythingOptions, reconstruct
+    """All models that see every view at once: their rows name the adapter."""
+    extra("torch", "networks", f"--backend {options.backend}")
+    from jcr.reconstruct.views_at_once import da3, mapanything, pi3x, vggt
+    from jcr.reconstruct.views_at_once.cost import Cost
+    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
 
-    weights, _ = weights_of(options)
-    return reconstruct(capture, MapAnythingOptions(weights, device_of(options)), progress)
+    row = BACKENDS[options.backend]
+    adapter = {"da3": da3, "da3-small": da3, "mapanything": mapanything, "vggt": vggt, "pi3x": pi3x}[row.name]
+    made = ViewsOptions(
+        row.name,
+        adapter.load,
+        weights_folder(options),
+        weights_of(options)[1],
+        Cost(*row.cost),
+        row.takes_poses,
+        device_of(options),
+        options.memory_gb,
+    )
+    return reconstruct(capture, made, progress)
+
+
+def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
+    extra("torch", "networks", f"--backend {options.backend}")
+    from jcr.reconstruct.views_at_once import moge
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+
+    def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
+        return _colmap(capture, replace(options, backend="colmap", dense=False), progress)
+
+    weights, licence = weights_folder(options), weights_of(options)[1]
+    made = SingleViewsOptions("moge", moge.load, weights, licence, cameras, device_of(options))
+    return reconstruct(capture, made, progress)
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -84,8 +115,7 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
 def _dense(options: "ReconstructOptions") -> dict[str, Any]:
     """What the options say of dense depth, for the back ends that estimate it without a network."""
-    device = device_of(options) if options.dense else "cpu"
-    return {"dense": options.dense, "device": device, "memory_gb": options.memory_gb}
+    return {"dense": options.dense, "priors": options.priors, "memory_gb": options.memory_gb}
 
 
 @dataclass(frozen=True)
@@ -115,6 +145,22 @@ class Backend:
     """Whether its input counts images in the capture's own order."""
     accuracy: str = ""
     """As measured, and where that stands; empty: not measured here."""
+    files: tuple[str, ...] = HUB_FILES
+    """Of its weights on the hub."""
+    parameters: int = 0
+    """Of the network, in millions."""
+    download_gb: float = 0.0
+    commercial: bool = True
+    """Whether the licence of its weights allows commercial use."""
+    takes_poses: bool = False
+    """Whether it can be shown camera poses."""
+    cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Of an any-view model: views_at_once.cost.Cost."""
+
+    @property
+    def sees_all_views(self) -> bool:
+        """Whether it is a network that is shown all views at once."""
+        return any(self.cost)
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
@@ -122,7 +168,7 @@ class Backend:
 
     def has_weights(self) -> bool:
         """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
-        return not self.hub_id or bool(cached_files(self.hub_id))
+        return not self.hub_id or bool(cached_files(self.hub_id, self.files))
 
 
 BACKENDS: dict[str, Backend] = {
@@ -138,6 +184,9 @@ BACKENDS: dict[str, Backend] = {
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
             package="torch",
             install=install("networks"),
+            parameters=689,
+            download_gb=2.8,
+            commercial=False,
         ),
         Backend(
             "dust3r",
@@ -149,17 +198,9 @@ BACKENDS: dict[str, Backend] = {
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
             package="torch",
             install=install("networks"),
-        ),
-        Backend(
-            "mapanything",
-            _mapanything,
-            "Apache-2.0",
-            metric=True,
-            auto=True,
-            options=("weights",),
-            hub_id="facebook/map-anything-apache",
-            package="mapanything",
-            install="pip install git+https://github.com/facebookresearch/map-anything",
+            parameters=571,
+            download_gb=2.3,
+            commercial=False,
         ),
         Backend(
             "colmap",
@@ -169,12 +210,92 @@ BACKENDS: dict[str, Backend] = {
             accuracy="0.05 mm and 0.005° on the bundled capture (docs/results/run.md)",
         ),
         Backend(
+            "da3",
+            _views_at_once,
+            "Apache-2.0",
+            auto=True,
+            options=("weights",),
+            hub_id="depth-anything/DA3-BASE",
+            package="depth_anything_3",
+            install=INSTALL_DA3,
+            parameters=135,
+            download_gb=0.5,
+            takes_poses=True,
+            cost=(1.0, 0.15, 5.5, 0.2),
+        ),
+        Backend(
+            "da3-small",
+            _views_at_once,
+            "Apache-2.0",
+            auto=True,
+            options=("weights",),
+            hub_id="depth-anything/DA3-SMALL",
+            package="depth_anything_3",
+            install=INSTALL_DA3,
+            parameters=34,
+            download_gb=0.14,
+            takes_poses=True,
+            cost=(0.35, 0.09, 2.4, 0.05),
+        ),
+        Backend(
+            "mapanything",
+            _views_at_once,
+            "Apache-2.0",
+            metric=True,
+            auto=True,
+            options=("weights",),
+            hub_id="facebook/map-anything-apache",
+            package="mapanything",
+            install="pip install git+https://github.com/facebookresearch/map-anything",
+            takes_poses=True,
+            cost=(5.0, 0.4, 20.0, 4.0),
+        ),
+        Backend(
+            "vggt",
+            _views_at_once,
+            "VGGT licence, non-commercial use only (https://github.com/facebookresearch/vggt)",
+            options=("weights",),
+            hub_id="facebook/VGGT-1B",
+            package="vggt",
+            install="pip install git+https://github.com/facebookresearch/vggt",
+            parameters=1257,
+            download_gb=5.0,
+            commercial=False,
+            cost=(5.2, 0.4, 20.0, 4.0),
+        ),
+        Backend(
+            "pi3x",
+            _views_at_once,
+            CC_BY_NC,
+            metric=True,
+            options=("weights",),
+            hub_id="yyfz233/Pi3X",
+            package="pi3",
+            install="pip install git+https://github.com/yyfz/Pi3",
+            commercial=False,
+            takes_poses=True,
+            cost=(6.0, 0.4, 20.0, 4.0),
+        ),
+        Backend(
             "direct",
             _direct,
             "Apache-2.0",
             auto=True,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
             "(docs/plain-tables.md)",
+        ),
+        Backend(
+            "moge",
+            _moge,
+            "MIT",
+            metric=True,
+            options=("weights",),
+            hub_id="Ruicheng/moge-2-vitl",
+            package="moge",
+            install="pip install --no-deps dlr-moge dlr-utils3d",
+            files=("model.pt",),
+            parameters=326,
+            download_gb=1.3,
         ),
         Backend(
             "marker",
@@ -200,9 +321,10 @@ BACKENDS: dict[str, Backend] = {
 }
 """By name; `auto` takes the first that it may.
 
-Networks whose uncertainty is known come before the one whose is not, metric ones before others. COLMAP needs no
-weights, and sees what networks do not. Direct alignment comes after it: COLMAP matches what is printed on things, it
-the colours of plain ones.
+Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
+sees what networks do not. Networks that see all views come after it: refined by colours they are as good where it works,
+and better than direct alignment on plain tables (docs/results/models.md, with simulated predictions), for more time.
+Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
 """
 
 PATHS = ("predictions", "cameras")
@@ -224,7 +346,7 @@ class ReconstructOptions:
     """auto takes the first of the list that needs no input of its own and whose package and weights are on this
     machine (jcr models), and the next such one where its result is rejected."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks and dense matching run."""
+    """Where networks and the map's training run."""
     seed: int = 0
     """Same seed, same result on the same machine."""
     weights: str | None = None
@@ -242,6 +364,9 @@ class ReconstructOptions:
     dense: bool = True
     """Estimate the dense depth that the map needs; without, a calibration alone comes sooner (networks predict it
     anyway)."""
+    priors: bool = True
+    """Fill plain surfaces with planes that their colour and the matched depth around them speak for. The map takes these
+    for surfaces, never for a view of free space. Networks predict them anyway."""
     memory_gb: float = 8.0
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
@@ -268,7 +393,12 @@ def reconstruct(
     row = BACKENDS[candidates(options)[0]]
     if not row.is_installed():
         raise InputError(
-            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}, or choose another"
+            f"--backend {row.name} needs {row.package}, which is not installed: {row.install}"
+            + (
+                f"; then {weights_command(row)}"
+                if row.hub_id and not row.has_weights()
+                else ", or choose another"
+            )
         )
     # By name, so that the order of the frames changes nothing.
     order = np.argsort(np.array(capture.images), kind="stable")
@@ -300,6 +430,8 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         points_in_recon=reconstruction.points_in_recon[rows],
         confidence=reconstruction.confidence[rows],
         colors=reconstruction.colors[rows],
+        reason=None if reconstruction.reason is None else reconstruction.reason[rows],
+        depth_std=None if reconstruction.depth_std is None else reconstruction.depth_std[rows],
         tracks=replace(tracks, image=row_of[tracks.image]),
         evidence=evidence,
     )
@@ -366,7 +498,34 @@ def weights_of(options: ReconstructOptions) -> tuple[str, str]:
     for published in BACKENDS.values():
         if published.hub_id == weights:
             return weights, published.licence
+    if "pair_graph" not in row.options:
+        return weights, f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
     return weights, f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
+
+
+def weights_folder(options: ReconstructOptions) -> Path:
+    """The folder of an any-view model's weights: the one that was named, or where `jcr models get` put them.
+
+    Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
+    """
+    row = BACKENDS[options.backend]
+    if options.weights is not None and Path(options.weights).is_dir():
+        return Path(options.weights)
+    named = options.weights or row.hub_id
+    if cached := cached_files(named, row.files):
+        return cached[0].parent
+    if named == row.hub_id:
+        raise InputError(f"--backend {row.name}: its weights are not on this machine; {weights_command(row)}")
+    raise InputError(
+        f"--weights {named}: no such folder, nor such weights in the cache; {weights_command(row)}"
+    )
+
+
+def weights_command(row: Backend) -> str:
+    """How to get the published weights of a network."""
+    size = f" ({row.download_gb:g} GB)" if row.download_gb else ""
+    licence = "" if row.commercial else ", non-commercial"
+    return f"jcr models get {row.name} downloads {row.hub_id}{size}{licence}"
 
 
 def _given_options(options: ReconstructOptions) -> dict[str, Any]:

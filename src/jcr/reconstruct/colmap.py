@@ -1,4 +1,4 @@
-"""The COLMAP back end: structure from motion, then dense pointmaps by plane sweep; no network, no weights."""
+"""The COLMAP back end: structure from motion, then dense pointmaps; no network, no weights."""
 
 import math
 from dataclasses import dataclass, replace

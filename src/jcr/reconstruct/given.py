@@ -1,7 +1,7 @@
 """The `given` back end: camera poses that somebody else found, a COLMAP model or a transforms.json.
 
 The model's own points are its tracks; where it has none (transforms.json), features are matched and triangulated
-with the cameras held. Dense pointmaps then come from the plane sweep, as for the COLMAP back end.
+with the cameras held. Dense pointmaps are made as for the COLMAP back end.
 """
 
 import tempfile

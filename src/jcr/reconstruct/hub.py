@@ -1,5 +1,6 @@
 """Weights on the Hugging Face hub: which files they are, and whether they are on this machine."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from jcr.extras import is_installed
@@ -7,13 +8,13 @@ from jcr.extras import is_installed
 HUB_FILES = ("config.json", "model.safetensors")
 
 
-def cached_files(hub_id: str) -> list[Path]:
-    """HUB_FILES of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
+def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES) -> list[Path]:
+    """Files of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
     if not is_installed("huggingface_hub"):
         return []
     from huggingface_hub import try_to_load_from_cache
 
     # Not a path where a file is missing, or known to be missing on the hub.
-    found = [try_to_load_from_cache(hub_id, name) for name in HUB_FILES]
+    found = [try_to_load_from_cache(hub_id, name) for name in names]
     paths = [Path(path) for path in found if isinstance(path, str)]
-    return paths if len(paths) == len(HUB_FILES) else []
+    return paths if len(paths) == len(names) else []

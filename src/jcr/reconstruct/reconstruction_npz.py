@@ -12,8 +12,10 @@ from jcr.errors import InputError
 from jcr.files import written_whole
 from jcr.records import CameraEvidence, Intrinsics, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/3"
+FORMAT = "jcr.reconstruction/4"
 """Changes with what the file holds."""
+OLD = "jcr.reconstruction/3"
+"""Without reasons and sigmas of depths, which were all matched; else the same."""
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -44,6 +46,10 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
             "evidence_recon_from_camera": evidence.recon_from_camera,
             "evidence_covariance": evidence.covariance,
         }
+    if reconstruction.reason is not None:
+        arrays["reason"] = reconstruction.reason
+    if reconstruction.depth_std is not None:
+        arrays["depth_std"] = reconstruction.depth_std
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
 
@@ -54,7 +60,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
         # NumPy leaves a file open that it cannot read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
-            if about["format"] != FORMAT:
+            if about["format"] not in (FORMAT, OLD):
                 raise InputError(
                     f"{path}: format {about['format']!r}, not {FORMAT!r}; delete it and run again"
                 )
@@ -77,6 +83,8 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 is_metric=about["is_metric"],
                 metric_std=about["metric_std"],
                 notes=tuple(about["notes"]),
+                reason=file.get("reason"),
+                depth_std=file.get("depth_std"),
                 evidence=_evidence(file),
             )
     except FileNotFoundError:

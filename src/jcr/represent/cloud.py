@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
-from jcr.records import Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import MATCHED, Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions
 
 
@@ -26,10 +26,12 @@ def point_cloud(
     options = options or CloudOptions()
     confidence = reconstruction.confidence
     keep = confidence > 0
+    # Depths on a plane have passed tests of their own, and hardly any is wrong.
+    alone = keep if reconstruction.reason is None else keep & (reconstruction.reason == MATCHED)
     if options.confidence_threshold is not None:
         keep &= confidence >= options.confidence_threshold
-    elif keep.any():
-        keep &= confidence >= np.percentile(confidence[keep], options.confidence_percentile)
+    elif alone.any():
+        keep &= ~alone | (confidence >= np.percentile(confidence[alone], options.confidence_percentile))
     pixel = np.flatnonzero(keep)
     if len(pixel) == 0:
         best = float(confidence.max()) if confidence.size else 0.0
@@ -53,6 +55,10 @@ def point_cloud(
         image=image,
         camera_centers_in_base=apply(hand_eye.base_from_recon, recon_from_camera[:, :3, 3]),
         label_names=label_names,
+        reason=None if reconstruction.reason is None else reconstruction.reason.reshape(-1)[pixel],
+        depth_std=None
+        if reconstruction.depth_std is None
+        else hand_eye.scale * reconstruction.depth_std.reshape(-1)[pixel].astype(np.float64),
     )
 
 

@@ -14,6 +14,8 @@ _VERTEX = np.dtype(
     + [(channel, "|u1") for channel in ("red", "green", "blue")]
     + [("label", "<i4"), ("confidence", "<f4"), ("margin", "<f4"), ("image", "<i4")]
 )
+_DENSE = [("reason", "|u1"), ("depth_std", "<f4")]
+"""Of clouds whose depths say what they rest on; m."""
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
@@ -23,12 +25,13 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
     The header's comments name the labels and the camera centres, so that `read_cloud` gives all of it back;
     `notes`, each of one line, are added to them.
     """
-    vertices = np.empty(len(cloud.points_in_base), _VERTEX)
+    further = [(name, kind) for name, kind in _DENSE if getattr(cloud, name) is not None]
+    vertices = np.empty(len(cloud.points_in_base), [*_VERTEX.descr, *further])
     for name, column in zip("xyz", cloud.points_in_base.T, strict=True):
         vertices[name] = column
     for name, column in zip(("red", "green", "blue"), cloud.color.T, strict=True):
         vertices[name] = column
-    for name in ("label", "confidence", "margin", "image"):
+    for name in ("label", "confidence", "margin", "image", *dict(further)):
         vertices[name] = getattr(cloud, name)
     centers = cloud.camera_centers_in_base.tolist()
     header = [
@@ -39,7 +42,10 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
         *(f"comment label {k} {name}" for k, name in enumerate(cloud.label_names)),
         *(f"comment camera {k} {x} {y} {z}" for k, (x, y, z) in enumerate(centers)),
         f"element vertex {len(vertices)}",
-        *(f"property {_PLY_TYPES[_VERTEX[name].str[1:]]} {name}" for name in _VERTEX.names or ()),
+        *(
+            f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}"
+            for name in vertices.dtype.names or ()
+        ),
         "end_header\n",
     ]
     write_bytes(path, "\n".join(header).encode() + vertices.tobytes())
@@ -57,10 +63,12 @@ def read_cloud(path: Path) -> PointCloud:
     words = [line.split(maxsplit=3) for line in lines]
     if not separator or "comment jcr cloud in the base frame, metres" not in lines:
         raise InputError(f"{path}: is no cloud of jcr; make it again with jcr map OUT")
-    if len(body) % _VERTEX.itemsize:
+    further = [(name, kind) for name, kind in _DENSE if f"property {_PLY_TYPES[kind[1:]]} {name}" in lines]
+    vertex = np.dtype([*_VERTEX.descr, *further])
+    if len(body) % vertex.itemsize:
         raise InputError(f"{path}: the cloud is cut short; make it again with jcr map OUT")
-    vertices = np.frombuffer(body, _VERTEX)
-    if not all(np.isfinite(vertices[name]).all() for name in _VERTEX.names or ()):
+    vertices = np.frombuffer(body, vertex)
+    if not all(np.isfinite(vertices[name]).all() for name in vertex.names or ()):
         raise InputError(
             f"{path}: the cloud is damaged (a number is not finite); make it again with jcr map OUT"
         )
@@ -79,4 +87,6 @@ def read_cloud(path: Path) -> PointCloud:
         image=vertices["image"].astype(int),
         camera_centers_in_base=camera_centers,
         label_names=names,
+        reason=vertices["reason"].copy() if "reason" in dict(further) else None,
+        depth_std=vertices["depth_std"].astype(np.float64) if "depth_std" in dict(further) else None,
     )

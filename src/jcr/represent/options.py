@@ -9,7 +9,7 @@ class CloudOptions:
     """Which points of the pointmaps enter the map."""
 
     confidence_percentile: float = 20.0
-    """Drop this share (%) of the estimated points, the least confident first."""
+    """Drop this share (%) of the points that rest on matching or a prediction alone, the least confident first."""
     confidence_threshold: float | None = None
     """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
     max_points: int = 200_000

@@ -9,7 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.records import PointCloud
+from jcr.records import PRIOR, PointCloud
 from jcr.represent.seen import CROSSED, HIT, SeenGrid
 
 BEHIND = 2.0
@@ -32,12 +32,16 @@ class Rays:
     reach: Float[Tensor, "n 1"]
     """Metres from the point to its camera, or to where the ray enters the workspace."""
     weight: Float[Tensor, " n"]
+    measured: Float[Tensor, " n"]
+    """1; 0 for a prior, whose ray shows no free space."""
     targets: dict[str, Tensor]
     """What each point says of itself: color (n,3), label (n,), further values (n,d)."""
 
     def __getitem__(self, rows: Tensor | slice) -> "Rays":
         targets = {name: target[rows] for name, target in self.targets.items()}
-        return Rays(self.x[rows], self.ahead[rows], self.reach[rows], self.weight[rows], targets)
+        return Rays(
+            self.x[rows], self.ahead[rows], self.reach[rows], self.weight[rows], self.measured[rows], targets
+        )
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,16 @@ def draw_samples(rays: Rays, seen: SeenGrid, along_rays: bool, generator: torch.
         near = b.x + cell * (CLEARANCE + NEAR * uniform(len(b.x)).square()) * b.ahead
         far = a.x + (CLEARANCE * cell + a.reach * uniform(len(a.x))) * a.ahead
         positives, negatives = [rays.x, behind], [near, far, anywhere(n // 8)]
-        weights = [rays.weight, a.weight * solid, b.weight, a.weight, torch.ones(n // 8, device=device)]
+        # Before a prior only what other rays crossed is free. Close to it the field learns where the surface ends
+        # all the same: what it says there counts only where the seen grid was crossed.
+        free_far = torch.maximum(a.measured, ((seen.at(far) & CROSSED) != 0).float())
+        weights = [
+            rays.weight,
+            a.weight * solid,
+            b.weight,
+            a.weight * free_far,
+            torch.ones(n // 8, device=device),
+        ]
     x = torch.cat(positives + negatives)
     occupied = torch.zeros(len(x), device=device)
     occupied[: sum(map(len, positives))] = 1.0
@@ -124,7 +137,7 @@ def workspace_rays(
     """The rays of the points that lie in the box; reliable points weigh more.
 
     A point counts by its confidence (relative to the median, within a factor of four) and by how small its
-    `margin` is against a cell: there is no use in sharpness that the calibration does not have.
+    `margin` and the depth's sigma are against a cell: there is no use in sharpness that the measurement does not have.
     """
     x = cloud.points_in_base
     inside = np.flatnonzero(((x > box[0]) & (x < box[1])).all(1))
@@ -143,7 +156,9 @@ def workspace_rays(
 
     confidence = cloud.confidence[inside]
     weight = np.clip(confidence / max(np.median(confidence), 1e-12), 0.25, 4.0)
-    weight /= 1.0 + (cloud.margin[inside] / cell) ** 2
+    depth_std = 0.0 if cloud.depth_std is None else cloud.depth_std[inside]
+    weight /= 1.0 + (cloud.margin[inside] ** 2 + depth_std**2) / cell**2
+    measured = np.ones(len(inside)) if cloud.reason is None else cloud.reason[inside] != PRIOR
 
     targets: dict[str, ndarray] = {"color": cloud.color[inside] / np.float32(255)}
     for name, value in values.items():
@@ -158,5 +173,10 @@ def workspace_rays(
     if len(cloud.label_names) > 1:
         tensors["label"] = torch.as_tensor(cloud.label[inside], dtype=torch.int64, device=device)
     return Rays(
-        tensor(x), tensor(toward / distance), tensor(reach[:, None]), tensor(weight / weight.mean()), tensors
+        tensor(x),
+        tensor(toward / distance),
+        tensor(reach[:, None]),
+        tensor(weight / weight.mean()),
+        tensor(measured),
+        tensors,
     )

@@ -1,6 +1,7 @@
 """What the rays saw: every cell of the workspace is crossed by a ray, hit by one, both, or unseen.
 
-Each point is a ray from its camera: all before it is free, the point is surface, all behind it is unseen. A field
+Each point is a ray from its camera: all before it is free, the point is surface, all behind it is unseen. Of a point
+that rests on a prior only the surface counts: nobody has seen that the way to it is free. A field
 alone cannot know this: trained on surfaces, it calls the inside of every object free.
 """
 
@@ -63,18 +64,24 @@ def carve(
     camera_centers_in_base: Float[Tensor, "m 3"],
     box: Float[Tensor, "2 3"],
     cell: float,
+    measured: Bool[Tensor, " n"] | None = None,
 ) -> SeenGrid:
     """The seen grid of the rays from each point's camera to the point; the box is whole pairs of cells.
+
+    Rays of points that are not `measured` (None: all are) cross nothing, and end the crossing of those beside them.
 
     Far from surfaces two cells at a time are judged at once, by their centre's depth before the nearest point in
     its direction; the last centimetres of each ray are followed one by one, which keeps the grid sharp where it matters.
     """
     blocks = ((box[1] - box[0]) / (2 * cell)).round().int().tolist()
     crossed = torch.zeros(blocks[::-1], dtype=torch.bool, device=box.device)
+    if measured is None:
+        measured = torch.ones(len(points_in_base), dtype=torch.bool, device=box.device)
     for i, center in enumerate(camera_centers_in_base):
-        of_image = points_in_base[image == i] - center
-        if len(of_image):
-            crossed |= _before_nearest(of_image, center, box[0], 2 * cell, blocks)
+        rows = image == i
+        if measured[rows].any():
+            of_image = points_in_base[rows] - center
+            crossed |= _before_nearest(of_image, measured[rows], center, box[0], 2 * cell, blocks)
     fine = crossed.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
     seen = SeenGrid(box[0], cell, fine.to(torch.uint8) * CROSSED)
 
@@ -85,7 +92,7 @@ def carve(
     samples = torch.zeros(len(flat), dtype=torch.int16, device=flat.device)
     for step in torch.arange(cell / 2, NEAR, cell / 2).tolist():
         index, inside = seen.index(points_in_base + step * ray)
-        index = index[inside & (reach[:, 0] > step)]
+        index = index[inside & (reach[:, 0] > step) & measured]
         samples.scatter_add_(0, index.long(), samples.new_ones(1).expand(len(index)))
     flat[samples >= CROSSINGS] |= CROSSED
     # Half a cell behind the point as well: a surface that lies just on a cell's far side has some thickness too.
@@ -112,6 +119,7 @@ def without_doubts(seen: SeenGrid) -> SeenGrid:
 
 def _before_nearest(
     points: Float[Tensor, "n 3"],
+    measured: Bool[Tensor, " n"],
     center: Float[Tensor, "3"],
     lower: Float[Tensor, "3"],
     block: float,
@@ -119,9 +127,10 @@ def _before_nearest(
 ) -> Bool[Tensor, "nz ny nx"]:
     """Blocks that lie wholly before the nearest of a camera's points in their direction.
 
-    The points are binned in a pinhole image about their mean direction, about two to a bin; an empty bin frees
-    nothing.
+    The measured points are binned in a pinhole image about their mean direction, about two to a bin; an empty bin frees
+    nothing, and points that are not measured only end what others free.
     """
+    points, assumed = points[measured], points[~measured]
     axis = F.normalize(F.normalize(points, dim=1).mean(0), dim=0)
     across = torch.linalg.cross(axis, torch.eye(3, device=axis.device)[axis.abs().argmin()])
     across = F.normalize(across, dim=0)
@@ -136,6 +145,11 @@ def _before_nearest(
     bins = ((v - v0) / pitch).long() * columns + ((u - u0) / pitch).long()
     nearest = torch.zeros(rows * columns, device=u.device)
     nearest.scatter_reduce_(0, bins, depth, "amin", include_self=False)
+    u, v, depth = (assumed @ turn.T).unbind(-1)
+    column, row = ((u / depth - u0) / pitch).floor(), ((v / depth - v0) / pitch).floor()
+    inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+    bins = (row * columns + column)[inside].long()
+    nearest.scatter_reduce_(0, bins, depth[inside], "amin")
 
     # The centres of the blocks in the turned frame are an outer sum, one term an axis.
     def along(row: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Dense pointmaps of images whose cameras are known, whichever back end found them."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,16 +10,9 @@ from numpy import ndarray
 
 from jcr.camera import pinhole_inside, rays, undistort_image
 from jcr.extras import extra
-from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
+from jcr.memory import ALLOWANCE, GB, MAP, announce, relieve, require, resident
 from jcr.progress import Progress
-from jcr.reconstruct.depth.views import (
-    BYTES_OF_PLANE,
-    BYTES_OF_RESULT,
-    BYTES_OF_THREAD,
-    PLANES,
-    choose_neighbours,
-    sweep_planes,
-)
+from jcr.reconstruct.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD, choose_neighbours, sweep_planes
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
 BYTES_OF_FEATURES_FOUND = 5_000_000
@@ -34,10 +27,10 @@ class DenseOptions:
     """Long side of the dense pointmaps."""
     dense: bool = True
     """Off: cameras and tracks alone, with pointmaps of no confidence."""
-    neighbours: int = 5
-    """Other images that each is compared with for its pointmap."""
-    device: str = "cpu"
-    """Where the plane sweep runs: cpu or cuda."""
+    neighbours: int = 10
+    """Other images that the depth of each is checked against; matched with the best of them."""
+    priors: bool = True
+    """Fill plain surfaces with planes."""
     memory_gb: float = 8.0
     """Peak resident set of the process, the program itself included."""
 
@@ -53,6 +46,19 @@ class SparseModel:
     """Of the images given: the one given, or estimated."""
     tracks: Tracks
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DenseDepth:
+    """Depth of every pixel of undistorted images, and what it rests on."""
+
+    points_in_recon: Float[ndarray, "m h w 3"]
+    confidence: Float[ndarray, "m h w"]
+    """Correlation times the number of images that agree; 0 for no estimate."""
+    reason: UInt8[ndarray, "m h w"]
+    """NO_DEPTH, MATCHED, PRIOR or BOTH of `jcr.records`."""
+    depth_std: Float[ndarray, "m h w"]
+    """One sigma of the depth (z), in recon units."""
 
 
 def with_pointmaps(
@@ -71,25 +77,28 @@ def with_pointmaps(
     pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
     colors = np.stack([undistort_image(image, sparse.lens, pinhole) for image in images])
     if options.dense:
-        points, confidence = dense_pointmaps(
+        dense = dense_pointmaps(
             colors,
             sparse.recon_from_camera,
             pinhole,
             choose_neighbours(sparse.tracks, sparse.recon_from_camera, options.neighbours),
             sweep_planes(sparse.tracks, sparse.recon_from_camera) if planes is None else planes,
-            options.device,
             report,
+            priors=options.priors,
             memory_gb=options.memory_gb,
         )
     else:
-        points, confidence = np.zeros(colors.shape, np.float32), np.zeros(colors.shape[:3], np.float32)
+        nothing = np.zeros(colors.shape[:3], np.float32)
+        dense = DenseDepth(np.zeros(colors.shape, np.float32), nothing, nothing.astype(np.uint8), nothing)
     return Reconstruction(
         image_index=sparse.rows,
         recon_from_camera=sparse.recon_from_camera,
         intrinsics=sparse.lens,
         pointmap_intrinsics=pinhole,
-        points_in_recon=points,
-        confidence=confidence,
+        points_in_recon=dense.points_in_recon,
+        confidence=dense.confidence,
+        reason=dense.reason,
+        depth_std=dense.depth_std,
         colors=colors,
         tracks=sparse.tracks,
         backend=backend,
@@ -103,32 +112,54 @@ def dense_pointmaps(
     pinhole: Intrinsics,
     neighbours: Sequence[Int[ndarray, " _"]],
     planes: Float[ndarray, "m d 3"],
-    device: str,
     report: Progress,
+    *,
     changing: bool = False,
+    priors: bool = True,
     memory_gb: float = 8.0,
-) -> tuple[Float[ndarray, "m h w 3"], Float[ndarray, "m h w"]]:
-    """Points in the recon frame and their confidence, per pixel of undistorted images.
+) -> DenseDepth:
+    """Points in the recon frame, per pixel of undistorted images, with confidence, reason and sigma.
 
-    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times. Confidence
-    is the plane sweep's, 0 for no estimate.
+    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times, one that sees
+    through a point of another may show what was there before, and nothing is filled by `priors`.
     """
-    extra("torch", "map", "dense depth")
-    from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions, plane_sweep
+    extra("numba", "map", "dense depth")
+    from jcr.reconstruct.depth.fused import fused_depth
+    from jcr.reconstruct.depth.matched import match_depth
 
-    depth, confidence = plane_sweep(
+    pixels = pinhole.width * pinhole.height
+    room = memory_gb * GB - resident() - ALLOWANCE - len(colors) * pixels * BYTES_OF_RESULT
+    threads = max(1, min(os.cpu_count() or 1, int(room // (pixels * BYTES_OF_THREAD))))
+
+    def progress(start: float, share: float) -> Callable[[float], None]:
+        def told(fraction: float) -> None:
+            relieve(memory_gb * GB)
+            report("dense depth", start + share * fraction)
+
+        return told
+
+    inverse_depth, score = match_depth(
+        colors, recon_from_camera, pinhole, neighbours, planes, threads, progress(0.0, 0.7)
+    )
+    found = fused_depth(
         colors,
         recon_from_camera,
         pinhole,
         neighbours,
-        planes,
-        PlaneSweepOptions(device=device, changing=changing, memory_gb=memory_gb),
-        lambda fraction: report("dense depth", fraction),
+        inverse_depth,
+        score,
+        changing=changing,
+        priors=priors and not changing,
+        threads=threads,
+        report=progress(0.7, 0.3),
     )
+    depth = 1 / found.inverse_depth.astype(np.float64)
     points = np.empty((*depth.shape, 3))
     for k, pose in enumerate(recon_from_camera):
         points[k] = np.einsum("ij,hwj->hwi", pose[:3, :3], depth[k, ..., None] * rays(pinhole)) + pose[:3, 3]
-    return points, confidence
+    return DenseDepth(
+        points, found.confidence.astype(np.float64), found.reason, (found.std * depth).astype(np.float32)
+    )
 
 
 def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, features: int = 0) -> None:
@@ -138,20 +169,19 @@ def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, featu
     kept with one image at a time.
     """
     if options.dense:
-        extra("torch", "map", "dense depth")  # imported now, for it is a large part of the program
+        extra("numba", "map", "dense depth")  # imported now, for it is a part of the program
 
     width, height = size
     pixels = int(width * height * min(1.0, options.pointmap_size_px / max(size)) ** 2)
     program = resident() + ALLOWANCE
     pictures = 3 * width * height * images
     result = images * (pixels * BYTES_OF_RESULT + BYTES_OF_FEATURES_FOUND)
-    of_thread, of_planes = pixels * BYTES_OF_THREAD, pixels * PLANES * BYTES_OF_PLANE
-    one = of_thread + of_planes if options.dense else 0
+    one = pixels * BYTES_OF_THREAD if options.dense else 0
     budget = options.memory_gb * GB
     least = program + pictures + max(features, result + max(one, MAP))
     require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
     cores = os.cpu_count() or 1
-    all_at_once = min(cores, images) * of_thread + images * of_planes if options.dense else 0
+    all_at_once = min(cores, images) * one
     # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
     ample = program + pictures + max(features * min(cores, images), result + all_at_once + MAP)
     announce(min(ample, int(budget)), budget)

@@ -1,4 +1,4 @@
-"""What a plane sweep takes: which views to compare, where their surfaces may lie (as sparse tracks tell), memory."""
+"""What matching takes: which views to compare, where their surfaces may lie (as sparse tracks tell), memory."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,9 +8,9 @@ from jcr.geometry import apply, inverse
 from jcr.records import Tracks
 
 PLANES = 48
-"""Of a sweep."""
-BYTES_OF_THREAD, BYTES_OF_PLANE, BYTES_OF_RESULT = 2000, 4, 80
-"""Per pixel: of the image that a thread works on; of each plane of an image that is smoothed; of every image."""
+"""Of a sweep; PatchMatch takes the first and the last."""
+BYTES_OF_THREAD, BYTES_OF_RESULT = 400, 150
+"""Per pixel: of the image that a thread works on; of every image."""
 
 
 def choose_neighbours(

@@ -6,7 +6,7 @@ viewing direction in the gripper's frame, and turns about it and tilts are tried
 From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
 that what disagrees with the robot's motion shows.
 
-Pointmaps come from the plane sweep, which knows depth near edges only: on plain tables a tenth of the pixels.
+Pointmaps are matched near edges; plain surfaces between them are filled with planes (depth/priors.py).
 docs/plain-tables.md says when, and what it gives.
 """
 

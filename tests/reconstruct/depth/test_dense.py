@@ -1,7 +1,7 @@
-"""Plane sweep on a scene whose depth is known: a box on a table, drawn by casting rays."""
+"""Dense depth on a scene whose depth is known: a box on a table, drawn by casting rays."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -12,10 +12,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
-from jcr.records import Intrinsics, Tracks
+from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics, Tracks
 
 if TYPE_CHECKING:
-    from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions
+    from jcr.reconstruct.depth.dense import DenseDepth
 
 pytestmark = pytest.mark.slow
 
@@ -23,6 +23,8 @@ PINHOLE = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
 BOX_HEIGHT, BOX_HALF_WIDTH = 0.06, 0.05
 BLANK_X = 0.11
 """The table has one colour beyond this x."""
+PATCH_XY, PATCH_HALF_WIDTH = (-0.02, 0.11), 0.035
+"""And on this square."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Scene:
     recon_from_camera: Float[ndarray, "m 4 4"]
     depth: Float[ndarray, "m h w"]
     blank: Bool[ndarray, "m h w"]
+    patch: Bool[ndarray, "m h w"]
     tracks: Tracks
 
 
@@ -41,7 +44,7 @@ def scene() -> Scene:
     rng = np.random.default_rng(3)
     texture = np.stack([gaussian_filter(rng.normal(size=(600, 600)), 2.0) for _ in range(3)], axis=-1)
     texture = np.clip(128 + 60 * texture / texture.std(), 0, 255)
-    cameras, images, depths, blanks = [], [], [], []
+    cameras, images, depths, blanks, patches = [], [], [], [], []
     for k in range(7):
         azimuth, tilt = 2 * np.pi * k / 7, 0.25 + 0.1 * (k % 3)
         centre = (0.42 + 0.03 * (k % 2)) * np.array(
@@ -72,9 +75,11 @@ def scene() -> Scene:
         color = color.T.reshape(*depth.shape, 3)
         blank = point[..., 0] > BLANK_X
         cameras.append(recon_from_camera)
-        images.append(np.where(blank[..., None], 140, np.clip(color, 0, 255)).astype(np.uint8))
+        patch = (np.abs(point[..., :2] - PATCH_XY) < PATCH_HALF_WIDTH).all(-1) & (point[..., 2] < 1e-6)
+        images.append(np.where((blank | patch)[..., None], 140, np.clip(color, 0, 255)).astype(np.uint8))
         depths.append(depth)
         blanks.append(blank)
+        patches.append(patch)
     recon_from_camera = np.stack(cameras)
     points = np.concatenate(
         [
@@ -91,67 +96,117 @@ def scene() -> Scene:
         point.append(seen)
         x_px.append(np.stack([u, v], axis=-1)[seen])
     tracks = Tracks(np.concatenate(image), np.concatenate(x_px), np.concatenate(point), points)
-    return Scene(np.stack(images), recon_from_camera, np.stack(depths), np.stack(blanks), tracks)
+    return Scene(
+        np.stack(images), recon_from_camera, np.stack(depths), np.stack(blanks), np.stack(patches), tracks
+    )
 
 
 @pytest.fixture(scope="module")
-def swept(scene: Scene) -> tuple[ndarray, ndarray]:
-    return _sweep(scene.images, scene.recon_from_camera, scene.tracks)
+def dense(scene: Scene) -> "DenseDepth":
+    return _dense(scene, scene.recon_from_camera, scene.tracks)
 
 
-def _sweep(
-    images: ndarray, recon_from_camera: ndarray, tracks: Tracks, options: "PlaneSweepOptions | None" = None
-) -> tuple[ndarray, ndarray]:
-    from jcr.reconstruct.depth.plane_sweep import plane_sweep
+def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: Any) -> "DenseDepth":
+    from jcr.reconstruct.depth.dense import dense_pointmaps
 
-    neighbours = choose_neighbours(tracks, recon_from_camera, 4)
+    neighbours = choose_neighbours(tracks, recon_from_camera, 6)
     planes = sweep_planes(tracks, recon_from_camera)
-    return plane_sweep(images, recon_from_camera, PINHOLE, neighbours, planes, options)
-
-
-def test_a_tight_budget_takes_the_images_one_by_one_and_changes_no_bit(
-    scene: Scene, swept: tuple[ndarray, ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from jcr.reconstruct.depth import plane_sweep as plane_sweep_module
-    from jcr.reconstruct.depth.plane_sweep import PlaneSweepOptions
-
-    together = []
-    smooth = plane_sweep_module._add_semi_global_paths
-    monkeypatch.setattr(
-        plane_sweep_module,
-        "_add_semi_global_paths",
-        lambda cost, grey: together.append(len(cost)) or smooth(cost, grey),
+    images = scene.images
+    return dense_pointmaps(
+        images, recon_from_camera, PINHOLE, neighbours, planes, lambda stage, fraction: None, **options
     )
-    tight = _sweep(scene.images, scene.recon_from_camera, scene.tracks, PlaneSweepOptions(memory_gb=0.1))
-    assert together == [1] * len(scene.images)
-    for one, other in zip(tight, swept, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
-def test_depth_is_found_and_confidence_knows_where(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
-    depth, confidence = swept
+def _z(scene: Scene, dense: "DenseDepth", recon_from_camera: ndarray | None = None) -> ndarray:
+    cameras = scene.recon_from_camera if recon_from_camera is None else recon_from_camera
+    pairs = zip(inverse(cameras), dense.points_in_recon, strict=True)
+    return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
+
+
+def test_a_tight_budget_changes_no_bit(scene: Scene, dense: "DenseDepth") -> None:
+    tight = _dense(scene, scene.recon_from_camera, scene.tracks, memory_gb=0.1)  # one thread
+    for name in ("points_in_recon", "confidence", "reason", "depth_std"):
+        np.testing.assert_array_equal(getattr(tight, name), getattr(dense, name))
+
+
+def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: "DenseDepth") -> None:
+    depth = _z(scene, dense)
     assert np.isfinite(depth).all() and (depth > 0).all()
-    assert (confidence >= 0).all()
-    error = np.abs(depth / scene.depth - 1)
-    believed = confidence > 0
-    assert believed[~scene.blank].mean() > 0.75
-    assert np.median(error[believed & ~scene.blank]) < 5e-4
-    assert (error[believed & ~scene.blank] > 0.02).mean() < 0.02
+    np.testing.assert_array_equal(dense.confidence > 0, dense.reason != NO_DEPTH)
+    error = np.abs(depth - scene.depth)
+    matched = np.isin(dense.reason, (MATCHED, BOTH))
+    textured = ~scene.blank & ~scene.patch
+    believed = dense.confidence > 0
+    assert believed[textured].mean() > 0.75
+    assert np.median((error / scene.depth)[matched & textured]) < 5e-4
+    assert (error / scene.depth > 0.02)[believed & textured].mean() < 0.02
+    for reason in (MATCHED, PRIOR, BOTH):
+        of_reason = dense.reason == reason
+        assert of_reason.sum() > 200
+        assert (error < 2 * dense.depth_std)[of_reason].mean() > 0.8
 
 
-def test_one_colour_is_no_evidence(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
-    _, confidence = swept
-    inner = scene.blank & np.roll(scene.blank, 12, 1) & np.roll(scene.blank, -12, 1)
-    inner &= np.roll(scene.blank, 12, 2) & np.roll(scene.blank, -12, 2)
-    assert inner.sum() > 500
-    assert (confidence[inner] == 0).mean() > 0.99
+def test_windows_lie_on_slopes() -> None:
+    """A plane that falls away at 65 degrees, seen by three cameras side by side; the search starts from others."""
+    from jcr.reconstruct.depth.matched import match_depth
+
+    normal = np.array([0.0, -np.sin(np.radians(65)), -np.cos(np.radians(65))])
+    rng = np.random.default_rng(0)
+    texture = gaussian_filter(rng.normal(size=(800, 800)), 3.0)
+    texture = 128 + 50 * texture / texture.std()
+    camera_x, images, depths = (-0.08, 0.0, 0.08), [], []
+    for x in camera_x:
+        centre = np.array([x, 0.0, 0.0])
+        depth = (-0.5 * np.cos(np.radians(65)) - normal @ centre) / (rays(PINHOLE) @ normal)
+        point = centre + depth[..., None] * rays(PINHOLE)
+        along = np.array([0.0, np.cos(np.radians(65)), -np.sin(np.radians(65))])
+        place = np.stack([point[..., 0], point @ along]) * 700 + 400
+        grey = map_coordinates(texture, place.reshape(2, -1), mode="reflect", order=1).reshape(depth.shape)
+        images.append(np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=-1))
+        depths.append(depth)
+    poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in camera_x]))
+    fronto = np.zeros((3, 2, 3))
+    fronto[:, :, 2] = 1 / np.array([0.9, 0.25])
+    neighbours = [np.array([1, 2]), np.array([0, 2]), np.array([1, 0])]
+    inverse_depth, score = match_depth(
+        np.stack(images), poses, PINHOLE, neighbours, fronto, 1, lambda _: None
+    )
+    middle = np.s_[1, 20:-20, 40:-40]
+    assert (score[middle] > 0.8).mean() > 0.9
+    assert (np.abs(inverse_depth * np.stack(depths) - 1)[middle] < 0.005).mean() > 0.95
 
 
-def test_a_pixel_that_no_neighbour_sees_has_no_confidence(
-    scene: Scene, swept: tuple[ndarray, ndarray]
+def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene, dense: "DenseDepth") -> None:
+    without = _dense(scene, scene.recon_from_camera, scene.tracks, priors=False)
+    assert not np.isin(without.reason, (PRIOR, BOTH)).any()
+    inner = _inner(scene.patch, 6)
+    assert inner.sum() > 300
+    for result in (dense, without):
+        assert np.isin(result.reason, (MATCHED, BOTH))[inner].mean() < 0.01
+    filled = inner & (dense.reason == PRIOR)
+    assert filled.sum() > 0.8 * inner.sum()
+    assert (np.abs(_z(scene, dense) / scene.depth - 1) < 0.005)[filled].mean() > 0.99
+
+
+def test_one_colour_that_goes_on_beyond_the_last_texture_stays_unknown(
+    scene: Scene, dense: "DenseDepth"
 ) -> None:
-    _, confidence = swept
-    neighbours = choose_neighbours(scene.tracks, scene.recon_from_camera, 4)
+    """It may be the floor beside the table as well."""
+    inner = _inner(scene.blank, 12)
+    assert inner.sum() > 500
+    assert (dense.confidence[inner] == 0).mean() > 0.99
+
+
+def _inner(mask: Bool[ndarray, "m h w"], margin: int) -> Bool[ndarray, "m h w"]:
+    """What lies so far (px) from the others in rows and columns."""
+    inner = mask.copy()
+    for axis in (1, 2):
+        inner &= np.roll(mask, margin, axis) & np.roll(mask, -margin, axis)
+    return inner
+
+
+def test_a_pixel_that_no_neighbour_sees_has_no_confidence(scene: Scene, dense: "DenseDepth") -> None:
+    neighbours = choose_neighbours(scene.tracks, scene.recon_from_camera, 6)
     hidden_somewhere = 0
     for i, others in enumerate(neighbours):
         seen = np.zeros(scene.depth[i].shape, dtype=int)
@@ -161,12 +216,11 @@ def test_a_pixel_that_no_neighbour_sees_has_no_confidence(
             u, v, _ = np.moveaxis(x / x[..., 2:] @ PINHOLE.matrix.T, -1, 0)
             seen += (u > -2) & (u < PINHOLE.width + 1) & (v > -2) & (v < PINHOLE.height + 1)
         hidden_somewhere += (seen == 0).sum()
-        assert (confidence[i][seen == 0] == 0).mean() > 0.99
+        assert (dense.confidence[i][seen == 0] == 0).mean() > 0.99
     assert hidden_somewhere > 100
 
 
-def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, swept: tuple[ndarray, ndarray]) -> None:
-    depth, confidence = swept
+def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: "DenseDepth") -> None:
     scale, motion = 7.3, transform(rotation_exp(np.array([0.3, -1.1, 0.7])), np.array([2.0, -3.0, 1.0]))
     moved = motion @ scene.recon_from_camera
     moved[:, :3, 3] *= scale
@@ -176,10 +230,12 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, swept: tuple[ndarr
         scene.tracks.point,
         scale * apply(motion, scene.tracks.points_in_recon),
     )
-    depth_moved, confidence_moved = _sweep(scene.images, moved, tracks)
-    both = (confidence > 0) & (confidence_moved > 0)
-    assert both.sum() > 0.99 * (confidence > 0).sum()
-    assert np.quantile(np.abs(depth_moved / scale / depth - 1)[both], 0.99) < 1e-3
+    other = _dense(scene, moved, tracks)
+    both = (dense.confidence > 0) & (other.confidence > 0)
+    assert both.sum() > 0.97 * (dense.confidence > 0).sum()
+    ratio = _z(scene, other, moved) / scale / _z(scene, dense)
+    assert np.quantile(np.abs(ratio - 1)[both], 0.95) < 1e-3
+    assert np.median(np.abs(other.depth_std[both] / scale / dense.depth_std[both] - 1)) < 1e-2
 
 
 def test_planes_take_the_slope_of_the_table(scene: Scene) -> None:

@@ -1,0 +1,39 @@
+"""Numba's compiler as the loops over pixels use it."""
+
+from collections.abc import Callable
+from typing import Any, no_type_check
+
+import numpy as np
+from numba import njit
+
+_OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy"}
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """The function compiled when it is first called, and kept on disk where that can be written.
+
+    Such functions carry no shapes to check and say `@no_type_check`: a checker around them could not be compiled.
+    """
+    try:
+        return njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # neither beside the source nor in the user's cache
+        return njit(**_OPTIONS)(function)
+
+
+@compiled
+@no_type_check
+def random_state(seed):
+    """State of `uniform`, the same for a seed in every thread and version."""
+    return np.array([np.uint64(88172645463325252) ^ (np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15))])
+
+
+@compiled
+@no_type_check
+def uniform(state):
+    """A number from 0 to 1 (Marsaglia, "Xorshift RNGs", 2003)."""
+    x = state[0]
+    x ^= x << np.uint64(13)
+    x ^= x >> np.uint64(7)
+    x ^= x << np.uint64(17)
+    state[0] = x
+    return (x >> np.uint64(11)) * (1.0 / 9007199254740992.0)

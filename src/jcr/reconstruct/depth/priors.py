@@ -1,0 +1,207 @@
+"""Planes where texture ends: what plain regions of an image most likely look like, given the depth around them.
+
+As in ACMP and ACMMP (Xu and Tao, "Planar prior assisted PatchMatch multi-view stereo", AAAI 2020; "Multi-scale geometric
+consistency guided and planar prior assisted multi-view stereo", PAMI 2022), depths that were matched and agree between
+views carry planes for the pixels that have none. Theirs are triangles between such pixels, which join things across
+their outlines; here a plane belongs to a region of one colour (as in Romanoni and Matteucci, "TAPA-MVS", ICCV 2019), and
+the support plane of the scene is known to be one. A plane is taken at a pixel where the other views show the point in
+the same colour and none of them sees through it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.camera import rays
+from jcr.reconstruct.depth.consistency import colours_agree
+from jcr.reconstruct.depth.matched import Relative, grid
+from jcr.reconstruct.depth.regions import FEWEST, colour_regions, region_planes
+from jcr.records import Intrinsics
+
+ON_PLANE = 0.006
+"""Relative distance of inverse depth within which a matched pixel lies on a plane."""
+SAME_COLOUR = 0.1
+"""Distance (RGB, each 0 to 1, exposure and vignetting evened) below which two pixels may show one point."""
+FARTHEST = 3.5
+"""Standard deviations of the pixels that carry a plane, up to which it is continued; the support plane has no end."""
+CARRIED = 0.5
+"""Share of a region's matched pixels that lie on its plane at least."""
+STRONG = 0.6
+"""The share from which the plane contradicts matched pixels off it: beside outlines, matching gives the nearer depth."""
+OFF_PLANE = 0.015
+"""Relative distance from such a plane at which a matched pixel is wrong."""
+FEWEST_VIEWS = 2
+"""Others that must show a point in its colour."""
+PATCH = 0.02
+"""Of the image, that a region without a plane of its own has at most to be taken for a part of the support plane."""
+WHOLE = 0.8
+"""Of its pixels at which the support plane must then hold: a thing that stands on it moves against it."""
+_POINTS, _TRIALS = 4000, 400
+"""Of the search for the support plane."""
+_PAIRS = 600
+"""Pixels of an image whose brightness is compared with other images'."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the planes say of one image."""
+
+    inverse_depth: Float[ndarray, "h w"]
+    holds: Bool[ndarray, "h w"]
+    """Colours agree with it and nothing sees through it."""
+    confirms: Bool[ndarray, "h w"]
+    """It holds, or the one other image that looks there agrees: enough where the pixel's own match lies on it."""
+    shown: UInt8[ndarray, "h w"]
+    """Images that show the plane's point in the pixel's colour."""
+    contradicts: Bool[ndarray, "h w"]
+    """Matched pixels that a well-carried plane shows to be wrong."""
+    std: Float[ndarray, "h w"]
+    """Relative, of inverse depth."""
+
+
+def support_plane(x_in_recon: Float[ndarray, "n 3"], tolerance: float, seed: int = 0) -> Float[ndarray, "4"]:
+    """The plane (unit normal n, d with n·x + d = 0) on which most points lie (RANSAC, then total least squares)."""
+    draw = np.random.default_rng(seed)
+    some = x_in_recon[draw.choice(len(x_in_recon), min(_POINTS, len(x_in_recon)), replace=False)]
+    corner = some[draw.integers(len(some), size=(_TRIALS, 3))]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    normal, corner = normal[length > 0] / length[length > 0, None], corner[length > 0, 0]
+    on_plane = [int((np.abs((some - c) @ n) < tolerance).sum()) for n, c in zip(normal, corner, strict=True)]
+    n, d = normal[np.argmax(on_plane)], -float(normal[np.argmax(on_plane)] @ corner[np.argmax(on_plane)])
+    for _ in range(5):
+        inside = x_in_recon[np.abs(x_in_recon @ n + d) < tolerance]
+        middle = inside.mean(0)
+        n = np.linalg.eigh(np.cov((inside - middle).T))[1][:, 0]
+        d = -float(n @ middle)
+    return np.append(n, d)
+
+
+def evened(
+    colors: UInt8[ndarray, "m h w 3"],
+    inverse_depth: Float[ndarray, "m h w"],
+    matched: Bool[ndarray, "m h w"],
+    views: Sequence[Relative],
+    pinhole: Intrinsics,
+) -> Float[ndarray, "m h w 3"]:
+    """Colours (0 to 1) without the images' exposures and the lens's vignetting, as matched points tell them.
+
+    Log brightness of one point in two images differs by their exposures and by a·(r²₁ - r²₂), with r the tangent of the
+    angle off axis: least absolute deviations over matched points.
+    """
+    color = colors.astype(np.float32) / 255
+    m, h, w = matched.shape
+    k = grid(pinhole)
+    r2 = (((np.arange(w) - k[2]) / k[0]) ** 2 + ((np.arange(h) - k[3]) / k[1])[:, None] ** 2).astype(
+        np.float32
+    )
+    grey = np.stack([np.log(np.maximum(cv2.blur(image.mean(-1), (5, 5)), 0.02)) for image in color])
+    draw = np.random.default_rng(0)
+    first, second, difference, radius = [], [], [], []
+    for i, view in enumerate(views):
+        v, u = np.nonzero(matched[i])
+        chosen = draw.permutation(len(v))[:_PAIRS]
+        v, u = v[chosen], u[chosen]
+        ray = np.stack([(u - k[2]) / k[0], (v - k[3]) / k[1], np.ones(len(u))], -1)
+        for n, j in enumerate(view.others):
+            x, y, z = (ray @ view.a[n].T + view.b[n] * inverse_depth[i, v, u][:, None]).T
+            x, y = np.rint(x / z), np.rint(y / z)
+            inside = (z > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+            x, y = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
+            ratio = z / inverse_depth[i, v, u] * inverse_depth[j, y, x]
+            one = inside & matched[j, y, x] & (np.abs(ratio - 1) < ON_PLANE)
+            first.append(np.full(one.sum(), i))
+            second.append(np.full(one.sum(), j))
+            difference.append((grey[i, v, u] - grey[j, y, x])[one])
+            radius.append((r2[v, u] - r2[y, x])[one])
+    rows, right = np.concatenate(first), np.concatenate(difference)
+    design = np.zeros((len(rows), m + 1))
+    design[np.arange(len(rows)), rows] = 1
+    design[np.arange(len(rows)), np.concatenate(second)] -= 1
+    design[:, m] = np.concatenate(radius)
+    found = np.zeros(m + 1)
+    for _ in range(8 if len(rows) else 0):
+        weight = 1 / np.maximum(np.abs(right - design @ found), 0.02)
+        # The overall exposure is free, and nothing is known of an image that no other shows.
+        normal = (design * weight[:, None]).T @ design + 1e-3 * weight.mean() * np.eye(m + 1)
+        found = np.linalg.solve(normal, (design * weight[:, None]).T @ right)
+    return np.stack(
+        [image * np.exp(-(found[i] + found[m] * r2))[..., None] for i, image in enumerate(color)]
+    ).astype(np.float32)
+
+
+def planar_prior(
+    i: int,
+    colors: Float[ndarray, "m h w 3"],
+    inverse_depth: Float[ndarray, "m h w"],
+    matched: Bool[ndarray, "m h w"],
+    view: Relative,
+    support: Float[ndarray, "4"],
+    recon_from_camera: Float[ndarray, "4 4"],
+    pinhole: Intrinsics,
+) -> Prior:
+    """The planes of image i's regions; `colors` are evened and a little smooth, `support` is in the recon frame."""
+    label, count = colour_regions(colors[i])
+    in_camera = recon_from_camera[:3, :3].T @ support[:3]
+    offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
+    plane = -in_camera / offset if offset else np.zeros(3)
+    planes, on_support, inliers, held, rest, middle, shape = region_planes(
+        label, count, inverse_depth[i], matched[i], plane, grid(pinhole).astype(float), ON_PLANE, i
+    )
+    pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
+    du, dv = np.moveaxis(pixel - middle[label], -1, 0)
+    xx, xy, yy = np.moveaxis(shape[label], -1, 0)
+    # Patches of shade and print on the support plane that carry no plane of their own.
+    lonely = _beside_support(label, on_support & (inliers > 0)) & (inliers == 0) & (held < FEWEST)
+    lonely &= np.bincount(label.ravel(), minlength=count) < PATCH * label.size
+    planes[lonely] = plane
+    predicted = np.einsum("hwi,hwi->hw", planes[label], rays(pinhole)).astype(np.float32)
+    away = np.sqrt(np.maximum(xx * du**2 + 2 * xy * du * dv + yy * dv**2, 0))
+    carried = (inliers > 0) & (inliers >= CARRIED * held)
+    near = on_support[label] | lonely[label] | (away < FARTHEST)
+    asked = (carried | lonely)[label] & (predicted > 0) & near
+    same, unlike, through = colours_agree(
+        i,
+        predicted,
+        asked,
+        inverse_depth,
+        matched,
+        colors,
+        view.others,
+        view.a,
+        view.b,
+        grid(pinhole),
+        SAME_COLOUR,
+    )
+    holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
+    # Where one image alone looks besides this one, it must agree, and the depth must rest on more than a colour.
+    alone = asked & (same == 1) & (unlike == 0) & (through == 0)
+    holds |= alone & on_support[label]
+    # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
+    held_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
+    holds &= ~(lonely & (held_share < WHOLE))[label]
+    off = np.abs(predicted / inverse_depth[i] - 1) > OFF_PLANE
+    strong = asked & (inliers >= STRONG * held)[label]
+    return Prior(
+        inverse_depth=predicted,
+        holds=holds,
+        confirms=holds | alone,
+        shown=same,
+        contradicts=strong & matched[i] & off,
+        std=(rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))).astype(
+            np.float32
+        ),
+    )
+
+
+def _beside_support(label: Int[ndarray, "h w"], on_support: Bool[ndarray, " r"]) -> Bool[ndarray, " r"]:
+    """Regions that touch one on the support plane."""
+    beside = np.zeros(len(on_support), bool)
+    for one, other in ((label[:, 1:], label[:, :-1]), (label[1:], label[:-1])):
+        beside[one[on_support[other]]] = True
+        beside[other[on_support[one]]] = True
+    return beside

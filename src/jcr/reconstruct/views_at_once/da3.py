@@ -1,0 +1,137 @@
+"""Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647): depth, confidence and cameras of any number of views.
+
+Its package builds the network of a configuration (`create_object(load_config(...))`, its README), which is all that is
+taken of it: reading images, exporting and the web page are left alone, and so need not be installed. Its conventions:
+cameras are camera_from_recon, x right, y down, z forward; depth is along z, not along the ray; intrinsics count from the
+image's corner; the unit is arbitrary. Where camera poses go in, they are relative to the first view and in units of the
+median distance from it.
+"""
+
+import json
+import os
+import warnings
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import nn
+
+from jcr.errors import InputError
+from jcr.geometry import inverse
+from jcr.reconstruct.preprocess import ImageGrid
+from jcr.reconstruct.views_at_once.interface import (
+    Predict,
+    Predicted,
+    Views,
+    checked,
+    edge_matrix,
+    normalised,
+    output,
+    pinhole_of_edges,
+    rays_of,
+    rigid,
+)
+
+LONG_EDGE, PATCH = 504, 14
+LEAST_UNIT = 0.1
+"""Below which the package takes the median distance between cameras for this."""
+
+
+def load(weights: Path, device: str) -> Predict:
+    """The network in a folder of config.json and model.safetensors.
+
+    Raises InputError for files that are missing, damaged or of another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        name = json.loads((weights / "config.json").read_text())["model_name"]
+        state = load_file(weights / "model.safetensors")
+        network = build(name)
+        network.load_state_dict({key.removeprefix("model."): state[key] for key in state})
+    except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+        raise InputError(f"{weights}: no weights of Depth Anything 3 ({_line(error)})") from None
+    return partial(predict, network.to(device))
+
+
+def build(name: str) -> nn.Module:
+    """The network of a configuration of the package, with random weights; KeyError for a name it does not know."""
+    os.environ.setdefault("DA3_LOG_LEVEL", "ERROR")  # it tells stdout which layers it builds
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its configuration's library
+        from depth_anything_3.cfg import create_object, load_config  # type: ignore[import-not-found]
+        from depth_anything_3.registry import MODEL_REGISTRY  # type: ignore[import-not-found]
+
+        return create_object(load_config(MODEL_REGISTRY[name])).eval()
+
+
+def predict(network: nn.Module, views: Views, long_edge: int = LONG_EDGE) -> Predicted:
+    """One pass over all views; with poses and intrinsics where the views have both."""
+    grid = grid_of(views.size, long_edge)
+    colors = np.stack([resized(image, grid, long_edge) for image in views.colors])
+    device = next(network.parameters()).device.type
+    extrinsics = intrinsics = None
+    if views.recon_from_camera is not None and views.pinhole is not None:
+        extrinsics = torch.from_numpy(_from_first(views.recon_from_camera)).float().to(device)[None]
+        matrix = torch.from_numpy(edge_matrix(grid.grid_intrinsics(views.pinhole))).float().to(device)
+        intrinsics = matrix.expand(1, len(colors), 3, 3)
+    # Half the time on a GPU, and what the package does there; on a CPU half precision is no faster.
+    half = torch.autocast("cuda", torch.bfloat16) if device == "cuda" else nullcontext()
+    with torch.inference_mode(), half:
+        answer = network(normalised(colors, device)[None], extrinsics, intrinsics)
+    count, height, width = colors.shape[:3]
+    depth = output(answer, "depth", (count, height, width), "Depth Anything 3")
+    pinholes = pinhole_of_edges(output(answer, "intrinsics", (count, 3, 3), "Depth Anything 3"))
+    camera_from_recon = rigid(output(answer, "extrinsics", (count, 3, 4), "Depth Anything 3"))
+    return checked(
+        Predicted(
+            grid,
+            depth[..., None] * rays_of(pinholes, height, width),
+            output(answer, "depth_conf", (count, height, width), "Depth Anything 3"),
+            pinholes,
+            inverse(camera_from_recon),
+            is_metric=False,
+        ),
+        "Depth Anything 3",
+    )
+
+
+def grid_of(size: tuple[int, int], long_edge: int = LONG_EDGE) -> ImageGrid:
+    """Nothing is cropped: the long edge becomes `long_edge`, then each edge the nearest multiple of the patch."""
+    width, height = (_multiple(round(edge * long_edge / max(size))) for edge in size)
+    return ImageGrid(size, (width, height), (0, 0), (width, height))
+
+
+def resized(image: UInt8[ndarray, "h w 3"], grid: ImageGrid, long_edge: int) -> UInt8[ndarray, "h2 w2 3"]:
+    """An image on the grid, in the two steps and with the filters of the package."""
+    height, width = image.shape[:2]
+    scale = long_edge / max(width, height)
+    for size in ((max(1, round(width * scale)), max(1, round(height * scale))), grid.size):
+        if size != (width, height):
+            enlarges = size[0] > width or size[1] > height
+            image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
+            width, height = size
+    return image
+
+
+def _multiple(edge: int) -> int:
+    return max(1, (edge + PATCH // 2) // PATCH) * PATCH
+
+
+def _from_first(recon_from_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 4 4"]:
+    """camera_from_first, in units of the median distance between the first camera and the others, itself included."""
+    first_from_camera = inverse(recon_from_camera[0]) @ recon_from_camera
+    distance = np.sort(np.linalg.norm(first_from_camera[:, :3, 3], axis=1))
+    camera_from_first = inverse(first_from_camera)
+    camera_from_first[:, :3, 3] /= max(distance[(len(distance) - 1) // 2], LEAST_UNIT)
+    return camera_from_first
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,82 @@
+"""MapAnything (Keetha et al. 2025, arXiv 2509.13414): points and cameras of all views in metres.
+
+Its conventions are ours: cameras x right, y down, z forward, poses recon_from_camera, pixel (0, 0) a centre. It takes
+intrinsics and camera poses.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from jcr.errors import InputError
+from jcr.geometry import apply, inverse
+from jcr.reconstruct.preprocess import image_grid, resize_and_crop
+from jcr.reconstruct.views_at_once.interface import (
+    Predict,
+    Predicted,
+    Views,
+    checked,
+    normalised,
+    output,
+    rigid,
+)
+
+LONG_EDGE, PATCH = 518, 14
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What is asked of the package's model."""
+
+    def infer(self, views: list[dict[str, Any]], **options: Any) -> list[dict[str, Tensor]]: ...
+
+
+def load(weights: Path, device: str) -> Predict:
+    """The network in a folder; InputError where it is not there."""
+    from mapanything.models import MapAnything  # type: ignore[import-not-found]
+
+    try:
+        return partial(predict, MapAnything.from_pretrained(str(weights)).to(device), device=device)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{weights}: no weights of MapAnything ({' '.join(str(error).split())})") from None
+
+
+def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
+    """One pass over all views, told the intrinsics where known, and the poses where the views have them."""
+    grid = image_grid(views.size, LONG_EDGE, PATCH, keep_square=True)
+    colors = np.stack([resize_and_crop(image, grid) for image in views.colors])
+    shown: list[dict[str, Any]] = [
+        {"img": image[None], "data_norm_type": ["dinov2"]} for image in normalised(colors, device)
+    ]
+    if views.pinhole is not None:
+        matrix = torch.from_numpy(grid.grid_intrinsics(views.pinhole).matrix).float().to(device)
+        for view in shown:
+            view["intrinsics"] = matrix[None]
+    if views.recon_from_camera is not None:
+        for view, pose in zip(shown, views.recon_from_camera, strict=True):
+            view["camera_poses"] = torch.from_numpy(pose).float().to(device)[None]
+            view["is_metric_scale"] = torch.tensor([True], device=device)
+    with torch.inference_mode():
+        # Masked points would be zeros without a say; the mask is used on the confidence instead.
+        answers = model.infer(shown, use_amp=device != "cpu", apply_mask=False)
+    count, height, width = colors.shape[:3]
+    points = np.empty((count, height, width, 3), np.float32)
+    confidence, poses, pinholes = (
+        np.empty((count, height, width)),
+        np.empty((count, 4, 4)),
+        np.empty((count, 4)),
+    )
+    for k, answer in enumerate(answers):
+        poses[k] = rigid(output(answer, "camera_poses", (1, 4, 4), "MapAnything"))[0]
+        x_in_recon = output(answer, "pts3d", (height, width, 3), "MapAnything")
+        points[k] = apply(inverse(poses[k]), x_in_recon)
+        confidence[k] = output(answer, "conf", (height, width), "MapAnything")
+        if "mask" in answer:
+            confidence[k] *= output(answer, "mask", (height, width), "MapAnything") > 0.5
+        own = output(answer, "intrinsics", (3, 3), "MapAnything")
+        pinholes[k] = own[0, 0], own[1, 1], own[0, 2], own[1, 2]
+    return checked(Predicted(grid, points, confidence, pinholes, poses, is_metric=True), "MapAnything")

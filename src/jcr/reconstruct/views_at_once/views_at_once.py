@@ -1,0 +1,429 @@
+"""The back ends of any-view models: one pass, held against the robot's motion, refined by the images' colours.
+
+What such a model believes is no measurement: it invents geometry where it sees none, and its metre on a table is often
+wrong by tens of percent. So its confidences weigh points within an image and nothing else. What flows on is camera poses
+with a joint covariance that the images' own matches give (refine.py), the robot gives the scale, and the model's metre
+is a check of it. What is kept, of the prediction, its refinement, and a second pass that is shown the poses of the
+first calibration, is what predicts images left out best.
+"""
+
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.camera import project, rays, unproject
+from jcr.errors import InputError
+from jcr.geometry import ARM, apply, inverse, rotation_angle
+from jcr.handeye.solve import solve_hand_eye
+from jcr.memory import ALLOWANCE, GB, announce, require, resident
+from jcr.progress import Progress, silent
+from jcr.reconstruct.pointmaps import fit_pinhole, reconstruction_from_pointmaps
+from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, prepare_images, resize_and_crop
+from jcr.reconstruct.views_at_once.cost import Cost
+from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
+from jcr.reconstruct.views_at_once.refine import Refined, refine
+from jcr.records import CameraEvidence, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+
+PREDICTED_STD = (0.02, np.radians(1.5))
+"""Of a predicted camera that no match confirms: of its distance from the scene, and of its rotation per axis. What Depth
+Anything 3's largest model has on 7-Scenes (27 % of pairs within an average threshold of 3°, its benchmark page)."""
+FAR_OFF = 4.0
+"""A view whose angle or matches differ from the robot's by this many times the median of the views is named."""
+FAR_OFF_DEG, FAR_OFF_PX = 2.0, 10.0
+"""And by at least this."""
+
+
+CLEARLY = 0.95
+"""Of the first pass's error that a second one must stay below: it is another draw of the same model."""
+
+
+@dataclass(frozen=True)
+class ViewsOptions:
+    """One model and where it runs."""
+
+    backend: str
+    """For the record: its row of the table of back ends."""
+    load: Callable[[Path, str], Predict]
+    """Of the folder of its weights, and the device."""
+    weights: Path
+    licence: str
+    cost: Cost
+    takes_poses: bool = False
+    device: str = "cpu"
+    memory_gb: float = 8.0
+    refined: bool = True
+    """Whether matches by colour may replace what the model says of the cameras."""
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """One account of the views, and how well images left out agree with it."""
+
+    name: str
+    predicted: Predicted
+    refined: Refined | None
+    hand_eye: HandEye
+
+    @property
+    def poses(self) -> Float[ndarray, "n 4 4"]:
+        poses = self.predicted.recon_from_camera if self.refined is None else self.refined.recon_from_camera
+        assert poses is not None
+        return poses
+
+    @property
+    def points(self) -> Float[ndarray, "n h w 3"]:
+        factor = 1 if self.refined is None else self.refined.depth_factor[..., None]
+        return self.predicted.x_in_camera * factor
+
+    @property
+    def missed_m(self) -> float:
+        """Error on images left out as one length; infinite where there are too few to leave one out."""
+        held_out = self.hand_eye.held_out
+        if held_out is None:
+            return float("inf")
+        return float(np.hypot(held_out.translation_mm / 1e3, ARM * np.radians(held_out.rotation_deg)))
+
+    def told(self) -> str:
+        held_out = self.hand_eye.held_out
+        error = "" if held_out is None else f" {held_out.translation_mm:.2g} mm, {held_out.rotation_deg:.2g}°"
+        return f"{self.name}{error}"
+
+
+def reconstruct(
+    capture: Capture, options: ViewsOptions, progress: Progress | None = None, predict: Predict | None = None
+) -> Reconstruction:
+    """Camera poses with their covariance, pointmaps and tracks; in the model's own unit.
+
+    `predict` takes the place of the weights. Raises InputError for weights that are missing or damaged, or where the
+    memory does not suffice.
+    """
+    report = progress or silent
+    _require_memory(capture, options)
+    images = prepare_images(capture, lambda size: ImageGrid(size, size, (0, 0), size))
+    predict = predict or loaded(options.load, options.weights, options.device)
+    report("reconstruct", 0.0)
+    predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
+    report("reconstruct", 0.5)
+    if predicted.recon_from_camera is None:
+        raise InputError(
+            f"--backend {options.backend} sees one view at a time and gives no cameras; choose another"
+        )
+    pinhole = images.pinhole or _own_pinhole(predicted, options.backend)
+    chosen, notes = _refined(capture, images, predicted, pinhole, options)
+    if options.takes_poses and chosen.hand_eye.converged:
+        chosen, note = _second_pass(capture, images, chosen, pinhole, predict)
+        notes = (*notes, note)
+    report("reconstruct", 1.0)
+    return _record(capture, images, chosen, options, notes)
+
+
+def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> Predict:
+    """A model that says nothing on stdout, which is for the command's result; packages print there."""
+    with redirect_stdout(sys.stderr):
+        predict = load(weights, device)
+
+    def predict_quietly(views: Views) -> Predicted:
+        with redirect_stdout(sys.stderr):
+            return predict(views)
+
+    return predict_quietly
+
+
+def _require_memory(capture: Capture, options: ViewsOptions) -> None:
+    """Say what it will take, before it is begun."""
+    width, height = capture.image_size
+    pictures = len(capture) * width * height * (3 + 4)
+    needed = (
+        resident()
+        + ALLOWANCE
+        + pictures
+        + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
+    )
+    require(int(needed), options.memory_gb * GB, f"--backend {options.backend} with {len(capture)} images")
+    announce(int(needed), options.memory_gb * GB, options.cost.told(len(capture), options.device))
+
+
+def with_known_rays(predicted: Predicted, images: PreparedImages) -> Predicted:
+    """With each point on the ray of its pixel, where the intrinsics are known: a model guesses them by a percent."""
+    if images.pinhole is None:
+        return predicted
+    known = predicted.grid.grid_intrinsics(images.pinhole)
+    points = predicted.x_in_camera[..., 2:] * rays(known).astype(np.float32)
+    pinholes = np.tile([known.fx, known.fy, known.cx, known.cy], (len(points), 1))
+    return replace(predicted, x_in_camera=points, pinholes=pinholes)
+
+
+def _own_pinhole(predicted: Predicted, backend: str) -> Intrinsics:
+    """One pinhole of the undistorted images, of all views together, as the model sees them."""
+    assert predicted.recon_from_camera is not None
+    at_origin = np.tile(np.eye(4), (len(predicted.confidence), 1, 1))
+    found, misfit_px = fit_pinhole(at_origin, predicted.x_in_camera, predicted.confidence)
+    if not np.isfinite(misfit_px):
+        raise InputError(f"--backend {backend}: its points lie on no pinhole's rays; give the intrinsics")
+    return predicted.grid.original_intrinsics(found)
+
+
+def _refined(
+    capture: Capture, images: PreparedImages, predicted: Predicted, pinhole: Intrinsics, options: ViewsOptions
+) -> tuple[_Candidate, tuple[str, ...]]:
+    """The prediction or its refinement, whichever predicts images left out better, and what there is to say."""
+    gripper = capture.base_from_gripper
+    as_predicted = _candidate("as predicted", gripper, predicted, None)
+    refined = refine(predicted, images, pinhole) if options.refined else None
+    if refined is None:
+        note = "too few matches by colour: the cameras are as the model has them"
+        return as_predicted, (
+            (note, *_contradicted(capture, as_predicted, pinhole)) if options.refined else ()
+        )
+    adjusted = _candidate("refined", gripper, predicted, refined)
+    kept, left = (
+        (adjusted, as_predicted) if adjusted.missed_m < as_predicted.missed_m else (as_predicted, adjusted)
+    )
+    note = (
+        f"leave-one-out error of the cameras {kept.told()} ({left.told()}): the former were kept; "
+        f"{len(refined.tracks.image)} matches by colour, {refined.error_px:.2f} px"
+    )
+    return kept, (note, *_contradicted(capture, kept, pinhole))
+
+
+def _candidate(
+    name: str, gripper: Float[ndarray, "n 4 4"], predicted: Predicted, refined: Refined | None
+) -> _Candidate:
+    """With the hand-eye transform of its camera poses."""
+    poses = predicted.recon_from_camera if refined is None else refined.recon_from_camera
+    assert poses is not None
+    covariance = None if refined is None else refined.evidence.covariance
+    return _Candidate(name, predicted, refined, solve_hand_eye(gripper, poses, camera_covariance=covariance))
+
+
+def _contradicted(capture: Capture, candidate: _Candidate, pinhole: Intrinsics) -> tuple[str, ...]:
+    """Views whose rotation, or whose matches by epipolar geometry through the hand-eye transform, the robot denies."""
+    camera, gripper = candidate.poses, capture.base_from_gripper
+    apart = _angle_differences_deg(camera, gripper)
+    named = {}
+    for k in np.flatnonzero(apart > max(FAR_OFF_DEG, FAR_OFF * float(np.median(apart)))):
+        named[k] = f"its angles to the other views differ from the robot's by {apart[k]:.1f}°"
+    refined = candidate.refined
+    if refined is not None and candidate.hand_eye.observability.observable:
+        base_from_camera = gripper @ candidate.hand_eye.gripper_from_camera
+        distance = epipolar_px(base_from_camera, refined.tracks, capture, pinhole, candidate.hand_eye.inliers)
+        for k in np.flatnonzero(distance > max(FAR_OFF_PX, FAR_OFF * float(np.median(distance)))):
+            named.setdefault(k, f"its matches lie {distance[k]:.0f} px from the robot's epipolar lines")
+    return tuple(f"{capture.images[k]}: {why} (median); check its pose" for k, why in sorted(named.items()))
+
+
+def _angle_differences_deg(
+    camera: Float[ndarray, "n 4 4"], gripper: Float[ndarray, "n 4 4"]
+) -> Float[ndarray, " n"]:
+    """Per view the median, over the others, of how far camera and gripper disagree on the angle between two views.
+
+    It is the same for both, wherever the camera is mounted.
+    """
+    angles = [
+        np.degrees(rotation_angle((inverse(poses)[:, None] @ poses[None])[..., :3, :3]))
+        for poses in (camera, gripper)
+    ]
+    difference = np.abs(angles[0] - angles[1])
+    np.fill_diagonal(difference, np.nan)
+    return np.nanmedian(difference, axis=1)
+
+
+def epipolar_px(
+    base_from_camera: Float[ndarray, "n 4 4"],
+    tracks: Tracks,
+    capture: Capture,
+    pinhole: Intrinsics,
+    trusted: Bool[ndarray, " n"],
+) -> Float[ndarray, " n"]:
+    """Per view the median distance, in pixels, of matches with trusted views from the epipolar lines of their keypoints.
+
+    Lines are drawn by cameras that the robot and a hand-eye transform give, without distortion. Zero where a view has
+    no match.
+    """
+    lens = capture.intrinsics or pinhole
+    direction = unproject(lens, tracks.x_px)
+    first = np.full(len(tracks.points_in_recon), -1)
+    first[tracks.point[::-1]] = np.arange(len(tracks.point))[::-1]
+    start = first[tracks.point]
+    others = np.flatnonzero(start != np.arange(len(start)))
+    start = start[others]
+    between = inverse(base_from_camera[tracks.image[others]]) @ base_from_camera[tracks.image[start]]
+    normal = np.cross(between[:, :3, 3], np.einsum("kij,kj->ki", between[:, :3, :3], direction[start]))
+    line = normal / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
+    distance = pinhole.fx * np.abs((line * direction[others]).sum(1))
+    views = tracks.image[start], tracks.image[others]
+    medians = []
+    for k in range(len(base_from_camera)):
+        mine = ((views[0] == k) & trusted[views[1]]) | ((views[1] == k) & trusted[views[0]])
+        medians.append(float(np.median(distance[mine])) if mine.any() else 0.0)
+    return np.array(medians)
+
+
+def _second_pass(
+    capture: Capture, images: PreparedImages, first: _Candidate, pinhole: Intrinsics, predict: Predict
+) -> tuple[_Candidate, str]:
+    """The model once more, shown where the robot and the first pass's hand-eye transform put the cameras.
+
+    Its pointmaps are kept where they predict views left out better; of the cameras it says what it was shown, so that
+    those of the first pass stay, for the robot's poses must not count twice.
+    """
+    base_from_camera = capture.base_from_gripper @ first.hand_eye.gripper_from_camera
+    again = with_known_rays(
+        predict(Views(images.colors, images.pinhole or pinhole, base_from_camera)), images
+    )
+    if first.refined is None or again.recon_from_camera is None:
+        return first, "a second pass was not judged: too few matches by colour"
+    tracks = first.refined.tracks
+    aligned = _in_unit_of(first, again)
+    before, after = (
+        transfer_px(capture, first.poses, points, first.predicted, tracks, images, pinhole, first.hand_eye)
+        for points in (first.points, aligned)
+    )
+    words = (
+        f"second pass, shown the robot's cameras: matches in views left out are predicted to {after:.2f} px, before "
+        f"{before:.2f} px"
+    )
+    if not after < CLEARLY * before:
+        return first, f"{words}: not kept"
+    factor = np.ones(again.confidence.shape, np.float32)
+    second = replace(again, x_in_camera=aligned.astype(np.float32), recon_from_camera=first.poses)
+    return replace(
+        first, predicted=second, refined=replace(first.refined, depth_factor=factor)
+    ), f"{words}: kept"
+
+
+def _in_unit_of(first: _Candidate, again: Predicted) -> Float[ndarray, "n h w 3"]:
+    """The points of a second pass, each view by the factor that fits it to the first's: its unit is its own."""
+    both = (first.predicted.confidence > 0) & (again.confidence > 0)
+    factors = [
+        float(np.median(one[mask] / other[mask])) if mask.any() else 1.0
+        for one, other, mask in zip(first.points[..., 2], again.x_in_camera[..., 2], both, strict=True)
+    ]
+    return again.x_in_camera * np.array(factors)[:, None, None, None]
+
+
+def transfer_px(
+    capture: Capture,
+    recon_from_camera: Float[ndarray, "n 4 4"],
+    x_in_camera: Float[ndarray, "n h w 3"],
+    predicted: Predicted,
+    tracks: Tracks,
+    images: PreparedImages,
+    pinhole: Intrinsics,
+    hand_eye: HandEye,
+) -> float:
+    """How far pointmaps put keypoints from where views left out show them: the median, in pixels.
+
+    A view left out has the camera that the robot's motion from the keypoint's view gives, with the hand-eye transform;
+    neither its depth nor its predicted camera has a say.
+    """
+    grid, lens = predicted.grid, capture.intrinsics or pinhole
+    first = np.full(len(tracks.points_in_recon), -1)
+    first[tracks.point[::-1]] = np.arange(len(tracks.point))[::-1]
+    start = first[tracks.point]
+    others = np.flatnonzero(start != np.arange(len(start)))
+    start = start[others]
+    undistorted = project(images.pinhole or pinhole, unproject(lens, tracks.x_px[start]))
+    column, row = np.rint(grid.grid_from_original(undistorted)).astype(int).T
+    column, row = np.clip(column, 0, grid.size[0] - 1), np.clip(row, 0, grid.size[1] - 1)
+    view = tracks.image[start]
+    z = hand_eye.scale * x_in_camera[view, row, column, 2]
+    base_from_camera = capture.base_from_gripper @ hand_eye.gripper_from_camera
+    between = inverse(base_from_camera[tracks.image[others]]) @ base_from_camera[view]
+    x = z[:, None] * unproject(lens, tracks.x_px[start])
+    there = np.einsum("kij,kj->ki", between[:, :3, :3], x) + between[:, :3, 3]
+    good = (z > 0) & (there[:, 2] > 0)
+    if not good.any():
+        return float("inf")
+    off = project(lens, there[good]) - tracks.x_px[others][good]
+    return float(np.median(np.linalg.norm(off, axis=1)))
+
+
+def _record(
+    capture: Capture,
+    images: PreparedImages,
+    chosen: _Candidate,
+    options: ViewsOptions,
+    notes: tuple[str, ...],
+) -> Reconstruction:
+    """As a reconstruction, with the evidence of the images alone."""
+    predicted, refined = chosen.predicted, chosen.refined
+    grid = predicted.grid
+    pinhole = images.pinhole
+    points = chosen.points
+    if pinhole is None and refined is not None:
+        pinhole = refined.pinhole
+        points = points[..., 2:] * rays(grid.grid_intrinsics(pinhole)).astype(np.float32)
+    shown = PreparedImages(
+        np.stack([resize_and_crop(image, grid) for image in images.colors]),
+        grid,
+        images.lens,
+        pinhole,
+        images.notes,
+    )
+    poses = chosen.poses
+    in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)]).astype(
+        np.float32
+    )
+    there = predicted.confidence > 0
+    x_in_recon = np.where(there[..., None], in_recon, 0)
+    notes = (f"weights {options.weights.name}: {options.licence}", *notes)
+    if refined is None:
+        made = reconstruction_from_pointmaps(
+            shown,
+            np.arange(len(capture)),
+            poses,
+            x_in_recon,
+            predicted.confidence,
+            source=options.backend,
+            backend=options.backend,
+            is_metric=predicted.is_metric,
+            notes=notes,
+        )
+        return replace(made, evidence=predicted_evidence(predicted))
+    return Reconstruction(
+        image_index=np.arange(len(capture)),
+        recon_from_camera=poses,
+        intrinsics=images.lens or refined.pinhole,
+        pointmap_intrinsics=grid.grid_intrinsics(pinhole or refined.pinhole),
+        points_in_recon=x_in_recon,
+        confidence=predicted.confidence,
+        colors=shown.colors,
+        tracks=refined.tracks,
+        backend=options.backend,
+        is_metric=predicted.is_metric,
+        notes=(*images.notes, *notes),
+        evidence=refined.evidence,
+    )
+
+
+def predicted_evidence(predicted: Predicted) -> CameraEvidence:
+    """Predicted cameras with the error that such models are known for, each its own, the first one's in all others.
+
+    Steps are relative to the first camera: its own error turns all others about it.
+    """
+    poses = predicted.recon_from_camera
+    assert poses is not None
+    there = predicted.confidence > 0
+    distance = float(np.median(predicted.x_in_camera[..., 2][there]))
+    single = np.repeat([(PREDICTED_STD[0] * distance) ** 2, PREDICTED_STD[1] ** 2], 3)
+    count = len(poses)
+    covariance = np.zeros((count, 6, count, 6))
+    by_first = np.tile(np.eye(6), (count, 1, 1))
+    arm = poses[:, :3, 3] - poses[0, :3, 3]
+    for axis in range(3):
+        turn = np.zeros(3)
+        turn[axis] = 1
+        by_first[:, :3, 3 + axis] = np.cross(turn, arm)
+    for n in range(count):
+        for m in range(count):
+            covariance[n, :, m] = by_first[n] @ np.diag(single) @ by_first[m].T
+        covariance[n, :, n] += np.diag(single)
+    covariance[0], covariance[:, :, 0] = 0, 0
+    return CameraEvidence(poses, covariance.reshape(6 * count, 6 * count))

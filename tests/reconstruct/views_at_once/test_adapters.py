@@ -1,0 +1,371 @@
+"""Each adapter against a network that answers with the truth in its package's own convention.
+
+The pictures' colours say where in the original image a pixel lies, so that the networks know what was done to them,
+and nothing is taken from the adapter: a resize, a crop, a half pixel or a camera the wrong way round shows.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from jcr.geometry import inverse, rotation_angle, transform
+from jcr.records import Intrinsics
+
+pytestmark = pytest.mark.slow  # torch
+COUNT = 3
+UNIT = 0.37
+"""Metres that a network without a metric scale calls one."""
+
+
+class Scene:
+    """Views of the plane z = 0 in the recon frame, in pictures that say where their pixels lie."""
+
+    def __init__(self, width: int, height: int) -> None:
+        middle = (width - 1) / 2, (height - 1) / 2
+        self.pinhole = Intrinsics(0.9 * width, 0.9 * width, *middle, width, height)
+        eyes = np.array([[0.2, 0.1, -0.7], [-0.2, 0.2, -0.6], [0.0, -0.3, -0.8]])
+        turns = Rotation.from_euler("xyz", [[8, 15, 20], [-14, -16, -40], [20, 2, 70]], degrees=True)
+        self.recon_from_camera = transform(turns.as_matrix(), eyes)
+        v, u = np.mgrid[:height, :width]
+        ramp = np.stack([(u + 0.5) / width, (v + 0.5) / height, np.zeros((height, width))], -1)
+        # Dithered: eight bits alone are steps of four pixels.
+        noise = np.random.default_rng(0).uniform(0, 1, (COUNT, height, width, 3))
+        self.colors = np.clip(np.floor(255 * ramp + noise), 0, 255).astype(np.uint8)
+
+    def seen(self, images: ndarray) -> tuple[ndarray, ndarray]:
+        """K of pictures (n,h,w,3) in [0, 1] from their colours, pixel (0, 0) a centre, and depth along z (n,h,w)."""
+        count, height, width = images.shape[:3]
+        lens = self.pinhole
+        matrices = np.tile(np.eye(3), (count, 1, 1))
+        inner = slice(2, -2)
+        for k, image in enumerate(images):
+            v, u = np.mgrid[:height, :width]
+            for axis, (pixel, size, focal, centre) in enumerate(
+                ((u, lens.width, lens.fx, lens.cx), (v, lens.height, lens.fy, lens.cy))
+            ):
+                there = image[inner, inner, axis] * size - 0.5
+                slope, start = np.polyfit(pixel[inner, inner].ravel(), there.ravel(), 1)
+                matrices[k, axis, axis], matrices[k, axis, 2] = focal / slope, (centre - start) / slope
+        return matrices, self.depths(matrices, height, width)
+
+    def depths(self, matrices: ndarray, height: int, width: int) -> ndarray:
+        v, u = np.mgrid[:height, :width]
+        pixels = np.stack([u, v, np.ones_like(u)], -1)
+        rays = np.einsum("nij,hwj->nhwi", np.linalg.inv(matrices), pixels)
+        pose = self.recon_from_camera
+        return -pose[:, 2, 3, None, None] / np.einsum("nj,nhwj->nhw", pose[:, 2, :3], rays)
+
+
+def points_of(matrices: ndarray, depth: ndarray) -> ndarray:
+    v, u = np.mgrid[: depth.shape[1], : depth.shape[2]]
+    rays = np.einsum("nij,hwj->nhwi", np.linalg.inv(matrices), np.stack([u, v, np.ones_like(u)], -1))
+    return rays * depth[..., None]
+
+
+def edges(matrices: ndarray) -> ndarray:
+    return matrices + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+
+
+def unnormalised(images: Any) -> ndarray:
+    from jcr.reconstruct.views_at_once.interface import IMAGENET_MEAN, IMAGENET_STD
+
+    return images.double().numpy().transpose(0, 2, 3, 1) * IMAGENET_STD + IMAGENET_MEAN
+
+
+def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], Any]]:
+    """By adapter, the prediction of a network that knows the truth; `told` collects what it was shown beside images."""
+    import torch
+    from torch import nn
+
+    from jcr.reconstruct.views_at_once import da3, mapanything, moge, pi3x, vggt
+
+    def tensor(values: ndarray) -> Any:
+        return torch.tensor(np.asarray(values, np.float32))
+
+    class Network(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.anchor = nn.Parameter(torch.zeros(1))
+
+    class Da3(Network):
+        def forward(self, images: Any, extrinsics: Any, intrinsics: Any) -> Any:
+            told.update(extrinsics=extrinsics, intrinsics=intrinsics)
+            matrices, depth = scene.seen(unnormalised(images[0]))
+            told["matrices"] = matrices
+            poses = inverse(scene.recon_from_camera)
+            poses[:, :3, 3] /= UNIT
+            return {
+                "depth": tensor(depth / UNIT)[None],
+                "depth_conf": torch.ones(1, *depth.shape),
+                "extrinsics": tensor(poses[:, :3])[None],
+                "intrinsics": tensor(edges(matrices))[None],
+            }
+
+    class Vggt(Network):
+        def forward(self, images: Any) -> Any:
+            matrices, depth = scene.seen(images.double().numpy().transpose(0, 2, 3, 1))
+            poses = inverse(scene.recon_from_camera)
+            height, width = depth.shape[1:]
+            encoded = np.concatenate(
+                [
+                    poses[:, :3, 3] / UNIT,
+                    Rotation.from_matrix(poses[:, :3, :3]).as_quat(),
+                    2 * np.arctan(height / 2 / matrices[:, 1, 1])[:, None],
+                    2 * np.arctan(width / 2 / matrices[:, 0, 0])[:, None],
+                ],
+                axis=1,
+            )
+            return {
+                "pose_enc": tensor(encoded)[None],
+                "depth": tensor(depth / UNIT)[None, ..., None],
+                "depth_conf": torch.ones(1, *depth.shape),
+            }
+
+    class Pi3x(Network):
+        def forward(self, images: Any, **known: Any) -> Any:
+            told.update(known)
+            matrices, depth = scene.seen(images[0].double().numpy().transpose(0, 2, 3, 1))
+            told["matrices"] = matrices
+            logits = torch.full((1, *depth.shape, 1), 2.0)
+            logits[0, 0, 0, 0] = -5.0
+            return {
+                "local_points": tensor(points_of(matrices, depth))[None],
+                "conf": logits,
+                "camera_poses": tensor(scene.recon_from_camera)[None],
+            }
+
+    class MapAnything:
+        def infer(self, views: list[dict[str, Any]], **options: Any) -> list[dict[str, Any]]:
+            images = np.concatenate([unnormalised(view["img"]) for view in views])
+            matrices, depth = scene.seen(images)
+            told.update(matrices=matrices, views=views)
+            points = points_of(matrices, depth)
+            mask = torch.ones(1, *depth.shape[1:], 1)
+            mask[0, 0, 0] = 0
+            return [
+                {
+                    "pts3d": tensor(mine @ pose[:3, :3].T + pose[:3, 3])[None],
+                    "camera_poses": tensor(pose)[None],
+                    "conf": torch.ones(1, *depth.shape[1:]),
+                    "mask": mask,
+                    "intrinsics": tensor(matrix)[None],
+                }
+                for mine, pose, matrix in zip(points, scene.recon_from_camera, matrices, strict=True)
+            ]
+
+    class MoGe(Network):
+        calls = 0
+
+        def infer(self, image: Any, fov_x: float | None, **options: Any) -> Any:
+            told["fov_x"] = fov_x
+            one = image[None].double().numpy().transpose(0, 2, 3, 1)
+            matrices, depth = scene.seen(np.repeat(one, COUNT, 0))
+            k, self.calls = self.calls, self.calls + 1
+            height, width = depth.shape[1:]
+            return {
+                "points": tensor(points_of(matrices, depth)[k]),
+                "mask": torch.ones(height, width, dtype=torch.bool),
+                "intrinsics": tensor(edges(matrices)[k] / [[width], [height], [1]]),
+            }
+
+    return {
+        "da3": lambda views: da3.predict(Da3(), views),
+        "vggt": lambda views: vggt.predict(Vggt(), views),
+        "pi3x": lambda views: pi3x.predict(Pi3x(), views),
+        "mapanything": lambda views: mapanything.predict(MapAnything(), views),
+        "moge": lambda views: moge.predict(MoGe(), views),
+    }
+
+
+@pytest.mark.parametrize("size", [(640, 480), (480, 640), (1000, 700)], ids=str)
+@pytest.mark.parametrize("name", ["da3", "vggt", "pi3x", "mapanything", "moge"])
+def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, int]) -> None:
+    from jcr.reconstruct.views_at_once.interface import Views, rays_of
+
+    scene = Scene(*size)
+    found = networks(scene, {})[name](Views(scene.colors, None))
+    grid = found.grid
+    assert all(edge % 14 == 0 for edge in grid.size) or name == "moge"
+    unit = 1.0 if found.is_metric else UNIT
+    assert found.is_metric == (name in ("pi3x", "mapanything", "moge"))
+
+    # The grid is where the adapter says, so that the true lens on it gives the true rays and depth.
+    known = grid.grid_intrinsics(scene.pinhole)
+    expected = np.tile([known.fx, known.fy, known.cx, known.cy], (COUNT, 1))
+    np.testing.assert_allclose(found.pinholes, expected, rtol=2e-3, atol=0.06)
+    rays = rays_of(expected, grid.size[1], grid.size[0]).astype(np.float64)
+    depth = scene.depths(np.tile(known.matrix, (COUNT, 1, 1)), grid.size[1], grid.size[0])
+    off = np.linalg.norm(unit * found.x_in_camera - rays * depth[..., None], axis=-1) / depth
+    there = found.confidence > 0
+    assert np.median(off[there]) < 5e-4 and there.mean() > 0.99
+    assert (found.confidence[0, 0, 0] == 0) == (name in ("pi3x", "mapanything"))
+
+    if name == "moge":
+        assert found.recon_from_camera is None
+        return
+    turned = found.recon_from_camera[:, :3, :3] @ np.swapaxes(scene.recon_from_camera[:, :3, :3], 1, 2)
+    assert np.degrees(rotation_angle(turned)).max() < 1e-3
+    np.testing.assert_allclose(
+        unit * found.recon_from_camera[:, :3, 3], scene.recon_from_camera[:, :3, 3], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["da3", "pi3x", "mapanything", "moge"])
+def test_what_is_known_is_told_in_the_packages_conventions(name: str) -> None:
+    from jcr.reconstruct.views_at_once.interface import Views
+
+    scene, told = Scene(640, 480), {}
+    networks(scene, told)[name](Views(scene.colors, scene.pinhole, scene.recon_from_camera))
+    if name == "moge":
+        assert told["fov_x"] == pytest.approx(np.degrees(2 * np.arctan(0.5 / 0.9)))
+        return
+    matrices = told["matrices"]
+    if name == "mapanything":
+        given = np.concatenate([view["intrinsics"].numpy() for view in told["views"]])
+        np.testing.assert_allclose(given, matrices, rtol=2e-3, atol=0.06)
+        for view, pose in zip(told["views"], scene.recon_from_camera, strict=True):
+            np.testing.assert_allclose(view["camera_poses"][0], pose, atol=1e-6)
+        return
+    np.testing.assert_allclose(told["intrinsics"][0], edges(matrices), rtol=2e-3, atol=0.06)
+    if name == "pi3x":
+        np.testing.assert_allclose(told["poses"][0], scene.recon_from_camera, atol=1e-6)
+        return
+    # Depth Anything 3: from the first camera, in units of the median distance from it.
+    given = inverse(told["extrinsics"][0].double().numpy())
+    np.testing.assert_allclose(given[0], np.eye(4), atol=1e-6)
+    assert np.median(np.linalg.norm(given[:, :3, 3], axis=1)) == pytest.approx(1, abs=1e-5)
+    between = inverse(scene.recon_from_camera[0]) @ scene.recon_from_camera
+    ratio = np.linalg.norm(between[1:, :3, 3], axis=1) / np.linalg.norm(given[1:, :3, 3], axis=1)
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-5)
+    np.testing.assert_allclose(given[:, :3, :3], between[:, :3, :3], atol=1e-6)
+
+
+def test_a_network_of_another_release_is_named() -> None:
+    from torch import nn
+
+    from jcr.errors import InputError
+    from jcr.reconstruct.views_at_once import da3
+    from jcr.reconstruct.views_at_once.interface import Views
+
+    class Other(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.anchor = nn.Linear(1, 1)
+
+        def forward(self, *arguments: Any) -> Any:
+            return {}
+
+    scene = Scene(640, 480)
+    with pytest.raises(InputError, match="gave no depth of shape"):
+        da3.predict(Other(), Views(scene.colors, None))
+
+
+def packaged(images: ndarray) -> Any:
+    """Images as the package of Depth Anything 3 prepares them; skips where its parts cannot be imported."""
+    try:
+        from depth_anything_3.utils.io.input_processor import InputProcessor  # type: ignore[import-not-found]
+    except (ImportError, RuntimeError) as error:
+        pytest.skip(f"the package's own reading of images cannot be imported: {error}")
+    return InputProcessor()(list(images), num_workers=1)[0]
+
+
+def test_depth_anything_3_agrees_with_its_package() -> None:
+    """Its network with random weights, its preparation of images, its post-processing: ours gives the same."""
+    pytest.importorskip("depth_anything_3")
+    import torch
+
+    from jcr.reconstruct.views_at_once import da3
+    from jcr.reconstruct.views_at_once.interface import Views, normalised, pinhole_of_edges
+
+    images = np.random.default_rng(0).integers(0, 256, (2, 300, 410, 3), np.uint8)
+    torch.manual_seed(0)
+    network = da3.build("da3-small")
+    grid = da3.grid_of((410, 300))
+    theirs = packaged(images)
+    ours = normalised(np.stack([da3.resized(image, grid, da3.LONG_EDGE) for image in images]), "cpu")
+    assert ours.shape == theirs.shape and torch.allclose(ours, theirs, atol=1e-5)
+
+    from depth_anything_3.utils.io.output_processor import OutputProcessor  # type: ignore[import-not-found]
+
+    with torch.inference_mode():
+        answer = OutputProcessor()(network(theirs[None]))
+    found = da3.predict(network, Views(images, None))
+    there = found.confidence > 0
+    assert there.mean() > 0.99
+    np.testing.assert_allclose(found.x_in_camera[..., 2][there], answer.depth[there], rtol=1e-5)
+    np.testing.assert_allclose(found.confidence[there], answer.conf[there], rtol=1e-5)
+    np.testing.assert_allclose(found.pinholes, pinhole_of_edges(answer.intrinsics), rtol=1e-5)
+    assert found.recon_from_camera is not None
+    np.testing.assert_allclose(inverse(found.recon_from_camera)[:, :3], answer.extrinsics, atol=1e-5)
+    # Poses that go in change what comes out.
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.3
+    shown = da3.predict(network, Views(images, Intrinsics(400.0, 400.0, 204.5, 149.5, 410, 300), poses))
+    assert np.abs(shown.x_in_camera - found.x_in_camera).max() > 1e-4
+
+
+def test_vggts_cameras_are_those_of_its_formula() -> None:
+    """Depth Anything 3's package decodes the same nine numbers, but for recon_from_camera."""
+    decoder = pytest.importorskip("depth_anything_3.model.utils.transform")
+    import torch
+
+    from jcr.reconstruct.views_at_once.interface import pinhole_of_edges
+    from jcr.reconstruct.views_at_once.vggt import cameras
+
+    rng = np.random.default_rng(0)
+    quaternion = rng.normal(size=(5, 4))
+    encoding = np.concatenate(
+        [
+            rng.normal(size=(5, 3)),
+            quaternion / np.linalg.norm(quaternion, axis=1)[:, None],
+            rng.uniform(0.5, 1.2, (5, 2)),
+        ],
+        1,
+    )
+    pose, intrinsics = decoder.pose_encoding_to_extri_intri(torch.tensor(encoding)[None].float(), (392, 518))
+    recon_from_camera, pinholes = cameras(encoding, 392, 518)
+    np.testing.assert_allclose(inverse(recon_from_camera)[:, :3], pose[0, :, :3], atol=1e-5)
+    np.testing.assert_allclose(pinholes, pinhole_of_edges(intrinsics[0].numpy()), rtol=1e-5)
+
+
+def test_moge_agrees_with_its_package() -> None:
+    pytest.importorskip("moge")
+    import torch
+    from moge.model.v2 import MoGeModel  # type: ignore[import-not-found]
+
+    from jcr.reconstruct.views_at_once import moge
+    from jcr.reconstruct.views_at_once.interface import Views
+
+    torch.manual_seed(0)
+    widths = [384, 64, 32, 16, 8]
+    stack = {"res_block_in_norm": "none", "res_block_hidden_norm": "none",
+             "resamplers": ["conv_transpose", "conv_transpose", "conv_transpose", "bilinear"]}  # fmt: skip
+    head = {"dim_in": widths, "dim_res_blocks": widths, "num_res_blocks": [0, 1, 1, 1, 0], **stack}
+    network = MoGeModel(
+        encoder={"backbone": "dinov2_vits14", "intermediate_layers": [5, 11], "dim_out": 384},
+        neck={"dim_in": [386, 2, 2, 2, 2], "dim_out": None, "dim_res_blocks": widths,
+              "num_res_blocks": [0, 1, 1, 1, 0], **stack},
+        points_head={**head, "dim_out": [None, None, None, None, 3]},
+        mask_head={**head, "dim_out": [None, None, None, None, 1]},
+        scale_head={"dims": [384, 384, 1]},
+        remap_output="exp",
+        num_tokens_range=[300, 600],
+    ).eval()  # fmt: skip
+    with torch.no_grad():  # a random mask is empty as soon as not
+        [bias for name, bias in network.mask_head.named_parameters() if name.endswith("bias")][-1].fill_(3.0)
+    images = np.random.default_rng(0).integers(0, 256, (2, 96, 128, 3), np.uint8)
+    lens = Intrinsics(110.0, 110.0, 63.5, 47.5, 128, 96)
+    found = moge.predict(network, Views(images, lens))
+    fov_deg = float(np.degrees(2 * np.arctan(64 / 110)))
+    for k, image in enumerate(images):
+        shown = torch.from_numpy(image).permute(2, 0, 1) / 255
+        answer = network.infer(shown, fov_x=fov_deg, apply_mask=False, use_fp16=False)
+        there = found.confidence[k] > 0
+        assert there.any() and not (there & ~answer["mask"].numpy()).any()
+        np.testing.assert_allclose(found.x_in_camera[k][there], answer["points"].numpy()[there], rtol=1e-5)
+        assert found.pinholes[k][0] == pytest.approx(110, rel=1e-4)
+        np.testing.assert_allclose(found.pinholes[k][2:], [63.5, 47.5], atol=1e-3)
