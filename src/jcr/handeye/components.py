@@ -194,14 +194,19 @@ def lower(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> F
     """L⁻¹ of a lower triangular factor L, times a matrix."""
     if root.ndim == 2 and right.ndim == 2:
         return solve_triangular(root, right, lower=True, check_finite=False)
-    return np.linalg.solve(root, right)
+    return np.linalg.solve(root, _for_each(root, right))
 
 
 def upper(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:
     """L⁻ᵀ of a lower triangular factor L, times a matrix."""
     if root.ndim == 2 and right.ndim == 2:
         return solve_triangular(root, right, lower=True, trans=1, check_finite=False)
-    return np.linalg.solve(np.swapaxes(root, -1, -2), right)
+    return np.linalg.solve(np.swapaxes(root, -1, -2), _for_each(root, right))
+
+
+def _for_each(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:
+    """The right side as often as there are factors: NumPy 1 takes a matrix beside a stack for a stack of vectors."""
+    return np.broadcast_to(right, (*root.shape[:-2], *right.shape[-2:]))
 
 
 def over(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Float[ndarray, "*k n r"]:

@@ -25,7 +25,7 @@ from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals
 from jcr.handeye.systematic import Region, smooth_errors
 from jcr.records import Budget
 
-LEAST_FREEDOM, MOST_FREEDOM = 0.1, 1e6
+MOST_FREEDOM = 1e6
 SHOWN = 1.1
 """Times the noise that was given: so much more is the residuals' doing."""
 LARGEST_TURN = 0.5
@@ -129,7 +129,9 @@ def fit_poses(
     # Of log σ²; a given part of it is known.
     estimated = np.exp(2 * log_sizes[:2]) / np.square((sigma_t, sigma_r))
     uncertain = 4 * estimated**2 * np.diag(np.linalg.inv(information))[:2]
-    freedom = np.clip(2 / uncertain, LEAST_FREEDOM, MOST_FREEDOM)
+    # How large the errors are together is told by all residuals, even where they leave open how much of it is random.
+    together = max(3 * int(used.sum()) - 6.5, 1.0)
+    freedom = np.clip(2 / uncertain, together, MOST_FREEDOM)
     residual = residuals(*unknowns, base_from_gripper, recon_from_camera)[0]
     return PoseFit(
         *unknowns,
