@@ -11,6 +11,7 @@ env: .venv/ready
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	touch $@
+	@echo "prepared. To have the jcr command in this shell:  . .venv/bin/activate"
 
 demo: .venv/ready
 	$(BIN)/python examples/demo.py $(BACKEND)

@@ -16,7 +16,7 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.extras import DISTRIBUTION
+from jcr.extras import DISTRIBUTION, is_installed
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,13 @@ BENCHES = {
     "run": Bench("the whole job on the bundled capture: error, time and memory", True),
     "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
     "real": Bench("real captures in DIR, against the references stored beside them", True, of_captures=True),
+    "matching": Bench(
+        "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
+        True,
+        of_captures=True,
+    ),
+    "gate": Bench("scenes that mislead matching, with the robot's gate and without", True),
+    "many": Bench("from 8 to 200 images: seconds and peak memory", True),
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
     ),
@@ -43,6 +50,7 @@ BENCHES = {
         "arms with systematic errors: is the answer within its sigma, and nearer than others'", draws=True
     ),
     "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
+    "attack": Bench("captures with one silent fault: named, refused, or wrong; and false alarms"),
     "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
     "density": Bench(
         "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
@@ -68,6 +76,8 @@ BENCHES = {
     "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
     "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
     "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
+    "samples": Bench("metric samples of a marker beside OpenCV's five methods"),
+    "first_day": Bench("what a new user types and sees, from files as robots write them to a URDF", True),
     "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
 }
 """In the order of the README's claims."""
@@ -185,7 +195,8 @@ def heading(arguments: Arguments) -> str:
 def machine() -> str:
     """Processor, cores and versions in a sentence."""
     names = (DISTRIBUTION, "numpy", "scipy", "torch", "pycolmap")
-    versions = ", ".join(f"{name} {version(name)}" for name in names)
+    there = [name for name in names if name == DISTRIBUTION or is_installed(name)]
+    versions = ", ".join(f"{name} {version(name)}" for name in there)
     return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}."
 
 

@@ -92,7 +92,9 @@ def shown_by(folder: Path, found: Reconstruction) -> Shown:
     depth, label = [], []
     for k in found.image_index.tolist():
         at_pixel = true_depth(truth, k)[nearest[..., 1], nearest[..., 0]]
-        between = cv2.remap(true_depth(truth, k).astype(np.float32), place, None, cv2.INTER_LINEAR)
+        between = cv2.remap(
+            true_depth(truth, k).astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR
+        )
         depth.append(np.where(np.abs(between - at_pixel) < SEES, between, at_pixel))
         label.append(true_labels(truth, k)[nearest[..., 1], nearest[..., 0]])
     base_from_camera = truth.base_from_camera[found.image_index]

@@ -115,7 +115,7 @@ def measure_intrinsics(
                     given = _drawn(rng)
                     if len(tracks.image) < 100 * count:
                         continue
-                    held.append((problem, _adjusted(problem, tracks, given, HELD)))
+                    held.append((problem, _adjusted(problem, tracks, given, prior_of(given, HELD))))
                     measured.append((problem, _adjusted(problem, tracks, given, prior_of(given))))
             cell = tuple(arms), preset, count
             rows += [

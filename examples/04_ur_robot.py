@@ -15,10 +15,12 @@ from pathlib import Path
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live.camera import Frame, opened
+from jcr.live.arm_words import ArmWords
+from jcr.live.camera import Camera, Frame, Recorded, opened
 from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
-from jcr.live.ur import ur_poses
+from jcr.live.rest import asks_at_rest
+from jcr.live.ur import states
 from jcr.simulate.ur import SimulatedUr
 
 
@@ -32,19 +34,22 @@ def simulated_camera(table, arm):
 with ExitStack() as until_done:
     if len(sys.argv) > 1:
         out, host, port, images = Path("captures/ur"), sys.argv[1], 30003, 12
-        frames = until_done.enter_context(opened(sys.argv[2] if len(sys.argv) > 2 else "0"))
+        camera = until_done.enter_context(opened(sys.argv[2] if len(sys.argv) > 2 else "0"))
     else:
         table = jcr.read_capture("examples/tabletop")
         arm = until_done.enter_context(SimulatedUr(table.base_from_gripper))
         out, host, port, images = Path("out/ur_robot"), "127.0.0.1", arm.port, 5
-        frames = simulated_camera(table, arm)
+        seen = Recorded(simulated_camera(table, arm))
+        camera = Camera(seen, seen.latest)
         shutil.rmtree(out, ignore_errors=True)  # a real one is gone on with
 
     def tell(answer, lines):
         """Which picture was kept or why not, what the motions do not show yet, and the pose to add next."""
         print("\n".join(lines))
 
-    collect(LiveFolder(out), frames, ur_poses(host, port, print), CollectOptions(images), tell)
+    print("move the arm; a picture is taken whenever it rests")
+    asks = asks_at_rest(lambda: states(host, port))
+    collect(LiveFolder(out), camera, asks, CollectOptions(images), tell, ArmWords("ur"))
 
 capture = jcr.read_capture(out)
 print(f"{len(capture)} pictures in {out}; next: jcr run {out} out/ur_run")

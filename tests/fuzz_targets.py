@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +15,20 @@ from jcr.calibration.calibration_json import (
     read_hand_eye,
     write_calibration,
 )
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses
 from jcr.capture import capture_json
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.images import read_image
-from jcr.capture.lerobot_files import read_episode
+from jcr.capture.lerobot_files import Info, read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
 from jcr.geometry import inverse
+from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
+from jcr.records import Attempt, Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
@@ -35,6 +37,7 @@ from jcr.simulate.ros_bag import write_bag
 
 SIZE = (16, 12)
 COUNT = 4
+RUN_IMAGES = 6
 NAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=3)
 
 
@@ -213,10 +216,50 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
     info |= {"video_path": "videos/0.mp4", "fps": 10, "features": {"state": {"shape": [2]}}}
     info["features"]["wrist"] = {"dtype": "video"}
     found = {
-        "episode.parquet": Target(table, lambda file: read_episode(folder / "set", info, "wrist", "state", 0))
+        "episode.parquet": Target(
+            table, lambda file: read_episode(folder / "set", Info.model_validate(info), "wrist", "state", 0)
+        )
     }
     for kind, name, bag in (("mcap", "scan.mcap", "scan"), ("ros1", "scan.bag", "scan.bag")):
         file = write_bag(folder / bag, capture, kind, 2.0, fps=4.0, tf_hz=10.0)
         file = next(file.glob("*.mcap")) if file.is_dir() else file
         found[name] = Target(file, lambda file: read_source(file, NAMES, into=file.parent / "frames"))
     return found
+
+
+def sound_run(out: Path) -> Path:
+    """A run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
+    (out / "capture").mkdir(parents=True)
+    problem = hand_eye_problem(np.random.default_rng(0), RUN_IMAGES)
+    names = tuple(f"{k}.png" for k in range(RUN_IMAGES))
+    frames = []
+    for name, pose in zip(names, problem.base_from_gripper, strict=True):
+        Image.fromarray(np.random.default_rng(len(frames)).integers(0, 255, (72, 96, 3), np.uint8)).save(
+            out / "capture" / name
+        )
+        frames.append({"image": name, "base_from_gripper": pose.tolist()})
+    (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
+    pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
+    attempt = Attempt("colmap", RUN_IMAGES, 1.0, 0.5, None)
+    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
+    lens = {
+        "fx": 90.0,
+        "fy": 90.0,
+        "cx": 47.5,
+        "cy": 35.5,
+        "distortion": [0.0] * 5,
+        "width": 96,
+        "height": 72,
+    }
+    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": lens}))
+    write_calibration(out / "calibration.json", read_calibration(out))
+    options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
+    options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
+    state = {
+        "capture": str(out / "capture"),
+        "reconstruct": "0",
+        "options": options,
+        "attempts": [asdict(attempt)],
+    }
+    (out / "run.json").write_text(json.dumps(state))
+    return out

@@ -18,23 +18,24 @@ LAYERS = [
     {"camera", "least_squares"},
     {"handeye"},
     {"capture"},
+    {"match"},
     {"reconstruct"},
     {"calibration"},
     {"represent", "segment"},
     {"export"},
     {"simulate"},
-    {"attempts", "check", "live"},
+    {"attempts", "check"},
     {"run_folder"},
     {"results"},
     {"mapping", "report"},
-    {"pipeline"},
+    {"live", "pipeline"},
     {"batch", "touch", "verify"},
     {"view"},
     {"cli"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-TORCH_ROOMS = {"reconstruct", "represent", "segment"}
+TORCH_ROOMS = {"match", "reconstruct", "represent", "segment"}
 BACK_ENDS = ["backends", "from_pairs", "colmap", "marker", "predictions"]
 SOLVERS = [
     "least_squares",

@@ -16,6 +16,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
+from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
@@ -42,6 +43,7 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     names: set[str] = set()
     monkeypatch.setattr(Backend, "has_weights", lambda self: not self.hub_id or self.name in names)
     monkeypatch.setattr(Backend, "is_installed", lambda self: True)
+    monkeypatch.setattr(backends, "_has_xfeat", lambda: "xfeat" in names)
     return names
 
 
@@ -65,12 +67,12 @@ def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
 def auto_result(
     problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Reconstruction, list[str]]:
-    """What auto keeps where each back end gives these camera poses or this error, and which ones it ran."""
+    """What auto keeps where each back end, or features, give these camera poses or this error; which ones it ran."""
     tried = []
 
     def answered(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         tried.append(options.backend)
-        answer = answers[options.backend]
+        answer = answers[options.backend if options.features == "auto" else options.features]
         if isinstance(answer, Exception):
             raise answer
         return reconstruction(options.backend, answer)
@@ -151,6 +153,25 @@ def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
 
 
+def test_learned_features_are_asked_where_those_of_sift_fail(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    present.add("xfeat")
+    rng = np.random.default_rng(0)
+    problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, 5e-4))
+    good = problem.recon_from_camera
+    shuffled = good[rng.permutation(8)]
+    kept, tried = auto_result(problem, {"sift": good}, monkeypatch)
+    assert tried == ["colmap"] and not kept.notes
+    kept, tried = auto_result(problem, {"sift": NotTrustedError("0 of 8"), "xfeat": good}, monkeypatch)
+    assert tried == ["colmap", "colmap"]
+    assert "colmap with sift, gave nothing (0 of 8); colmap with xfeat (held-out" in kept.notes[0]
+    # Two that fail, and a third that does not: all three are told.
+    refused = NotTrustedError("1 of 8")
+    kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
+    assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
+
+
 def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -184,7 +205,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert colmap["why_not"].startswith("not to be trusted: ") and direct["why_not"] is None
     assert (colmap["reconstruct_s"], direct["reconstruct_s"]) == (20.0, 400.0)
     assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
-    assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0}
+    assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0, "report": 0.0}
     assert result.calibration.model_dump()["attempts"] == content["attempts"]
     told = (tmp_path / "log.txt").read_text().splitlines()
     assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (not to be trusted: ")
@@ -197,7 +218,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     again = RunFolder(tmp_path).calibration()
     assert made == ["colmap", "direct"]
     assert again.model_dump()["attempts"] == content["attempts"]
-    assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0}
+    assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
 
 
 def test_where_nothing_is_found_each_attempt_says_why(

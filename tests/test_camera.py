@@ -34,6 +34,14 @@ PINCUSHION = Intrinsics(500.0, 500.0, 310.0, 245.0, 640, 480, (0.15, 0.05, -0.00
 FOLDING = Intrinsics(898.3, 901.1, 649.4, 362.5, 1280, 720, (0.0119, 0.7232, 0.00036, -0.00038, -2.4673))
 """A published calibration of a real camera: points near the corners had no weight in it."""
 
+RATIONAL = Intrinsics(
+    612.4, 612.2, 636.8, 367.2, 1280, 720, (0.45, -2.6, 4e-4, -2e-4, 1.6, 0.33, -2.4, 1.5), "rational"
+)
+"""About an Azure Kinect's colour camera."""
+FISHEYE = Intrinsics(286.0, 286.5, 423.0, 399.0, 848, 800, (-0.0078, 0.045, -0.042, 0.008), "fisheye")
+"""About a tracking camera's: its corners see 80° off the axis."""
+MODELS = [WIDE, RATIONAL, FISHEYE]
+
 repeatable = settings(derandomize=True, deadline=None, max_examples=40)
 
 
@@ -202,3 +210,50 @@ def test_resampled_pixels_show_what_their_rays_see(factor: int) -> None:
     difference = (seen[..., :2] - expected)[2:-2, 2:-2]
     assert np.abs(difference.mean((0, 1))).max() < 0.05
     assert np.abs(difference).max() < 0.6
+
+
+def reaching(camera: Intrinsics) -> np.ndarray:
+    """Rays all over the image."""
+    u, v = np.meshgrid(np.linspace(5, camera.width - 6, 15), np.linspace(5, camera.height - 6, 11))
+    return unproject(camera, np.stack([u, v], -1))
+
+
+@pytest.mark.parametrize("camera", MODELS)
+def test_each_model_is_opencvs(camera: Intrinsics):
+    x = 1.7 * reaching(camera).reshape(-1, 1, 3)
+    project_by = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    expected = project_by(x, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))[0]
+    np.testing.assert_allclose(project(camera, x[:, 0]), expected[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", MODELS)
+def test_each_model_has_its_inverse_and_derivatives(camera: Intrinsics):
+    x = 0.8 * reaching(camera)
+    np.testing.assert_allclose(0.8 * unproject(camera, project(camera, x)), x, atol=1e-8)
+    step = 1e-6
+    for k in range(3):
+        ahead, behind = (project(camera, x + sign * step * np.eye(3)[k]) for sign in (1, -1))
+        np.testing.assert_allclose(
+            by_point(camera, x)[..., k], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-4
+        )
+    values = parameters(camera)
+    assert with_parameters(camera, values) == camera
+    for k in range(len(values)):
+        ahead, behind = (
+            project(with_parameters(camera, values + sign * step * np.eye(len(values))[k]), x)
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(
+            by_parameters(camera, x)[..., k], (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4
+        )
+
+
+def test_a_fisheye_is_smooth_on_its_axis_and_its_pinhole_grid_ends_before_its_border():
+    axis = np.array([[0.0, 0.0, 1.0], [1e-7, 0.0, 1.0], [1e-3, 2e-3, 1.0]])
+    assert np.isfinite(by_point(FISHEYE, axis)).all()
+    np.testing.assert_allclose(project(FISHEYE, axis)[0], [FISHEYE.cx, FISHEYE.cy])
+    np.testing.assert_allclose(unproject(FISHEYE, project(FISHEYE, axis)), axis, atol=1e-9)
+    grid = pinhole_inside(FISHEYE, 512)
+    assert grid.model == "pinhole" and np.abs(rays(grid)).max() < 1.8
+    seen = project(FISHEYE, rays(grid))
+    assert (seen > -0.5).all() and (seen < [FISHEYE.width - 0.5, FISHEYE.height - 0.5]).all()

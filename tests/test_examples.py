@@ -176,3 +176,17 @@ def test_the_api_is_called_as_it_is_shown_and_twice(done: Path, tmp_path: Path):
     assert solve.observability.observable and not solve.observability.unobservable
     assert solve.covariance.shape == (7, 7) and solve.inliers.all()
     np.testing.assert_allclose(solve.gripper_from_camera, true_hand_eye(), atol=2e-3)
+
+
+def test_the_notebook_runs_and_shows_the_result(tmp_path: Path):
+    notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    shutil.copytree(EXAMPLES / "tabletop", tmp_path / "examples" / "tabletop")
+    script = "\n".join(cells) + "\nprint(result._repr_html_())\n"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "<b>gripper_from_camera</b>, accepted" in done.stdout
+    assert (tmp_path / "out/notebook/report.html").is_file()
+    assert "out/notebook/export/hand_eye.launch" in done.stdout

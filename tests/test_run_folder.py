@@ -2,74 +2,28 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fuzz_targets import RUN_IMAGES, sound_run
 from jcr.cli import dispatch
-from jcr.errors import InputError
 from jcr.run_folder import RunFolder
-
-COUNT = 6
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with calibration.json and run.json, of poses without noise; its capture lies in it."""
-    from PIL import Image
-
-    from jcr.calibration.calibration_json import calibration_file, write_calibration
-    from jcr.calibration.options import CalibrateOptions
-    from jcr.calibration.stage import calibrate_poses
-    from jcr.reconstruct.backends import ReconstructOptions
-    from jcr.records import Attempt, PosePairs
-    from jcr.simulate.problem import hand_eye_problem
-
-    out = tmp_path_factory.mktemp("sound") / "out"
-    (out / "capture").mkdir(parents=True)
-    problem = hand_eye_problem(np.random.default_rng(0), COUNT)
-    names = tuple(f"{k}.png" for k in range(COUNT))
-    frames = []
-    for name, pose in zip(names, problem.base_from_gripper, strict=True):
-        Image.fromarray(np.random.default_rng(len(frames)).integers(0, 255, (72, 96, 3), np.uint8)).save(
-            out / "capture" / name
-        )
-        frames.append({"image": name, "base_from_gripper": pose.tolist()})
-    (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
-    pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
-    attempt = Attempt("colmap", COUNT, 1.0, 0.5, None)
-    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
-    lens = {
-        "fx": 90.0,
-        "fy": 90.0,
-        "cx": 47.5,
-        "cy": 35.5,
-        "distortion": [0.0] * 5,
-        "width": 96,
-        "height": 72,
-    }
-    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": lens}))
-    write_calibration(out / "calibration.json", RunFolder(out).calibration())
-    options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
-    options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}
-    state = {
-        "capture": str(out / "capture"),
-        "reconstruct": "0",
-        "options": options,
-        "attempts": [asdict(attempt)],
-    }
-    (out / "run.json").write_text(json.dumps(state))
-    return out
+    return sound_run(tmp_path_factory.mktemp("sound") / "out")
 
 
 def test_a_sound_folder_is_read(sound: Path):
     folder = RunFolder(sound)
     assert folder.options().calibrate.robot_noise == (0.1, 0.05)
-    assert len(folder.capture()) == COUNT and folder.calibration().converged
+    assert len(folder.capture()) == RUN_IMAGES and folder.calibration().converged
     assert folder.state().attempts == tuple(folder.calibration().attempts)
 
 
@@ -175,38 +129,3 @@ def test_a_cut_file_is_refused(sound: Path, tmp_path: Path, name: str, length: i
     (out / name).write_text((out / name).read_text()[:length])
     command = ["map", str(out)] if name == "run.json" else ["compare", str(out), str(out)]
     assert name in refused([*command, "--quiet"] if name == "run.json" else command, capsys)
-
-
-def places(content: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Every place of a value in JSON content, the first of each list alone."""
-    if path:
-        yield path
-    if isinstance(content, dict):
-        for key, value in content.items():
-            yield from places(value, (*path, key))
-    if isinstance(content, list) and content:
-        yield from places(content[0], (*path, 0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["run.json", "calibration.json"])
-def test_any_value_exchanged_is_read_or_refused(sound: Path, tmp_path: Path, name: str):
-    """Each value in turn for one of another kind: what is read then is what the schema allows."""
-    original = json.loads((sound / name).read_text())
-    out = edited(sound, tmp_path / "out", name, lambda content: None)
-    folder, read = RunFolder(out), 0
-    for path in places(original):
-        for value in ("null", "-1", "0", "1e309", '""', "[]", "{}", f'"{"x" * 100_000}"'):
-            content = json.loads(json.dumps(original))
-            parent = content
-            for key in path[:-1]:
-                parent = parent[key]
-            parent[path[-1]] = "EXCHANGED"
-            (out / name).write_text(json.dumps(content).replace('"EXCHANGED"', value))
-            try:
-                folder.calibration()
-                folder.capture()
-                read += 1
-            except InputError as error:
-                assert "\n" not in str(error)
-    assert read > 20  # options that may be unset, and texts that may be any

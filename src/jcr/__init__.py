@@ -12,14 +12,24 @@ from jcr import deflate  # noqa: F401
 from jcr.errors import InputError, NotTrustedError
 
 if TYPE_CHECKING:
+    from jcr.capture.options import ReadOptions
     from jcr.capture.read import read_capture
+    from jcr.check import check as check_capture
+    from jcr.cli.export import export_run
     from jcr.handeye.solve import solve_hand_eye
     from jcr.pipeline import build_map, calibrate, measure, run
     from jcr.represent.map_file import load_map
+    from jcr.results import RunOptions
+    from jcr.verify import verify as verify_run
 
     __version__: str
 
 _MODULE_OF = {
+    "ReadOptions": "jcr.capture.options",
+    "RunOptions": "jcr.results",
+    "check_capture": "jcr.check:check",
+    "verify_run": "jcr.verify:verify",
+    "export_run": "jcr.cli.export",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
     "run": "jcr.pipeline",
@@ -32,20 +42,26 @@ _MODULE_OF = {
 __all__ = [
     "InputError",
     "NotTrustedError",
+    "ReadOptions",
+    "RunOptions",
     "build_map",
     "calibrate",
+    "check_capture",
+    "export_run",
     "load_map",
     "measure",
     "read_capture",
     "run",
     "solve_hand_eye",
+    "verify_run",
 ]
 
 
 def __getattr__(name: str) -> Any:
     # SciPy and COLMAP take seconds to import; each name imports only the module behind it.
     if name in _MODULE_OF:
-        return getattr(import_module(_MODULE_OF[name]), name)
+        module, _, inside = _MODULE_OF[name].partition(":")
+        return getattr(import_module(module), inside or name)
     if name == "__version__":
         from importlib.metadata import version
 

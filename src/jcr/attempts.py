@@ -10,7 +10,7 @@ from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, for_backend, reconstruct
+from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
 from jcr.records import Attempt, Capture, HandEye, Reconstruction
 
 
@@ -43,36 +43,33 @@ def choose(
 ) -> Choice:
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
-    `auto` runs the best back end whose weights are on this machine, and the next ones when that
-    gives nothing or its calibration is not to be trusted for another reason than the motion. Of two results a trusted
-    one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as soon as it is sure
-    that the run goes on with it. Raises InputError as the back end does, NothingFoundError where none gave anything.
+    `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long as
+    the ones before gave nothing or a calibration that is not to be trusted for another reason than the motion. Of two
+    results a trusted one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as
+    soon as it is sure that the run goes on with it. Raises InputError as the back end does, NothingFoundError where none
+    gave anything.
     """
-    names = _asked(candidates(options))
-    if len(names) == 1:
-        only = _tried(capture, for_backend(options, names[0]), calibrate_options, progress, chosen)
+    made = tries(options)
+    if len(made) == 1:
+        only = _tried(capture, made[0], calibrate_options, progress, chosen)
         return _choice(only, (only.attempt(),))
-    kept = _tried(capture, for_backend(options, names[0]), calibrate_options, progress)
+    kept = _tried(capture, made[0], calibrate_options, progress)
     if isinstance(kept.failure, InputError) and options.weights is not None:
         raise kept.failure
-    attempts = {kept.backend: kept.attempt()}
-    if kept.is_enough and BACKENDS[names[0]].hub_id:
-        kept = kept.noted(_about(names[0]))
-    for name in names[1:]:
+    attempts, at = [kept.attempt()], 0
+    if kept.is_enough and BACKENDS[kept.backend].hub_id:
+        kept = kept.noted(_about(kept.backend))
+    for one in made[1:]:
         if kept.is_enough:
             break
-        kept, both = _better(kept, _tried(capture, for_backend(options, name), calibrate_options, progress))
-        attempts |= {attempt.backend: attempt for attempt in both}
-    choice = _choice(kept, tuple(attempts.values()))
+        other = _tried(capture, one, calibrate_options, progress)
+        kept, (attempts[at], of_other) = _better(kept, other)
+        attempts.append(of_other)
+        if kept.name == other.name:
+            at = len(attempts) - 1
+    choice = _choice(kept, tuple(attempts))
     chosen(choice.reconstruction)
     return choice
-
-
-def _asked(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Of the candidates the two best, where one network that sees all views does not count; no second such one."""
-    networks = [name for name in names if BACKENDS[name].sees_all_views]
-    asked = tuple(name for name in names if name not in networks[1:])
-    return asked[: 3 if networks else 2]
 
 
 def again(
@@ -103,6 +100,13 @@ class _Tried:
     hand_eye: HandEye | None = None
     failure: InputError | NotTrustedError | None = None
     """Why there is no calibration."""
+    features: str | None = None
+    """What was matched between images, where the back end has a choice."""
+
+    @property
+    def name(self) -> str:
+        """The back end and its features."""
+        return self.backend + (f" with {self.features}" if self.features else "")
 
     @property
     def missed_m(self) -> float:
@@ -121,7 +125,7 @@ class _Tried:
         error = (
             "too few images to leave one out" if held_out is None else f"held-out error {missed(held_out)}"
         )
-        return f"{self.backend} ({error})"
+        return f"{self.name} ({error})"
 
     def noted(self, note: str) -> "_Tried":
         """The same with one more note."""
@@ -138,6 +142,7 @@ class _Tried:
             round(self.reconstruct_s, 3),
             round(self.calibrate_s, 3),
             why_not if self.failure is None else str(self.failure),
+            self.features,
         )
 
 
@@ -150,11 +155,13 @@ def _tried(
 ) -> _Tried:
     """One back end's reconstruction, and what `calibrate` makes of it."""
     start = time.perf_counter()
+    features = None if options.features == "auto" else options.features
     try:
         reconstruction = reconstruct(capture, options, progress)
     except (InputError, NotTrustedError) as error:
-        return _Tried(options.backend, time.perf_counter() - start, failure=error.with_traceback(None))
-    tried = _Tried(options.backend, time.perf_counter() - start, reconstruction)
+        seconds = time.perf_counter() - start
+        return _Tried(options.backend, seconds, failure=error.with_traceback(None), features=features)
+    tried = _Tried(options.backend, time.perf_counter() - start, reconstruction, features=features)
     give_back()  # what the back end worked with
     reconstructed(reconstruction)
     return _calibrated(capture, tried, calibrate_options, progress)
@@ -178,9 +185,9 @@ def _calibrated(
     return replace(tried, calibrate_s=seconds, hand_eye=hand_eye)
 
 
-def _about(backend: str) -> str:
+def _about(backend: str, name: str = "") -> str:
     best = ", the best whose weights are on this machine" if BACKENDS[backend].hub_id else ""
-    return f"back end {backend}{best}"
+    return f"back end {name or backend}{best}"
 
 
 def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
@@ -188,23 +195,23 @@ def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
     if isinstance(other.failure, InputError) and not BACKENDS[other.backend].hub_id:
         raise other.failure
     if one.hand_eye is None:
-        nothing = f"{_about(one.backend)}, gave nothing ({one.failure})"
+        nothing = f"{_about(one.backend, one.name)}, gave nothing ({one.failure})"
         if other.hand_eye is None:
             # The licence of weights that were used belongs to this answer, too.
             failure = NotTrustedError(f"{other.failure}; {nothing}")
             return replace(other, failure=failure), (one.attempt(), other.attempt())
         kept = other.noted(f"{nothing}; {other.told()} was used instead")
         return kept, (one.attempt(), other.attempt())
-    doubt = f"{_about(one.backend)}, is not to be trusted ({one.hand_eye.warnings[0]})"
+    doubt = f"{_about(one.backend, one.name)}, is not to be trusted ({one.hand_eye.warnings[0]})"
     if other.hand_eye is None:
-        kept = one.noted(f"{doubt}, and {other.backend} gave nothing ({other.failure})")
+        kept = one.noted(f"{doubt}, and {other.name} gave nothing ({other.failure})")
         return kept, (one.attempt(), other.attempt())
     untrusted = f"not to be trusted: {one.hand_eye.warnings[0]}"
     if other.hand_eye.converged:
         kept = other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
         return kept, (one.attempt(untrusted), other.attempt())
     kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
-    words = f"{doubt}, nor is {other.backend}; {kept.told()} was used and not {left.told()}"
+    words = f"{doubt}, nor is {other.name}; {kept.told()} was used and not {left.told()}"
     farther = f"not to be trusted, and its held-out error is not the smaller one: {left.told()}"
     attempts = tuple(tried.attempt(farther if tried is left else None) for tried in (one, other))
     return kept.noted(words), attempts

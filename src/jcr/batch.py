@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Literal
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
-from jcr.run_folder import RunFolder, fingerprint
+from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 
 STATE = "batch.json"
 """In each run folder: its row of the table, and a fingerprint of what it was made from."""
@@ -40,7 +41,7 @@ class BatchOptions:
     processes: int | None = None
     """Captures at a time on this machine (unset: one for every two cores); cores are shared out among them."""
     calibrate_only: bool = False
-    """Stop at calibration.json: no cloud, map and report."""
+    """Calibration and report alone: no cloud and no map."""
     ray: str | None = None
     """Run on a Ray cluster at this address (auto: the one this machine belongs to). Every node must see the same
     folders. Needs the extra jcr-handeye[cluster]."""
@@ -79,6 +80,7 @@ class Task:
     out: Path
     run: RunOptions
     calibrate_only: bool
+    read: ReadOptions
 
 
 def batch(
@@ -87,6 +89,7 @@ def batch(
     run_options: RunOptions,
     options: BatchOptions,
     progress: Progress | None = None,
+    read: ReadOptions | None = None,
 ) -> list[Row]:
     """Run every capture into a folder of its own in `out`; summary.csv and summary.html rank them, best first.
 
@@ -97,7 +100,7 @@ def batch(
         raise InputError(f"--processes {options.processes}: give 1 or more")
     report = progress or silent
     tasks = [
-        Task(path.resolve(), out.resolve() / name, run_options, options.calibrate_only)
+        Task(path.resolve(), out.resolve() / name, run_options, options.calibrate_only, read or ReadOptions())
         for path, name in zip(captures, _names(captures), strict=True)
     ]
     out.mkdir(parents=True, exist_ok=True)
@@ -116,9 +119,11 @@ def run_one(task: Task) -> Row:
     start = time.perf_counter()
     failed = Row(str(task.capture), str(task.out), "failed")
     try:
-        capture = read_capture(task.capture)
+        capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
         made_from = fingerprint(capture, task.run.reconstruct.as_json())
-        others = json.dumps([asdict(task.run), task.calibrate_only], sort_keys=True, default=str)
+        others = json.dumps(
+            [asdict(task.run), asdict(task.read), task.calibrate_only], sort_keys=True, default=str
+        )
         made_from += hashlib.sha256(others.encode()).hexdigest()
         if (row := _finished(task, made_from)) is not None:
             return row

@@ -1,9 +1,10 @@
 """The one camera model: projection and its derivatives, its inverse, resizing and cropping, undistorted images.
 
-OpenCV's pinhole with five distortion coefficients ("Camera Calibration and 3D Reconstruction"). What a distortion does
-to rays stands in `_distorted`, `_slopes` and `_by_coefficients` alone: another model is another branch of these three
-and longer `parameters`, and no caller knows. Pixel (0, 0) is the centre of the top-left pixel, so an image of width w
-spans [-0.5, w - 0.5]. Arrays keep their precision: float32 points give float32 pixels.
+OpenCV's pinhole with five distortion coefficients, its rational model with eight ("Camera Calibration and 3D
+Reconstruction") and its fisheye with four (Kannala and Brandt, TPAMI 2006). What a distortion does to rays stands in
+`_distorted`, `_slopes`, `_by_coefficients` and, for the fisheye, `_fisheye_rays` alone: no caller knows the model.
+Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [-0.5, w - 0.5]. Arrays keep their
+precision: float32 points give float32 pixels.
 """
 
 from dataclasses import replace
@@ -14,38 +15,49 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.records import Intrinsics
+from jcr.records import COEFFICIENTS, Intrinsics, coefficients_of
 
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2")
+"""The parameters with which every model begins; the other coefficients follow, as records.COEFFICIENTS has them."""
 NORMALIZED = Intrinsics(1.0, 1.0, 0.0, 0.0, 1, 1)
 """Its pixels are x/z, y/z."""
 Coordinate = Float[ndarray, "*batch"] | np.floating
 _WIDEST_TANGENT = 10.0
-"""Rays farther than 84° from the optical axis are beyond this model."""
+"""Rays farther than 84° from the optical axis are beyond these models."""
+_WIDEST_ANGLE = float(np.arctan(_WIDEST_TANGENT))
+_NEAR_AXIS = 1e-8
+"""x² + y² below which a fisheye's formulas are taken there, for they divide by it; they are flat to 1e-8."""
+_WIDEST_PINHOLE = 1.7
+"""x/z and y/z at 60°, beyond which a pinhole grid would stretch a fisheye's border without end."""
 
 
-def parameters(camera: Intrinsics) -> Float[ndarray, "9"]:
-    """The camera as a vector in the order of PARAMETERS."""
+def parameter_names(camera: Intrinsics) -> tuple[str, ...]:
+    """Of `parameters`, in their order."""
+    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[camera.model])
+
+
+def parameters(camera: Intrinsics) -> Float[ndarray, " p"]:
+    """The camera as a vector: PARAMETERS, and the other coefficients of its model."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
-def with_parameters(camera: Intrinsics, values: Float[ndarray, "9"]) -> Intrinsics:
-    """A camera of the same image size with `values` in the order of PARAMETERS."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))
+def with_parameters(camera: Intrinsics, values: Float[ndarray, " p"]) -> Intrinsics:
+    """A camera of the same model and image size with the values that `parameters` gives."""
+    fx, fy, cx, cy, *distortion = (float(value) for value in values)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=coefficients_of(distortion))
 
 
 def is_distorted(camera: Intrinsics) -> bool:
     """Whether straight lines are not straight in its images."""
-    return any(camera.distortion)
+    return camera.model == "fisheye" or any(camera.distortion)
 
 
 def without_distortion(camera: Intrinsics) -> Intrinsics:
     """The pinhole with the same focal lengths and principal point."""
-    return replace(camera, distortion=NO_DISTORTION)
+    return replace(camera, distortion=NO_DISTORTION, model="pinhole")
 
 
 def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
@@ -60,6 +72,8 @@ def project(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Floa
 def unproject(camera: Intrinsics, x_px: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
     """Directions (...,3) with z = 1 of pixels (...,2): by Newton's method, exact where no distortion folds over."""
     target = (x_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if camera.model == "fisheye":
+        return _fisheye_rays(camera, target)
     found = target
     for _ in range(30 if is_distorted(camera) else 0):
         x, y = found[..., 0], found[..., 1]
@@ -86,10 +100,10 @@ def by_point(camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]) -> Flo
 
 def by_parameters(
     camera: Intrinsics, x_in_camera: Float[ndarray, "*batch 3"]
-) -> Float[ndarray, "*batch 2 9"]:
-    """Derivatives of `project` by the camera's parameters, in the order of PARAMETERS."""
+) -> Float[ndarray, "*batch 2 p"]:
+    """Derivatives of `project` by the camera's `parameters`."""
     x, y = x_in_camera[..., 0] / x_in_camera[..., 2], x_in_camera[..., 1] / x_in_camera[..., 2]
-    out = np.zeros((*x.shape, 2, 9), x.dtype)
+    out = np.zeros((*x.shape, 2, 4 + len(camera.distortion)), x.dtype)
     out[..., 0, 0], out[..., 1, 1] = _distorted(camera, x, y)
     out[..., 0, 2] = out[..., 1, 3] = 1.0
     by_coefficients = _by_coefficients(camera, x, y)
@@ -99,9 +113,11 @@ def by_parameters(
 
 def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Where rays (x, y, 1) go before focal lengths and principal point."""
-    k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial, _ = _radial(camera, r2)
+    if camera.model == "fisheye":
+        return x * radial, y * radial
+    p1, p2 = camera.distortion[2:4]
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
@@ -110,27 +126,75 @@ def _distorted(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordi
 
 def _slopes(camera: Intrinsics, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate, Coordinate]:
     """Derivatives of `_distorted`: of its x by x, of either by the other (they are equal), of its y by y."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    r2 = x * x + y * y
+    radial, slope = _radial(camera, x * x + y * y)
+    by_x, cross, by_y = radial + 2 * slope * x * x, 2 * slope * x * y, radial + 2 * slope * y * y
+    if camera.model == "fisheye":
+        return by_x, cross, by_y
+    p1, p2 = camera.distortion[2:4]
+    return by_x + 2 * p1 * y + 6 * p2 * x, cross + 2 * (p1 * x + p2 * y), by_y + 6 * p1 * y + 2 * p2 * x
+
+
+def _radial(camera: Intrinsics, r2: Coordinate) -> tuple[Coordinate, Coordinate]:
+    """The factor by which rays at x² + y² = r2 move outwards, and its derivative by r2."""
+    if camera.model == "fisheye":
+        k = camera.distortion
+        r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
+        angle = np.arctan(r)
+        a2 = angle * angle
+        bent = angle * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
+        by_angle = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])))
+        return bent / r, (by_angle / (1 + r * r) - bent / r) / (2 * r * r)
+    k1, k2, _, _, k3, *more = list(camera.distortion)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-    return (
-        radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
-        slope * x * y + 2 * (p1 * x + p2 * y),
-        radial + slope * y * y + 6 * p1 * y + 2 * p2 * x,
-    )
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    if not more:
+        return radial, slope
+    k4, k5, k6 = more
+    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    return radial / below, (slope - radial / below * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
 
 
 def _by_coefficients(
     camera: Intrinsics, x: Coordinate, y: Coordinate
-) -> tuple[Float[ndarray, "*batch 5"], Float[ndarray, "*batch 5"]]:
-    """Derivatives (...,5) of `_distorted`'s x and y by the coefficients of the camera's distortion."""
+) -> tuple[Float[ndarray, "*batch c"], Float[ndarray, "*batch c"]]:
+    """Derivatives (...,c) of `_distorted`'s x and y by the coefficients of the camera's distortion."""
     r2, xy = x * x + y * y, 2 * x * y
-    powers = r2, r2**2, r2**3
+    if camera.model == "fisheye":
+        r = np.sqrt(np.maximum(r2, _NEAR_AXIS))
+        shares = [np.arctan(r) ** power / r for power in (3, 5, 7, 9)]
+        return np.stack([x * share for share in shares], -1), np.stack([y * share for share in shares], -1)
+    above = [r2, r2**2, r2**3]
+    below = []
+    if camera.model == "rational":
+        k4, k5, k6 = list(camera.distortion)[5:]
+        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        above = [power / denominator for power in above]
+        below = [-_radial(camera, r2)[0] * power for power in above]
     return (
-        np.stack([x * powers[0], x * powers[1], xy, r2 + 2 * x * x, x * powers[2]], axis=-1),
-        np.stack([y * powers[0], y * powers[1], r2 + 2 * y * y, xy, y * powers[2]], axis=-1),
+        np.stack(
+            [x * above[0], x * above[1], xy, r2 + 2 * x * x, x * above[2], *(x * b for b in below)], axis=-1
+        ),
+        np.stack(
+            [y * above[0], y * above[1], r2 + 2 * y * y, xy, y * above[2], *(y * b for b in below)], axis=-1
+        ),
     )
+
+
+def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 3"]:
+    """Directions with z = 1 of distorted coordinates: by Newton's method in the angle, in which the model is smooth."""
+    k = camera.distortion
+    bent = np.linalg.norm(target, axis=-1)
+    angle = np.minimum(bent, _WIDEST_ANGLE)
+    for _ in range(30):
+        a2 = angle * angle
+        error = angle * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))) - bent
+        if np.abs(error).max(initial=0.0) < 1e-14:
+            break
+        slope = 1 + a2 * (3 * k[0] + a2 * (5 * k[1] + a2 * (7 * k[2] + a2 * 9 * k[3])))
+        # Beyond the widest angle there is no ray in front of the camera; the nearest one stands for it.
+        angle = np.clip(angle - error / np.maximum(slope, 0.1), 0.0, _WIDEST_ANGLE)
+    stretch = np.where(bent < 1e-12, 1.0, np.tan(angle) / np.maximum(bent, 1e-12))
+    return np.concatenate([target * stretch[..., None], np.ones_like(target[..., :1])], axis=-1)
 
 
 @lru_cache(maxsize=64)  # every stage asks for the same camera
@@ -166,7 +230,8 @@ def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, 
 
     With such a distortion images do not register.
     """
-    if lens is None or (fold := fold_distance_px(lens)) is None:
+    # Of a fisheye's border, beyond the widest angle, there are pixels without rays; the rest is as good as any.
+    if lens is None or lens.model == "fisheye" or (fold := fold_distance_px(lens)) is None:
         return lens, ()
     note = (
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
@@ -213,8 +278,8 @@ def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
     u, v = np.linspace(u0, u1, 100), np.linspace(v0, v1, 100)
     left, right = (unproject(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
     top, bottom = (unproject(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
-    x0, x1 = float(left.max()), float(right.min())
-    y0, y1 = float(top.max()), float(bottom.min())
+    x0, x1 = max(float(left.max()), -_WIDEST_PINHOLE), min(float(right.min()), _WIDEST_PINHOLE)
+    y0, y1 = max(float(top.max()), -_WIDEST_PINHOLE), min(float(bottom.min()), _WIDEST_PINHOLE)
     scale = long_side_px / max((x1 - x0) * lens.fx, (y1 - y0) * lens.fy)
     width, height = round((x1 - x0) * lens.fx * scale), round((y1 - y0) * lens.fy * scale)
     fx, fy = width / (x1 - x0), height / (y1 - y0)

@@ -16,6 +16,7 @@ from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
 from jcr.handeye.solve import solve_hand_eye
 from jcr.progress import Progress
+from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs, Reconstruction
 
@@ -80,6 +81,10 @@ def check(
             remarks += found.notes
         except NotTrustedError as error:
             remarks.append(str(error))
+            if (
+                board := proposed([read_image(capture.folder / name) for name in capture.images])
+            ) is not None:
+                remarks.append(board)
     if found is not None:
         used = gripper[found.image_index]
         hand_eye = solve_hand_eye(used, found.recon_from_camera, robot_noise=robot_noise)

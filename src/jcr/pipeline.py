@@ -16,10 +16,11 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
 from jcr.capture.added import read_added, with_images, write_added
-from jcr.extras import is_installed
+from jcr.capture.images import read_image
 from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
+from jcr.reconstruct.board_in_view import proposed
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
@@ -61,15 +62,14 @@ def calibrate(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Reconstruction and calibration of a capture in the folder `out`; raises as `run` does.
+    """Reconstruction, calibration and report of a capture in the folder `out`; raises as `run` does.
 
-    Without torch and Numba there is no dense depth, which only a later map needs.
+    There is no dense depth: only a map needs it, and `build_map` makes it where it is missing.
     """
-    options = _with_backend(options, backend, capture)
-    if not (is_installed("torch") and is_installed("numba")):
-        options = _with_dense(options, False)
+    options = _with_dense(_with_backend(options, backend, capture), False)
     with held(Path(out)) as folder:
-        return _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
+        calibrated = _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
+        return _report(calibrated, folder, options, progress or silent)
 
 
 def calibrate_poses(
@@ -150,9 +150,10 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
             progress,
             lambda made: folder.keep_reconstruction(made, state),
         )
-    except NothingFoundError as error:
+    except NothingFoundError as nothing:
+        error = nothing if options.reconstruct.board else _with_board(nothing, capture)
         _fail(capture, folder, state, options, error)
-        raise
+        raise error from None
     folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
     content = calibration_file(
         capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
@@ -169,6 +170,12 @@ def _kept(capture: Capture, folder: RunFolder, state: State, progress: Progress)
     reconstruction = folder.reconstruction()
     seconds = _seconds_since(start)
     return again(capture, reconstruction, seconds, earlier.attempts, state.options.calibrate, progress)
+
+
+def _with_board(error: NothingFoundError, capture: Capture) -> NothingFoundError:
+    """The error with the --board that would help, where the images show a board."""
+    proposal = proposed([read_image(capture.folder / name) for name in capture.images])
+    return error if proposal is None else NothingFoundError(f"{error}; {proposal}", error.attempts)
 
 
 def _fail(

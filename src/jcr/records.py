@@ -4,17 +4,37 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+LensModel = Literal["pinhole", "rational", "fisheye"]
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Of each distortion, in OpenCV's order; ROS calls them plumb_bob, rational_polynomial and equidistant."""
+Coefficients = (
+    tuple[float, float, float, float]
+    | tuple[float, float, float, float, float]
+    | tuple[float, float, float, float, float, float, float, float]
+)
+
+
+def coefficients_of(values: Iterable[float]) -> Coefficients:
+    """Four, five or eight numbers as a lens has them."""
+    return cast(Coefficients, tuple(float(value) for value in values))
+
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera with OpenCV's five-coefficient distortion, in pixels of a `width` x `height` image."""
+    """A camera with one of OpenCV's distortions, in pixels of a `width` x `height` image."""
 
     fx: float
     fy: float
@@ -22,8 +42,9 @@ class Intrinsics:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3."""
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """As many coefficients as COEFFICIENTS has names for the model."""
+    model: LensModel = "pinhole"
 
     @property
     def matrix(self) -> Float[ndarray, "3 3"]:
@@ -43,8 +64,8 @@ class Capture:
     """Width, height in pixels after EXIF rotation; the same for all images."""
     intrinsics: Intrinsics | None = None
     """None: unknown, to be estimated."""
-    intrinsics_std: Float[ndarray, "9"] | None = None
-    """Standard deviations of the given ones, in the order of camera.PARAMETERS, not a number where one is not stated."""
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    """Standard deviations of the given ones, in the order of camera.parameters, not a number where one is not stated."""
     source: Path | None = None
     """What it was read from, where that is not a capture.json in `folder`."""
     cameras: Path | None = None
@@ -57,6 +78,8 @@ class Capture:
     """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
     urdf: Path | None = None
     """Of the arm, where it was given."""
+    orientation: int = 1
+    """EXIF's, of all images: 1 as the sensor has them; others were turned upright, and the camera frame is theirs."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -288,8 +311,8 @@ class HandEye:
     warnings: tuple[str, ...] = ()
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
-    intrinsics_covariance: Float[ndarray, "9 9"] | None = None
-    """In the order of camera.PARAMETERS; None where they were not refined."""
+    intrinsics_covariance: Float[ndarray, "q q"] | None = None
+    """In the order of camera.parameters; None where they were not refined."""
     held_out: HeldOut | None = None
     reasons: tuple[str | None, ...] = ()
     """Per pose: why it was rejected, None when used."""
@@ -339,6 +362,8 @@ class Attempt:
     """0 where there was nothing to calibrate."""
     why_not: str | None
     """Why the run does not go on with it; None where it does."""
+    features: str | None = None
+    """What was matched between images, where the back end has a choice."""
 
 
 @dataclass(frozen=True)

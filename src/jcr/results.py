@@ -1,11 +1,17 @@
 """What the whole job is told, and what it hands to the report, the command line and the caller."""
 
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
+from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions, MapOptions
@@ -51,6 +57,38 @@ class RunResult:
     def lens(self) -> Intrinsics:
         """As the calibration left it."""
         return self.hand_eye.intrinsics or self.reconstruction.intrinsics
+
+    @property
+    def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
+        """The hand-eye transform."""
+        return self.hand_eye.gripper_from_camera
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"]:
+        """In records.COVARIANCE_ORDER."""
+        return self.hand_eye.covariance
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        return hand_eye_table(self.hand_eye, str(self.out / "report.html"))
+
+
+def hand_eye_table(hand_eye: HandEye, report: str) -> str:
+    """The transform with its standard deviations as HTML."""
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    mm = 1e3 * hand_eye.gripper_from_camera[:3, 3]
+    turn = np.degrees(rotation_log(hand_eye.gripper_from_camera[:3, :3]))
+    rows = "".join(
+        f"<tr><th>{axis}</th><td>{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm</td>"
+        f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
+        for k, axis in enumerate("xyz")
+    )
+    verdict = "accepted" if hand_eye.converged else f"rejected: {escape('; '.join(hand_eye.warnings))}"
+    return (
+        f"<p><b>gripper_from_camera</b>, {verdict}; {int(hand_eye.inliers.sum())} of {len(hand_eye.inliers)} poses "
+        f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
+        f"<p>1σ, gripper axes. {escape(report)}</p>"
+    )
 
 
 @dataclass(frozen=True)

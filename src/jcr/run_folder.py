@@ -18,16 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr import __version__
-from jcr.calibration.calibration_json import (
-    CalibrationFile,
-    first_fault,
-    read_calibration,
-    write_calibration,
-)
+from jcr.calibration.calibration_json import CalibrationFile, read_calibration, write_calibration
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.words import log
 from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.capture_json import kept
+from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.files import remove_unfinished, write_text

@@ -71,7 +71,7 @@ def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
     _, hand_eye = calibrated(0, images, scaled(factor))
     found = re.match(
-        r"the pictures show a focal length of (\d+) ± \S+ px where (\d+) is given;", said(hand_eye)
+        r"the pictures show a focal length of ([\d.]+) ± \S+ px where ([\d.]+) is given", said(hand_eye)
     )
     assert found is not None
     assert float(found[1]) == pytest.approx(LENS.fx, rel=0.01)
@@ -112,7 +112,7 @@ def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:
     turned = said(calibrated(0, 10, replace(LENS, distortion=(-k1, *others)))[1])
     assert "distortion" in turned and "focal" not in turned and "principal" not in turned
     shifted = said(calibrated(0, 10, replace(LENS, cx=LENS.cx + 30))[1])
-    found = re.match(r"the pictures show a principal point of \((\d+), (\d+)\) ± ", shifted)
+    found = re.match(r"the pictures show a principal point of \(([\d.]+), ([\d.]+)\) ± ", shifted)
     assert found is not None and "focal" not in shifted and "distortion" not in shifted
     assert [float(found[1]), float(found[2])] == pytest.approx([LENS.cx, LENS.cy], abs=4)
 

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -105,6 +106,34 @@ def test_exif_rotation_is_honoured(capture: Path):
         file.unlink()
     edit(capture, lambda c: [f.update(image=f["image"].replace("jpg", "png")) for f in c["frames"]])
     assert jcr.read_capture(capture).image_size == (640, 480)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_what_exif_turns_is_said(capture: Path, orientation: int):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for file in sorted((capture / "images").glob("*.jpg")):
+        Image.open(file).save(file, quality=95, exif=exif)
+    found = jcr.read_capture(capture)
+    assert found.orientation == orientation
+    said = [note for note in found.notes if f"EXIF orientation {orientation}: the images are rotated" in note]
+    assert len(said) == (orientation != 1)
+    if orientation == 3:
+        last = sorted((capture / "images").glob("*.jpg"))[-1]
+        Image.open(last).save(last, quality=95)
+        with pytest.raises(jcr.InputError, match="EXIF orientation 1, but .* has 3"):
+            jcr.read_capture(capture)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
+def test_the_bits_that_are_used_are_read(tmp_path: Path, bits: int, shape: tuple[int, ...]):
+    ramp = np.linspace(0, 255, 64).round().astype(np.uint16)
+    shown = np.broadcast_to(ramp.reshape(1, 64, *[1] * (len(shape) - 2)), shape)
+    (tmp_path / "deep.png").write_bytes(
+        cv2.imencode(".png", (shown << (bits - 8)).astype(np.uint16))[1].tobytes()
+    )
+    assert (read_image(tmp_path / "deep.png")[..., 0] == ramp).all()
 
 
 def test_sixteen_bit_grey_and_cmyk_are_read(tmp_path: Path):

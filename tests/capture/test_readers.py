@@ -247,7 +247,7 @@ FAULTS = {
     "image not there": (
         lambda f: edit_line(f, 1, lambda line: "images/99.jpg" + line[line.index(",") :]),
         {},
-        r"99\.jpg: no such image",
+        r"99\.jpg; add them",
     ),
     "image outside": (
         lambda f: edit_line(f, 1, lambda line: "../99.jpg" + line[line.index(",") :]),

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,8 +23,9 @@ from jcr.live.asks import Ask, pose_of_numbers
 from jcr.live.camera import Frame, opened
 from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
-from jcr.live.line_server import MAX_LINE, Listen, bound, served_poses
+from jcr.live.line_server import MAX_LINE, MOST_REFUSED, Listen, bound, served_poses
 from jcr.live.look import picture
+from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
 from jcr.simulate.ur import SimulatedUr
 from places import ROOT
@@ -57,9 +59,13 @@ def video(path: Path, tabletop: Path, images: range, rest_s: int = 1) -> Path:
 
 def taken(folder: Path, camera: Path, asks: Iterator[Ask], **options) -> list[dict]:
     answers: list[dict] = []
-    with opened(str(camera)) as frames:
+    with opened(str(camera)) as opened_camera:
         collect(
-            LiveFolder(folder), frames, asks, CollectOptions(**options), lambda a, lines: answers.append(a)
+            LiveFolder(folder),
+            opened_camera,
+            asks,
+            CollectOptions(**options),
+            lambda a, lines: answers.append(a),
         )
     return answers
 
@@ -97,7 +103,8 @@ def test_each_pose_gets_the_picture_that_was_still_there_and_a_stopped_capture_g
         assert np.allclose(capture.base_from_gripper[k], pose[k])
         assert (capture.folder / LiveFolder.thumbnail(name)).is_file()
     page = (tmp_path / "c" / "live.html").read_text()
-    assert "5 pictures of 5" in page and page.count("<img") == 5 and "best next" in page
+    assert "5 pictures of 5" in page and page.count('<img src="thumbnails/') == 5 and "Next pose" in page
+    assert (tmp_path / "c" / "live" / "now.jpg").is_file()
 
 
 def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_told(tmp_path: Path, tabletop: Path):
@@ -217,6 +224,31 @@ def test_others_need_the_token(tabletop: Path):
     assert len(heard) == 1
 
 
+def test_a_client_that_drips_or_floods_is_dropped_and_others_are_served(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("jcr.live.line_server.LINE_S", 0.4)
+    with serving(Listen(port=0, timeout_s=20.0)) as (port, heard):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as dripping:
+            begun = time.monotonic()
+            with pytest.raises(OSError):
+                while time.monotonic() - begun < 10:
+                    dripping.sendall(b" ")
+                    time.sleep(0.1)
+            assert time.monotonic() - begun < 5
+        flooding = Client(port)
+        answers = [flooding.ask({"pose": k}) for k in range(MOST_REFUSED)]
+        assert not any(answer["accepted"] for answer in answers)
+        assert "in a row were refused" in flooding.ask({"pose": 0})["reason"]
+        assert flooding.lines.readline() == ""
+        flooding.close()
+        friend = Client(port)
+        half = json.dumps({"base_from_gripper": [0.4, 0, 0.5, 0, np.pi, 0]})
+        friend.socket.sendall(half[:20].encode())
+        time.sleep(0.1)
+        assert friend.ask(half[20:]) == {"accepted": True}
+        friend.close()
+    assert len(heard) == 1
+
+
 def test_silence_ends_the_wait():
     listen = Listen(port=0, timeout_s=0.1)
     with bound(listen) as server, pytest.raises(jcr.InputError, match="nobody sent a pose"):
@@ -226,11 +258,13 @@ def test_silence_ends_the_wait():
 @pytest.mark.parametrize("length", [812, 1060, 1220])
 def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
     goals = np.array(poses(tabletop)[:3])
-    with SimulatedUr(goals, length) as robot:
-        asks = ur.ur_poses("127.0.0.1", robot.port, lambda text: None)
-        for goal in goals:
+    angles = np.linspace(-1, 1, 18).reshape(3, 6)
+    with SimulatedUr(goals, length, angles) as robot:
+        asks = asks_at_rest(lambda: ur.states("127.0.0.1", robot.port))
+        for goal, joints in zip(goals, angles, strict=True):
             ask = next(asks)
             assert np.allclose(ask.base_from_gripper, goal, atol=1e-9)
+            assert ask.joints is not None and np.allclose(ask.joints, joints)
             ask.answer({"accepted": True})
         assert ask.current is not None and np.allclose(ask.current(), goals[2], atol=1e-9)
 

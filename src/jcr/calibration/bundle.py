@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by
+from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by, prior_of
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve
@@ -82,8 +82,8 @@ class Adjusted:
     """m, rad per axis: what of these is left in the poses."""
     given_noise: tuple[float, float] | None
     """As `adjust` was told it."""
-    intrinsics_covariance: Float[ndarray, "9 9"]
-    """In the order of camera.PARAMETERS."""
+    intrinsics_covariance: Float[ndarray, "q q"]
+    """In the order of camera.parameters."""
     pixels: PixelErrors
     missed: Float[ndarray, "m 6"]
     """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment that does not use it."""
@@ -142,16 +142,18 @@ def adjust(
     intrinsics: Intrinsics,
     tracks: Tracks,
     noise: tuple[float, float] | None = None,
-    free: IntrinsicsPrior = HELD,
+    free: IntrinsicsPrior | None = None,
     systematic: Float[ndarray, "s s"] | None = None,
     max_iterations: int = 60,
 ) -> Adjusted:
     """Adjust from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
     `noise` is the robot's (m, rad), at least; it is estimated with the rest. `systematic` is the covariance of its
-    systematic errors at 1 rad; None: that of errors smooth over the poses. `free` is what is known of the intrinsics.
+    systematic errors at 1 rad; None: that of errors smooth over the poses. `free` is what is known of the
+    intrinsics; None: that they are exact.
     """
     x, scale, z = start
+    free = prior_of(intrinsics, HELD) if free is None else free
     order = _usable(tracks)
     kept, point = np.unique(tracks.point[order], return_inverse=True)
     problem = _Problem(
@@ -479,10 +481,10 @@ def _by_intrinsics(covariance: Float[ndarray, "p p"]) -> Float[ndarray, "7 c"]:
 
 def freed_intrinsics(
     adjusted: Adjusted, free: IntrinsicsPrior
-) -> tuple[Float[ndarray, "9"], Float[ndarray, "9 9"]]:
+) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
     """The camera one Gauss-Newton step on, with another prior about where its parameters started, and the covariance.
 
-    In the order of camera.PARAMETERS.
+    In the order of camera.parameters.
     """
     problem, bundle = replace(adjusted.problem, free=free), adjusted.bundle
     view = _view(bundle, problem)

@@ -11,19 +11,22 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from jcr.capture.plain_files import read_json
+from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.geometry import HUGE, require_rigid
 from jcr.records import (
+    COEFFICIENTS,
     COVARIANCE_ORDER,
     Attempt,
     Capture,
     HandEye,
     ImageVerdict,
     Intrinsics,
+    LensModel,
     PosePairs,
     Reconstruction,
+    coefficients_of,
 )
 from jcr.rounding import significant
 
@@ -167,11 +170,24 @@ class Lens(_Part):
     fy: Positive
     cx: float
     cy: float
-    distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
+    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
     width: Pixels
     height: Pixels
-    std: Annotated[list[Spread], Field(min_length=9, max_length=9)] | None = None
+    model: LensModel = "pinhole"
+    std: list[Spread] | None = None
     """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
+
+    @model_validator(mode="after")
+    def _as_many_as_the_model_has(self) -> "Lens":
+        if len(self.distortion) != len(COEFFICIENTS[self.model]):
+            raise ValueError(
+                f"{len(self.distortion)} coefficients, but a {self.model} lens has {COEFFICIENTS[self.model]}"
+            )
+        if self.std is not None and len(self.std) != 4 + len(self.distortion):
+            raise ValueError(
+                f"{len(self.std)} standard deviations, but a {self.model} lens has {4 + len(self.distortion)} parameters"
+            )
+        return self
 
 
 class NetworkScale(_Part):
@@ -515,7 +531,9 @@ def _content(file: Path) -> dict[str, object]:
 def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
     kind = content.get("format")
     if kind != FORMAT:
-        raise InputError(f"{file}: format {kind!r}, this version reads {FORMAT!r}; use the jcr that wrote it")
+        raise InputError(
+            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; use the jcr that wrote it"
+        )
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
         return CalibrationFile.model_validate_json(json.dumps(content), strict=True)
@@ -523,15 +541,7 @@ def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
 
 
-def first_fault(error: ValidationError) -> str:
-    """Where the first thing wrong is, and what."""
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
-    what = first["msg"].removeprefix("Value error, ")
-    return f"{place}: {what}" if place else what
-
-
-def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "9 9"] | None = None) -> Lens | None:
+def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "q q"] | None = None) -> Lens | None:
     if intrinsics is None:
         return None
     std = None if covariance is None else np.sqrt(np.diag(covariance)).tolist()
@@ -540,5 +550,13 @@ def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "9 9"] | Non
 
 def intrinsics_of(lens: Lens) -> Intrinsics:
     """The record of a file's lens."""
-    k1, k2, p1, p2, k3 = lens.distortion
-    return Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, (k1, k2, p1, p2, k3))
+    return Intrinsics(
+        lens.fx,
+        lens.fy,
+        lens.cx,
+        lens.cy,
+        lens.width,
+        lens.height,
+        coefficients_of(lens.distortion),
+        lens.model,
+    )

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
-from jcr.camera import PARAMETERS, by_parameters, parameters, unproject, without_distortion
+from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.equation import Poses
 from jcr.records import HandEye, Intrinsics, Tracks
@@ -65,7 +65,7 @@ def lens_doubt(
     found = _found_off(freed, held, tracks, SURE, 1.0)
     if not found:
         return None
-    as_given = adjusted_with(HELD)
+    as_given = adjusted_with(prior_of(held, HELD))
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shift = max(
         _shift(hand_eye.gripper_from_camera, hand_eye.scale, freed),
@@ -96,7 +96,7 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float
         off.append(
             f"a focal length of {camera[0]:.0f} ± {significant(std[0])} px where {held.fx:.0f} is given"
         )
-    used_radius = np.linalg.norm(unproject(without_distortion(held), tracks.x_px)[:, :2], axis=1)
+    used_radius = np.linalg.norm(unproject(held, tracks.x_px)[:, :2], axis=1)
     radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
     ray = np.stack([radius, 0 * radius, np.ones(9)], axis=1)
     bends = by_parameters(held, ray)[:, 0, [K1, K2]]

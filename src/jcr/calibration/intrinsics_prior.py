@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import PARAMETERS
+from jcr.camera import parameter_names
 from jcr.records import Intrinsics
 
 MEASURED = {
@@ -45,6 +45,8 @@ FROM_FEATURES = {
 }
 """By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
 from other features of the same pictures differ by the square root of two times that (docs/architecture.md)."""
+HELD: dict[str, float] = {}
+"""Of intrinsics that are exact."""
 LEAST = 1e-12
 """A standard deviation below it leaves a parameter as it is."""
 
@@ -53,24 +55,24 @@ LEAST = 1e-12
 class IntrinsicsPrior:
     """Independent directions in which intrinsics may differ from where they start, with their standard deviations."""
 
-    directions: Float[ndarray, "9 c"]
-    """In the order of camera.PARAMETERS."""
+    directions: Float[ndarray, "q c"]
+    """In the order of camera.parameters."""
     std: Float[ndarray, " c"]
 
 
 def prior_of(
-    intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, "9"] = MEASURED
+    intrinsics: Intrinsics, std: dict[str, float] | Float[ndarray, " q"] = MEASURED
 ) -> IntrinsicsPrior:
-    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of PARAMETERS.
+    """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of its `parameters`.
 
-    One that is not a number is that of MEASURED.
+    One that is not a number is that of MEASURED. Coefficients that a lens model does not have are left out.
     """
     if not isinstance(std, dict):
         usual = prior_of(intrinsics)
         spread = np.sqrt(usual.directions**2 @ usual.std**2)
         std = np.where(np.isnan(std), spread, std)
         free = np.flatnonzero(std > LEAST)
-        return IntrinsicsPrior(np.eye(len(PARAMETERS))[:, free], std[free])
+        return IntrinsicsPrior(np.eye(len(std))[:, free], std[free])
     fx, fy, width = intrinsics.fx, intrinsics.fy, intrinsics.width
     moves = {
         "f": {"fx": fx, "fy": fy},
@@ -78,11 +80,13 @@ def prior_of(
         "cx": {"cx": width},
         "cy": {"cy": width},
     }
-    directions = np.zeros((len(PARAMETERS), len(std)))
-    for column, name in enumerate(std):
+    names = parameter_names(intrinsics)
+    known = {name: value for name, value in std.items() if name in moves or name in names}
+    directions = np.zeros((len(names), len(known)))
+    for column, name in enumerate(known):
         for parameter, unit in moves.get(name, {name: 1.0}).items():
-            directions[PARAMETERS.index(parameter), column] = unit
-    return IntrinsicsPrior(directions, np.array(list(std.values())))
+            directions[names.index(parameter), column] = unit
+    return IntrinsicsPrior(directions, np.array(list(known.values())))
 
 
 def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c c"]:
@@ -92,7 +96,3 @@ def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c 
     to_prior = np.linalg.pinv(prior.directions)
     information = np.linalg.inv(to_prior @ spread @ to_prior.T + LEAST * np.diag(prior.std**2))
     return np.linalg.inv(information + np.diag(prior.std**-2.0))
-
-
-HELD = IntrinsicsPrior(np.zeros((len(PARAMETERS), 0)), np.zeros(0))
-"""Of intrinsics that are exact."""

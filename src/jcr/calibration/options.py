@@ -1,6 +1,7 @@
 """How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -9,6 +10,8 @@ class CalibrateOptions:
 
     robot_noise: tuple[float, float] | None = None
     """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    scale: float | None = None
+    """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
     robot: str | None = None
     """Name of the arm (see `jcr simulate --help`), whose joint offsets and link errors then count as such; else the one
     that the capture names."""
@@ -16,5 +19,7 @@ class CalibrateOptions:
     """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
     known_length: tuple[str, float, float, float, float, float] | None = None
     """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
+    focus: Literal["fixed", "varies"] = "fixed"
+    """varies: a focal length for each image, of a camera whose focus moved while the images were taken."""
     bundle_adjustment: bool = True
     """Refine with the image correspondences; without, the camera poses alone decide."""

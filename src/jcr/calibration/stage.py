@@ -1,5 +1,6 @@
 """The calibration stage: poses first, robustly; then images, points, lens and robot adjusted together."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,12 +8,15 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
+from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
-from jcr.calibration.given_intrinsics import LensDoubt, lens_doubt
+from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
+from jcr.capture.checks import how_turned
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
@@ -78,6 +82,9 @@ def calibrate(
     )
     if unused is not None:
         hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, unused))
+    hand_eye = _in_sequence(hand_eye, capture, reconstruction, systematic)
+    if (turned := how_turned(capture)) is not None:
+        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, turned))
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
@@ -174,6 +181,16 @@ def _calibrated(
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
+    if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
+        faults = _camera_faults(
+            hand_eye, capture, reconstruction, tracks, noise, adjusted, options, systematic
+        )
+        if options.focus == "varies" and hand_eye.converged:
+            hand_eye = _refined(hand_eye, faults.adjusted, gripper, camera, reconstruction)
+            hand_eye.covariance[:6, :6] += faults.more_covariance
+            hand_eye = judged(hand_eye)
+        if faults.faults:
+            return _with_faults(hand_eye, faults.faults)
     if (
         adjusted is None
         and hand_eye.converged
@@ -207,17 +224,74 @@ def _calibrated(
         _of_poses(systematic, np.flatnonzero(used)),
         adjusted,
     )
-    return hand_eye if doubt is None else _doubted(kept, doubt)
+    return hand_eye if doubt is None else _with_faults(kept, [Fault(doubt.text, doubt.shift, of_lens=True)])
 
 
-def _doubted(hand_eye: HandEye, doubt: LensDoubt) -> HandEye:
-    """With what the lens does counted as uncertainty, and named: first, where that is more than can be trusted."""
-    covariance = hand_eye.covariance + np.outer(doubt.shift, doubt.shift)
-    widened = judged(replace(hand_eye, covariance=covariance, lens_shift=doubt.shift))
-    if hand_eye.converged and widened.converged:
-        return replace(widened, warnings=(*widened.warnings, doubt.text))
-    # More images, the cure for a large covariance, do not mend a lens.
-    return replace(widened, converged=False, warnings=(doubt.text, *hand_eye.warnings))
+def _with_faults(hand_eye: HandEye, faults: Sequence[Fault]) -> HandEye:
+    """With what the faults do counted as uncertainty, and named: first, where that is more than can be trusted."""
+    for fault in faults:
+        by_lens = fault.shift if fault.of_lens else np.zeros(7)
+        if hand_eye.lens_shift is not None:
+            by_lens = np.hypot(by_lens, hand_eye.lens_shift)
+        covariance = hand_eye.covariance + np.outer(fault.shift, fault.shift)
+        lens_shift = by_lens if by_lens.any() else None
+        earlier, trusted = hand_eye.warnings, hand_eye.converged
+        hand_eye = judged(replace(hand_eye, covariance=covariance, lens_shift=lens_shift))
+        if trusted and hand_eye.converged and not fault.rejects:
+            hand_eye = replace(hand_eye, warnings=(*earlier, fault.text))
+        else:
+            # More images, the cure for a large covariance, do not mend a lens.
+            hand_eye = replace(hand_eye, converged=False, warnings=(fault.text, *earlier))
+    return hand_eye
+
+
+def _camera_faults(
+    hand_eye: HandEye,
+    capture: Capture,
+    reconstruction: Reconstruction,
+    tracks: Tracks,
+    noise: tuple[float, float] | None,
+    adjusted: Adjusted | None,
+    options: CalibrateOptions,
+    systematic: Float[ndarray, "r r"],
+) -> CameraFaults:
+    """What the used images say against one camera, whether or not their calibration is accepted."""
+    used, start = hand_eye.inliers, (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon)
+    rows, estimated = reconstruction.image_index[used], capture.intrinsics is None
+
+    def readjust(observations: Tracks, intrinsics: Intrinsics) -> Adjusted:
+        camera = reconstruction.recon_from_camera[used]
+        return adjust(
+            capture.base_from_gripper[rows],
+            start,
+            camera,
+            intrinsics,
+            observations,
+            noise,
+            _intrinsics_prior(capture, intrinsics),
+            _of_poses(systematic, np.flatnonzero(used)),
+        )
+
+    if adjusted is None:
+        adjusted = readjust(tracks, reconstruction.intrinsics)
+    # An answer that is rejected has no uncertainty beside which a fault could be small.
+    covariance = adjusted.covariance if hand_eye.converged else np.zeros((7, 7))
+    names = [capture.images[row] for row in rows]
+    return camera_faults(
+        adjusted, tracks, readjust, covariance, not estimated, names, options.focus == "varies"
+    )
+
+
+def _in_sequence(
+    hand_eye: HandEye, capture: Capture, reconstruction: Reconstruction, systematic: Float[ndarray, "r r"]
+) -> HandEye:
+    """With a slip, a drift or a delay that the order of the images shows, where no fault of the camera does."""
+    if hand_eye.lens_shift is not None or any(CAMERA_FAULT in text for text in hand_eye.warnings):
+        return hand_eye
+    rows, camera = reconstruction.image_index, reconstruction.recon_from_camera
+    names = [capture.images[row] for row in rows]
+    fault = sequence_fault(hand_eye, capture.base_from_gripper[rows], camera, names, systematic)
+    return hand_eye if fault is None else _with_faults(hand_eye, [fault])
 
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
@@ -259,14 +333,18 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
     systematic = systematic_errors(gripper, None if options.robot is None else arm_named(options.robot))
-    hand_eye = solve_hand_eye(
-        gripper, camera, robot_noise=noise, cues=Cues(offset=offset), systematic=systematic
-    )
-    if pairs.is_metric and not hand_eye.observability.observable:
-        cues = Cues((1.0, METRIC_STD), offset)
-        hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
-        remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
-        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    cues = Cues(offset=offset)
+    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
+    scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
+    hand_eye = free
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
+    if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
+        hand_eye = solve_hand_eye(
+            gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
+        )
+        if not free.observability.observable and scale == 1.0:
+            remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
+            return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     if pairs.is_metric and not is_one(hand_eye):

@@ -156,7 +156,8 @@ def attempt_in_words(attempt: Attempt, images: int) -> str:
     )
     verdict = "kept" if attempt.why_not is None else f"not kept ({attempt.why_not})"
     times = f"reconstruct {attempt.reconstruct_s:.2f} s, calibrate {attempt.calibrate_s:.2f} s"
-    return f"{attempt.backend} registered {registered}, {verdict}; {times}"
+    features = f" with {attempt.features}" if attempt.features else ""
+    return f"{attempt.backend}{features} registered {registered}, {verdict}; {times}"
 
 
 def missed(held_out: "HeldOut | HeldOutError") -> str:

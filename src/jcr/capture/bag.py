@@ -3,14 +3,16 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Int
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import lens_of_ros, read_camera_info
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
+from jcr.capture.plain_files import first_fault, read_yaml
 from jcr.capture.pose_track import speed
 from jcr.capture.recording import capture_of_recording
 from jcr.capture.ros_image import picture_of
@@ -22,6 +24,7 @@ from jcr.records import Capture, Intrinsics
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+METADATA = "metadata.yaml"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -87,6 +90,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 def _opened(path: Path) -> Iterator[Any]:
     highlevel = extra("rosbags.highlevel", "ros", "a bag")
     typesys = extra("rosbags.typesys", "ros", "a bag")
+    if (path / METADATA).is_file():
+        _check_metadata(path / METADATA)
     try:
         # Older sqlite3 bags hold no message definitions; those of the standard messages never changed since.
         standard = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -100,6 +105,34 @@ def _opened(path: Path) -> Iterator[Any]:
         yield reader
     finally:
         reader.close()
+
+
+class _Metadata(BaseModel):
+    """What rosbags takes from a metadata.yaml without a look at its kind."""
+
+    model_config = ConfigDict(extra="ignore")
+    relative_file_paths: Annotated[list[Annotated[str, Field(max_length=1000)]], Field(max_length=10_000)]
+    files: list[dict[str, Any]] | None = None
+    topics_with_message_count: list["_Counted"]
+
+
+class _Counted(BaseModel):
+    topic_metadata: "_Topic"
+
+
+class _Topic(BaseModel):
+    name: str
+    type: str
+
+
+def _check_metadata(file: Path) -> None:
+    content = read_yaml(file)
+    try:
+        _Metadata.model_validate(content.get("rosbag2_bagfile_information"), strict=True)
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; make it again with `ros2 bag reindex`") from None
+    except AttributeError:
+        raise InputError(f"{file}: describes no bag; make it again with `ros2 bag reindex`") from None
 
 
 def _refuse_other_definitions(reader: Any, connections: list[Any], path: Path) -> None:

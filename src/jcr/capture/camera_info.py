@@ -7,9 +7,17 @@ from typing import Any
 from jcr.capture.checks import checked_lens
 from jcr.capture.plain_files import read_yaml
 from jcr.errors import InputError
-from jcr.records import Intrinsics
+from jcr.records import COEFFICIENTS, Intrinsics, LensModel
 
 FILE = "camera_info.yaml"
+_MODELS: dict[Any, LensModel] = {
+    "": "pinhole",
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "rational",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+"""By their names in ROS (sensor_msgs/distortion_models.hpp; depthai and others write fisheye)."""
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
@@ -24,6 +32,8 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
             f"{file}: no camera_info; it needs image_width, image_height, camera_matrix, distortion_model and "
             "distortion_coefficients"
         ) from None
+    if not isinstance(matrix, list) or not isinstance(coefficients, list):
+        raise InputError(f"{file}: the camera matrix and the distortion must be lists of numbers")
     return lens_of_ros(matrix, model, coefficients, calibrated, size, str(file))
 
 
@@ -37,10 +47,8 @@ def lens_of_ros(
 ) -> Intrinsics | None:
     """Intrinsics from K (9 numbers) and D; None for the zeros of a camera that was never calibrated.
 
-    Raises InputError for a lens that OpenCV's five coefficients cannot say, or of another resolution.
+    Raises InputError for a distortion that jcr does not know, or intrinsics of another resolution.
     """
-    if not all(isinstance(value, Sequence) for value in (matrix, coefficients, calibrated_size)):
-        raise InputError(f"{where}: the camera matrix and the distortion must be lists of numbers")
     if len(matrix) != 9:
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
@@ -50,11 +58,17 @@ def lens_of_ros(
             f"{where}: calibrated at {'x'.join(map(str, calibrated_size))}, the images are "
             f"{'x'.join(map(str, size))}; give the intrinsics of these images"
         )
-    beyond = any(coefficients[5:])
-    if any(coefficients) and (model not in ("plumb_bob", "rational_polynomial", "") or beyond):
+    focal_and_centre = [matrix[0], matrix[4], matrix[2], matrix[5]]
+    known = _MODELS.get(model)
+    if known is None and not any(coefficients):
+        known = "pinhole"
+    if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
-            f"{where}: distortion model {model} with {len(coefficients)} coefficients; jcr knows plumb_bob "
-            "(k1, k2, p1, p2, k3): use rectified images, or calibrate with plumb_bob"
+            f"{where}: distortion model {model} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
+            "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
         )
-    five = [*coefficients[:5], *[0.0] * (5 - len(coefficients))]
-    return checked_lens([matrix[0], matrix[4], matrix[2], matrix[5]], five, size, where)
+    if known == "rational" and not any(coefficients[5:]):
+        known = "pinhole"
+    count = len(COEFFICIENTS[known])
+    padded = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
+    return checked_lens(focal_and_centre, padded, size, where, known)

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.checks import checked_capture, checked_lens, read_rigid
+from jcr.capture.checks import checked_capture, checked_lens, first_few, read_rigid, require_images
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import contained, read_json
+from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics
 
 FILE, URDF = "capture.json", "robot.urdf"
 MOST_TURNS = 6 * np.pi + 0.01
@@ -32,13 +32,14 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
     frames = content["frames"]
     images = [_image_name(frame, i, file) for i, frame in enumerate(frames)]
+    require_images(folder, images, str(file))
     without_pose = [
         name for name, frame in zip(images, frames, strict=True) if "base_from_gripper" not in frame
     ]
     if without_pose:
         raise InputError(
             f"{file}: {len(images)} images but {len(images) - len(without_pose)} gripper poses; "
-            f"add base_from_gripper to {', '.join(without_pose)}"
+            f"add base_from_gripper to {first_few(without_pose)}"
         )
     poses = [
         read_rigid(frame["base_from_gripper"], f"{file}: base_from_gripper of frame {i} ({name})")
@@ -67,8 +68,19 @@ def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None
     if not isinstance(lens, dict) or not {"fx", "fy", "cx", "cy"} <= lens.keys():
         raise InputError(f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null")
     focal_and_centre = [lens[key] for key in ("fx", "fy", "cx", "cy")]
-    distortion = lens.get("distortion") or [0.0] * 5
-    return checked_lens(focal_and_centre, distortion, size, where)
+    model = lens.get("model", "pinhole")
+    if model not in COEFFICIENTS:
+        raise InputError(f"{where}: lens model {model!r} is not known; give one of {', '.join(COEFFICIENTS)}")
+    distortion = lens.get("distortion") or [0.0] * len(COEFFICIENTS[model])
+    if not isinstance(distortion, list):
+        raise InputError(f"{where}: distortion must be a list [{','.join(COEFFICIENTS[model])}]")
+    return checked_lens(focal_and_centre, distortion, size, where, model)
+
+
+def lens_as_json(lens: Intrinsics) -> dict[str, Any]:
+    """The "intrinsics" of a capture.json."""
+    model = {} if lens.model == "pinhole" else {"model": lens.model}
+    return model | {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
 
 
 def _intrinsics_std(given: Any, lens: Intrinsics | None, file: Path) -> Float[ndarray, " p"] | None:
@@ -109,9 +121,7 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         if capture.urdf.resolve() != (folder / URDF).resolve():
             write_bytes(folder / URDF, capture.urdf.read_bytes())
         arm["urdf"] = URDF
-    lens = None
-    if capture.intrinsics is not None:
-        lens = {key: getattr(capture.intrinsics, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
+    lens = None if capture.intrinsics is None else lens_as_json(capture.intrinsics)
     stated: dict[str, Any] = {"frames": frames, "intrinsics": lens}
     if capture.intrinsics_std is not None:
         std = [None if np.isnan(value) else value for value in capture.intrinsics_std.tolist()]
@@ -141,7 +151,7 @@ def _joints(frames: list[Any], images: list[str], file: Path) -> Float[ndarray, 
         return None
     if not all(with_joints):
         without = [name for name, has in zip(images, with_joints, strict=True) if not has]
-        raise InputError(f"{file}: no joints at {', '.join(without)}; give them for all frames or for none")
+        raise InputError(f"{file}: no joints at {first_few(without)}; give them for all frames or for none")
     rows = []
     for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
         where = f"{file}: joints of frame {i} ({name})"
@@ -168,7 +178,9 @@ def _robot(
     if name is None:
         return None, ()
     if name not in ROBOT_NAMES:
-        return None, (f"robot {name!r} is not one of {', '.join(ROBOT_NAMES)}: its kinematics are not used",)
+        return None, (
+            f"robot {shown(name)} is not one of {', '.join(ROBOT_NAMES)}: its kinematics are not used",
+        )
     dof = arm_named(name).dof
     if joints is not None and joints.shape[1] != dof:
         raise InputError(
@@ -191,5 +203,4 @@ def _urdf(name: Any, file: Path) -> Path | None:
 def _image_name(frame: Any, index: int, file: Path) -> str:
     if not isinstance(frame, dict) or not isinstance(frame.get("image"), str):
         raise InputError(f'{file}: frame {index} has no "image"; give the image\'s path as text')
-    contained(file.parent, frame["image"], f"{file}: frame {index}")
     return frame["image"]

@@ -1,6 +1,8 @@
 """What every reader of captures demands, whatever the format: sound files, rigid metres, one camera."""
 
 import hashlib
+import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,13 +11,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import read_image
+from jcr.capture.images import TURNED, how_stored, read_image
 from jcr.capture.options import MIN_FRAMES
-from jcr.capture.plain_files import contained
+from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel, coefficients_of
 
+NAMED = 10
+"""Images that a message names; of more it says how many."""
+MIRRORED = (2, 4, 5, 7)
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
@@ -29,15 +34,37 @@ def checked_capture(
     """
     if not images:
         require_frames(0, where)
-    for name in images:
-        contained(folder, name, where)
-    twice = {name for name in images if images.count(name) > 1}
+    require_images(folder, images, where)
+    twice = [name for name, count in Counter(images).items() if count > 1]
     if twice:
         raise InputError(
-            f"{where}: names {', '.join(sorted(twice))} more than once; keep one frame per image"
+            f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
         )
     check_metres(base_from_gripper, where)
-    return Capture(folder, tuple(images), base_from_gripper, _common_size(folder, images))
+    size = _common_size(folder, images)
+    orientation = _common_orientation(folder, images)
+    return Capture(folder, tuple(images), base_from_gripper, size, orientation=orientation)
+
+
+def require_images(folder: Path, images: Sequence[str], where: str) -> None:
+    """InputError where images are not there, or lead out of the folder: before anything takes long."""
+    rows = [k for k, name in enumerate(images) if not os.path.exists(folder / name)]
+    for k in rows[:NAMED] or range(len(images)):
+        contained(folder, images[k], f"{where}: frame {k}")
+    missing = [images[k] for k in rows]
+    if len(missing) == 1:
+        raise InputError(f"{folder / missing[0]}: no such image; correct its name in {where} or add the file")
+    if missing:
+        raise InputError(
+            f"{where}: {len(missing)} of {len(images)} images are not there: {first_few(missing)}; correct the names "
+            "or add the files"
+        )
+
+
+def first_few(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(name[:LONGEST] for name in names[:NAMED]) + more
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
@@ -47,18 +74,26 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
 
 
 def checked_lens(
-    focal_and_centre: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int], where: str
+    focal_and_centre: Sequence[Any],
+    distortion: Sequence[Any],
+    size: tuple[int, int],
+    where: str,
+    model: LensModel = "pinhole",
 ) -> Intrinsics:
-    """Intrinsics of images of `size` from fx, fy, cx, cy and k1, k2, p1, p2, k3; InputError if they cannot be."""
+    """Intrinsics of images of `size` from fx, fy, cx, cy and the model's coefficients; InputError if they cannot be."""
+    names = COEFFICIENTS[model]
     try:
         fx, fy, cx, cy = (float(value) for value in focal_and_centre)
         coefficients = [float(k) for k in distortion]
     except (TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null"
+            f"{where}: need numbers fx, fy, cx, cy and distortion [{','.join(names)}], or null"
         ) from None
-    if len(coefficients) != 5:
-        raise InputError(f"{where}: distortion has {len(coefficients)} numbers, not the five k1,k2,p1,p2,k3")
+    if len(coefficients) != len(names):
+        raise InputError(
+            f"{where}: distortion has {len(coefficients)} numbers, not the {len(names)} of a {model} lens, "
+            f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
+        )
     if not np.isfinite([fx, fy, cx, cy, *coefficients]).all() or fx <= 0 or fy <= 0:
         raise InputError(
             f"{where}: fx and fy must be positive and all numbers finite; or give null to estimate them"
@@ -69,8 +104,7 @@ def checked_lens(
             f"{where}: the principal point ({cx:.4g}, {cy:.4g}) lies outside the {width}x{height} images; "
             "scale the intrinsics to this resolution"
         )
-    k1, k2, p1, p2, k3 = coefficients
-    return Intrinsics(fx, fy, cx, cy, width, height, (k1, k2, p1, p2, k3))
+    return Intrinsics(fx, fy, cx, cy, width, height, coefficients_of(coefficients), model)
 
 
 def read_rigid(value: Any, where: str) -> Float[ndarray, "4 4"]:
@@ -113,3 +147,39 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
                 "all images must come from one camera at one resolution"
             )
     return first
+
+
+def _common_orientation(folder: Path, images: Sequence[str]) -> int:
+    """The EXIF orientation of all images; InputError where they differ, as a camera's axes cannot."""
+    first = how_stored(folder / images[0]).orientation
+    for name in images[1:]:
+        if (other := how_stored(folder / name).orientation) != first:
+            raise InputError(
+                f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: turned to be shown, their "
+                "cameras' axes differ; remove the tag from all images (exiftool -Orientation= FILES)"
+            )
+    if first in MIRRORED:
+        raise InputError(
+            f"{folder / images[0]}: EXIF orientation {first}: {TURNED[first]}, and no camera sees a mirrored world; "
+            "remove the tag (exiftool -Orientation= FILES)"
+        )
+    return first
+
+
+def how_turned(capture: Capture) -> str | None:
+    """What a user must know of a capture whose images are turned to be shown."""
+    if capture.orientation == 1:
+        return None
+    return (
+        f"EXIF orientation {capture.orientation}: the images are {TURNED[capture.orientation]}, as viewers show them, "
+        "and gripper_from_camera and the intrinsics are of the camera that would see them so; for a driver that gives "
+        "the sensor's own images remove the tag (exiftool -Orientation= FILES) and calibrate again"
+    )
+
+
+def how_scaled(capture: Capture) -> str | None:
+    """What was done to images of 16 bits that use fewer."""
+    bits = {how_stored(capture.folder / name).bits for name in capture.images}
+    if max(bits) == 8:
+        return None
+    return f"images of 16 bits of which {' or '.join(map(str, sorted(bits)))} are used: read by the upper eight of those"

@@ -18,7 +18,7 @@ from jcr.capture.plain_files import contained
 from jcr.capture.table import gripper_poses
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
 if TYPE_CHECKING:
     import pycolmap
@@ -31,9 +31,10 @@ _COEFFICIENTS = {
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "FULL_OPENCV": COEFFICIENTS["rational"],
+    "OPENCV_FISHEYE": COEFFICIENTS["fisheye"],
 }
-"""COLMAP's camera models that OpenCV's five coefficients can say, and which of them follow in its parameters."""
+"""COLMAP's camera models that jcr knows, and which coefficients follow in their parameters."""
 
 
 def find_model(path: Path) -> Path | None:
@@ -123,10 +124,10 @@ def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
 
 def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
     """The one lens of all images, of the given size; InputError when there are several, or a strange one."""
-    model = read_model(folder)
+    found = read_model(folder)
     cameras = {
         (camera.model.name, camera.width, camera.height, *map(float, camera.params))
-        for camera in (model.camera(model.image(k).camera_id) for k in model.reg_image_ids())
+        for camera in (found.camera(found.image(k).camera_id) for k in found.reg_image_ids())
     }
     if len(cameras) > 1:
         raise InputError(
@@ -141,14 +142,11 @@ def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
         raise InputError(
             f"{folder}: cameras of {width}x{height}, images of {size[0]}x{size[1]}; use the same images"
         )
-    two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV")
+    two_focals = name in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
     focals, rest = (params[:2], params[2:]) if two_focals else (params[:1] * 2, params[1:])
     centre, rest = [value - HALF_PIXEL for value in rest[:2]], rest[2:]
     wanted = _COEFFICIENTS[name]
-    if any(rest[len(wanted) :]):
-        raise InputError(
-            f"{folder}: a distortion with k4 to k6, which jcr does not know; run colmap image_undistorter"
-        )
-    value = dict(zip(wanted, rest, strict=False))
-    distortion = [value.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    return checked_lens([*focals, *centre], distortion, size, str(folder))
+    value = dict(zip(wanted, rest, strict=True))
+    model: LensModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
+    distortion = [value.get(key, 0.0) for key in COEFFICIENTS[model]]
+    return checked_lens([*focals, *centre], distortion, size, str(folder), model)

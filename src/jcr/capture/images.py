@@ -3,6 +3,7 @@
 import struct
 import warnings
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,20 @@ MAX_PIXELS = 64_000_000
 """Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
 BLURRED = 0.25
 """Share of the usual sharpness below which an image is called blurred."""
+ORIENTATION = 0x0112
+"""The EXIF tag."""
+TURNED = {
+    2: "mirrored",
+    3: "rotated by 180°",
+    4: "mirrored and rotated by 180°",
+    5: "mirrored and rotated by 90°",
+    6: "rotated by 90° clockwise",
+    7: "mirrored and rotated by 90°",
+    8: "rotated by 90° counter-clockwise",
+}
+"""What is done to show an image of that orientation (EXIF 2.32, tag 274)."""
+PNG_DEPTH = 24
+"""Byte of a PNG's header that says how many bits a sample has."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
@@ -35,12 +50,11 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
                 if opened.format != "MPO" and pictures > 1:
                     raise InputError(f"{path}: holds {pictures} pictures; save one as PNG or JPEG")
                 opened.load()
-                upright = ImageOps.exif_transpose(opened)
-                if upright.mode.startswith("I"):  # 16-bit grey, which convert() would clip at 255
-                    grey = np.asarray(upright, dtype=np.float64)
-                    eight_bit = np.clip(grey / 256, 0, 255).astype(np.uint8)
-                    return np.repeat(eight_bit[..., None], 3, axis=2)
-                return np.asarray(upright.convert("RGB"))
+                if (deep := _sixteen_bit(path, opened)) is not None:
+                    shown = Image.fromarray((deep >> (_bits(deep) - 8)).astype(np.uint8))
+                    shown.getexif()[ORIENTATION] = opened.getexif().get(ORIENTATION, 1)
+                    opened = shown
+                return np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such image; correct its name in the capture or add the file") from None
     except InputError:
@@ -49,6 +63,48 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise InputError(f"{path}: over {MAX_PIXELS // 1_000_000} million pixels; shrink the image") from None
     except Exception as error:  # decoders raise whatever a damaged file makes them
         raise InputError(f"{path}: not a readable image ({error}); save it again as PNG or JPEG") from None
+
+
+def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
+    """Pixels of an image of 16 bits, grey or RGB; None of any other. Pillow keeps the upper eight of coloured ones."""
+    if opened.mode.startswith("I"):
+        return np.clip(np.asarray(opened, dtype=np.int64), 0, 65535).astype(np.uint16)
+    if opened.format != "PNG" or opened.mode not in ("RGB", "RGBA"):
+        return None
+    with path.open("rb") as stream:
+        depth = stream.read(PNG_DEPTH + 1)[PNG_DEPTH]
+    if depth != 16:
+        return None
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imread(str(path), flags)
+    return None if bgr is None or bgr.dtype != np.uint16 else np.asarray(bgr[..., ::-1])
+
+
+def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
+    """Bits that an image of 16 uses: sensors of 8, 10, 12 or 14 fill the lower ones, and black is what they show."""
+    largest = int(deep.max(initial=0))
+    return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
+
+
+@dataclass(frozen=True)
+class HowStored:
+    """What a file says of its pixels beside what they show."""
+
+    orientation: int
+    """EXIF: 1 as the sensor has it; others are turned, or mirrored, to be shown."""
+    bits: int
+    """Used of each colour."""
+
+
+def how_stored(path: Path) -> HowStored:
+    """Of an image that `read_image` reads."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Image.open(path) as opened:
+            orientation = opened.getexif().get(ORIENTATION, 1)
+            deep = _sixteen_bit(path, opened)
+    known = orientation if isinstance(orientation, int) and orientation in TURNED else 1
+    return HowStored(known, 8 if deep is None else _bits(deep))
 
 
 def _refuse_size(path: Path, size: tuple[int, int]) -> None:

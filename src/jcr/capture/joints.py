@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_text
 from jcr.capture.pose_track import Stamps, bracket
 from jcr.capture.robot_poses import RADIANS_LIMIT
-from jcr.capture.urdf_chain import chain_of
+from jcr.capture.urdf_chain import chain_of, load_urdf
 from jcr.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,15 +65,9 @@ class Arm:
 
 def read_arm(options: ReadOptions) -> Arm:
     """The arm in the URDF that the options name; InputError listing its links where they name none or no arm."""
-    import yourdfpy
-
     file = options.urdf
     assert file is not None
-    read_text(file)
-    try:
-        urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=True)
-    except Exception as error:  # the parser raises whatever its XML library does
-        raise InputError(f"{file}: not a readable URDF ({error}); expand xacro first") from None
+    urdf = load_urdf(file, build_scene_graph=True)
     by_child = {joint.child: joint for joint in urdf.robot.joints}
     base = str(options.base_frame or urdf.base_link)
     for option, link in (("--base-frame", base), ("--gripper-frame", options.gripper_frame)):

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -10,9 +9,8 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.joints import read_arm
-from jcr.capture.lerobot_files import INFO, Episode, pictures_in_table, read_episode
+from jcr.capture.lerobot_files import Episode, Feature, pictures_in_table, read_episode, read_info
 from jcr.capture.options import ReadOptions
-from jcr.capture.plain_files import read_json
 from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recording import capture_of_recording
@@ -32,19 +30,17 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
     Raises InputError listing the cameras, states or episodes that there are where those of the options are not.
     """
-    info = read_json(path / INFO)
-    if not isinstance(info, dict) or not isinstance(info.get("features"), dict) or "fps" not in info:
-        raise InputError(f"{path / INFO}: no LeRobot data set; it has no features or fps")
-    camera, key = _camera(info["features"], options, path), _state_key(info["features"], options, path)
+    info = read_info(path)
+    camera, key = _camera(info.features, options, path), _state_key(info.features, options, path)
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     state = np.concatenate([episode.state for episode in episodes])
-    poses, joints = _poses(state, key, info["features"][key], options, path)
+    poses, joints = _poses(state, key, info.features[key], options, path)
     ends = np.cumsum([len(episode.time_s) for episode in episodes])
     parts = np.split(np.arange(len(state)), ends[:-1])
     motion = np.concatenate(
         [_speed(episode, poses[part]) for episode, part in zip(episodes, parts, strict=True)]
     )
-    tolerance_s = 0.5 / float(info["fps"])
+    tolerance_s = 0.5 / info.fps
 
     def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
         for episode, part in zip(episodes, parts, strict=True):
@@ -75,8 +71,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     )
 
 
-def _camera(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
-    cameras = [key for key, feature in features.items() if feature.get("dtype") in ("video", "image")]
+def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
+    cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
     if options.camera_topic is not None or len(cameras) != 1:
@@ -86,10 +82,10 @@ def _camera(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
     return cameras[0]
 
 
-def _state_key(features: dict[str, Any], options: ReadOptions, path: Path) -> str:
+def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
     key = options.joint_topic or (CARTESIAN if CARTESIAN in features and options.urdf is None else STATE)
     if key not in features:
-        states = [name for name, feature in features.items() if str(feature.get("dtype")).startswith("float")]
+        states = [name for name, feature in features.items() if feature.dtype.startswith("float")]
         raise InputError(
             f"{path}: no {key}; choose the robot's state with --joint-topic: {', '.join(states)}"
         )
@@ -97,17 +93,14 @@ def _state_key(features: dict[str, Any], options: ReadOptions, path: Path) -> st
 
 
 def _poses(
-    state: Float[ndarray, "n k"], key: str, feature: dict[str, Any], options: ReadOptions, path: Path
+    state: Float[ndarray, "n k"], key: str, feature: Feature, options: ReadOptions, path: Path
 ) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n j"] | None]:
     """Gripper poses from the state: a pose by the names of its numbers or the convention asked for, or joints.
 
     The joint angles (rad) too, where the state has those of a chain of rotating joints.
     """
     where = f"{path}: {key}"
-    names = feature.get("names") or []
-    while isinstance(names, dict):  # {"motors": [...]} or {"axes": [...]}
-        names = next(iter(names.values()), [])
-    names = [str(name).removesuffix(".pos").lower() for name in names]
+    names = feature.numbers()
     if options.urdf is not None:
         arm = read_arm(options)
         recorded = state[:, arm.columns(names, where)]

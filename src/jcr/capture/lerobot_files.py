@@ -1,19 +1,81 @@
 """Where a LeRobot data set keeps an episode: v2.1 in files of its own, v3.0 among others in one file."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from string import Formatter
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from jcr.capture.plain_files import contained
+from jcr.capture.plain_files import contained, first_fault, read_json
 from jcr.errors import InputError
 from jcr.extras import extra
 
 INFO = "meta/info.json"
+
+
+FIELDS = ("video_key", "episode_chunk", "episode_index", "chunk_index", "file_index")
+"""What the templates of paths may name."""
+
+
+def _template(text: str) -> str:
+    """A path with fields of plain names and digits at most two wide: format() takes attributes, and any width."""
+    for _, field, form, conversion in Formatter().parse(text):
+        if field is None:
+            continue
+        if field not in FIELDS or conversion or not re.fullmatch(r"(0?\d?\d?d)?", form or ""):
+            raise ValueError(f"no path of the fields {', '.join(FIELDS)}")
+    return text
+
+
+Template = Annotated[str, Field(max_length=1000), AfterValidator(_template)]
+
+
+class Feature(BaseModel):
+    """One kind of number or picture that the set records."""
+
+    dtype: str = ""
+    names: Any = None
+    """A list of texts, or one below {"motors": …} or {"axes": …}."""
+
+    def numbers(self) -> list[str]:
+        """The names of its numbers, in lower case; empty where it has none."""
+        names = self.names
+        while isinstance(names, dict):
+            names = next(iter(names.values()), None)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return []
+        return [name.removesuffix(".pos").lower() for name in names]
+
+
+class Info(BaseModel):
+    """What is asked of meta/info.json."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    features: dict[str, Feature]
+    fps: Annotated[float, Field(gt=0, le=1e6)]
+    codebase_version: str = ""
+    total_episodes: Annotated[int, Field(ge=0)] | None = None
+    chunks_size: Annotated[int, Field(ge=1)] = 1000
+    data_path: Template
+    video_path: Template | None = None
+
+
+def read_info(path: Path) -> Info:
+    """meta/info.json of the set in the folder `path`; InputError where it is none."""
+    file = path / INFO
+    content = read_json(file)
+    if not isinstance(content, dict) or not {"features", "fps"} <= content.keys():
+        raise InputError(f"{file}: no LeRobot data set; it has no features or fps")
+    try:
+        return Info.model_validate(content, strict=True)
+    except ValidationError as error:
+        raise InputError(f"{file}: {first_fault(error)}; correct it there or download it again") from None
 
 
 @dataclass(frozen=True)
@@ -29,25 +91,26 @@ class Episode:
     video_start_s: float
 
 
-def read_episode(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """Episode `index` with the state and the camera of those keys; InputError when it is not there or damaged."""
-    version = str(info.get("codebase_version", ""))
-    return (_episode_v3 if version.startswith("v3") else _episode_v2)(path, info, camera, key, index)
+    return (_episode_v3 if info.codebase_version.startswith("v3") else _episode_v2)(
+        path, info, camera, key, index
+    )
 
 
-def _episode_v2(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+def _episode_v2(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """v2.1: a table and a video per episode."""
-    total = int(info.get("total_episodes", index + 1))
+    total = index + 1 if info.total_episodes is None else info.total_episodes
     if not 0 <= index < total:
         raise InputError(f"{path}: no episode {index}; there are {total}, counted from 0")
-    chunk = index // int(info.get("chunks_size", 1000))
+    chunk = index // info.chunks_size
     fields = {"episode_chunk": chunk, "episode_index": index, "video_key": camera}
-    data = _file(path, info, "data_path", fields)
-    video = _file(path, info, "video_path", fields) if _is_video(info, camera) else None
+    data = _file(path, info.data_path, fields)
+    video = _file(path, info.video_path, fields) if _is_video(info, camera) else None
     return Episode(index, *_rows(data, key), data, video, 0.0)
 
 
-def _episode_v3(path: Path, info: dict[str, Any], camera: str, key: str, index: int) -> Episode:
+def _episode_v3(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """v3.0: many episodes in one table and one video; meta/episodes says where."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     columns = ["episode_index", "data/chunk_index", "data/file_index"]
@@ -60,11 +123,11 @@ def _episode_v3(path: Path, info: dict[str, Any], camera: str, key: str, index: 
         if index in table["episode_index"]:
             row = table["episode_index"].index(index)
             chunk, number, *of_video = (table[name][row] for name in columns[1:])
-            data = _file(path, info, "data_path", {"chunk_index": chunk, "file_index": number})
+            data = _file(path, info.data_path, {"chunk_index": chunk, "file_index": number})
             video, start = None, 0.0
             if of_video:
                 fields = {"video_key": camera, "chunk_index": of_video[0], "file_index": of_video[1]}
-                video, start = _file(path, info, "video_path", fields), float(of_video[2])
+                video, start = _file(path, info.video_path, fields), float(of_video[2])
             return Episode(index, *_rows(data, key, index), data, video, start)
     raise InputError(f"{path}: no episode {index}; meta/episodes knows {found}, counted from 0")
 
@@ -97,8 +160,8 @@ def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -
         raise InputError(f"{episode.table}: {camera} cannot be read ({error}); download it again") from None
 
 
-def _is_video(info: dict[str, Any], camera: str) -> bool:
-    return info["features"][camera].get("dtype") == "video"
+def _is_video(info: Info, camera: str) -> bool:
+    return info.features[camera].dtype == "video"
 
 
 def _rows(
@@ -123,11 +186,13 @@ def _table(parquet: Any, file: Path, columns: list[str]) -> dict[str, list[Any]]
         ) from None
 
 
-def _file(path: Path, info: dict[str, Any], key: str, fields: dict[str, Any]) -> Path:
+def _file(path: Path, template: str | None, fields: dict[str, Any]) -> Path:
+    if template is None:
+        raise InputError(f"{path / INFO}: has videos and no video_path; of which version is it?")
     try:
-        name = str(info[key]).format(**fields)
-    except (KeyError, IndexError, ValueError, AttributeError) as error:
+        name = template.format(**fields)
+    except (KeyError, ValueError) as error:
         raise InputError(
-            f"{path / INFO}: {key} cannot be filled in ({error}); of which version is it?"
+            f"{path / INFO}: {template} cannot be filled in ({error}); of which version is it?"
         ) from None
     return contained(path, name, str(path / INFO))

@@ -50,6 +50,8 @@ class ReadOptions:
     """How a table writes poses of the gripper in the base; auto goes by the names of its columns."""
     pose_units: UnitsName = "auto"
     """Of a table's positions and angles, or of joint angles; auto is what the convention or a column says."""
+    pose_inverted: bool = False
+    """The poses are gripper_from_base, of the base in the gripper: invert them."""
     poses: Path | None = None
     """Table of gripper poses; unset: poses.csv, .tsv, .txt or .npy beside the images."""
     camera_info: Path | None = None

@@ -1,16 +1,22 @@
 """Text, YAML, JSON and arrays that others wrote: plain data from inside of the folder, or one line of what is wrong."""
 
 import json
+from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray
 
 from jcr.errors import InputError
 
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
 LONGEST = 255
 """Bytes of a file's name that file systems take."""
+LONGEST_SHOWN = 80
+"""Characters of a value that a message quotes."""
 
 
 def read_text(file: Path) -> str:
@@ -51,11 +57,11 @@ def read_json(file: Path) -> Any:
     """The content of a JSON file; InputError on bytes that are not UTF-8 JSON or keys that appear twice."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise InputError(f"{file}: the key {key!r} appears twice in one object; keep one")
-        return dict(pairs)
+        content = dict(pairs)
+        if len(content) < len(pairs):
+            key = Counter(key for key, _ in pairs).most_common(1)[0][0]
+            raise InputError(f"{file}: the key {shown(key)} appears twice in one object; keep one")
+        return content
 
     try:
         return json.loads(read_text(file), object_pairs_hook=unique)
@@ -69,6 +75,20 @@ def read_json(file: Path) -> Any:
         raise InputError(f"{file}: a number that is none ({error}); correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: nested too deeply to be a capture; write it as the README shows") from None
+
+
+def shown(value: object) -> str:
+    """A value of a file as a message may quote it: one that is long is cut."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}… ({len(text)} characters)"
+
+
+def first_fault(error: "ValidationError") -> str:
+    """Where the first thing wrong is that a schema finds, and what."""
+    first = error.errors()[0]
+    place = ".".join(str(part)[:LONGEST_SHOWN] for part in first["loc"])
+    what = first["msg"].removeprefix("Value error, ")
+    return f"{place}: {what}" if place else what
 
 
 def read_npy(file: Path) -> ndarray:
@@ -87,7 +107,9 @@ def contained(folder: Path, name: str, where: str) -> Path:
     except ValueError:  # an empty name, or half of a surrogate pair
         longest = LONGEST + 1
     if "\0" in name or longest > LONGEST or Path(name).is_absolute():
-        raise InputError(f"{where}: {name!r} is no path inside the capture; use one relative to {folder}")
+        raise InputError(
+            f"{where}: {shown(name)} is no path inside the capture; use one relative to {folder}"
+        )
     target = folder / name
     if not target.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")

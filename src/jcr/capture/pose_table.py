@@ -1,6 +1,6 @@
 """A table of gripper poses: columns by their names, TUM and ethz-asl trajectories, or a controller's rows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.options import ReadOptions, UnitsName
+from jcr.capture.plain_files import shown
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.capture.table_cells import Cells, is_number, read_cells
 from jcr.errors import InputError
@@ -46,6 +47,8 @@ class PoseTable:
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     """The poses of a table; InputError naming the row or column at fault, or the option that it needs."""
     cells = read_cells(file)
+    if options.pose_convention == "auto":
+        options = replace(options, pose_convention=cells.convention)
     if cells.names is None:
         columns = _unnamed(file, cells, options)
     else:
@@ -93,7 +96,7 @@ def stamp_ns(text: str, where: str) -> int:
             raise ValueError
         return stamp
     except (InvalidOperation, ValueError, OverflowError):
-        raise InputError(f"{where}: {text!r} is no time stamp; give seconds or nanoseconds") from None
+        raise InputError(f"{where}: {shown(text)} is no time stamp; give seconds or nanoseconds") from None
 
 
 def _unnamed(file: Path, cells: Cells, options: ReadOptions) -> dict[str, tuple[str, ...]]:
@@ -155,6 +158,6 @@ def _numbers(cells: tuple[str, ...], name: str, where: str) -> list[float]:
     for row, cell in enumerate(cells, start=1):
         if not is_number(cell):
             raise InputError(
-                f"{where}: row {row}, column {name}: {cell!r} is no number; correct or drop the row"
+                f"{where}: row {row}, column {name}: {shown(cell)} is no number; correct or drop the row"
             )
     return [float(cell) for cell in cells]

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import require_frames
+from jcr.capture.checks import how_scaled, how_turned, require_frames
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
 from jcr.capture.table import find_table
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
+from jcr.geometry import inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 
@@ -90,9 +91,13 @@ def read_source(
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
         found = reader(path, options)
-        if isinstance(found, Capture):
-            require_frames(len(found), str(path), at_least)
-        return found
+        if options.pose_inverted:
+            found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
+        if not isinstance(found, Capture):
+            return found
+        require_frames(len(found), str(path), at_least)
+        remarks = [remark for remark in (how_turned(found), how_scaled(found)) if remark is not None]
+        return replace(found, notes=(*found.notes, *remarks))
     if into is None:
         raise InputError(
             f"{path}: its images lie inside of it; say where to put the chosen ones: into=FOLDER"
@@ -111,6 +116,8 @@ def _extracted(path: Path, options: ReadOptions, into: Path, reader: Any, progre
     ]
     if not (into / capture_json.FILE).is_file() or _content(into).get("made_from") != made_from:
         capture = reader(path, options, into, progress)
+        if options.pose_inverted:
+            capture = replace(capture, base_from_gripper=inverse(capture.base_from_gripper))
         capture_json.write(into, capture, notes=capture.notes, made_from=made_from)
     return replace(capture_json.read(into), notes=tuple(_content(into)["notes"]))
 

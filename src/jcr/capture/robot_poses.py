@@ -31,11 +31,25 @@ class Convention:
     rotation: Callable[[Float[ndarray, "n k"]], Float[ndarray, "n 3 3"]] | None = None
     """Of the numbers after the position, angles in radians; None: a matrix."""
     quaternion: bool = False
+    numbers: Callable[[Rotation], Float[ndarray, "n k"]] | None = None
+    """The way back: `rotation`'s numbers of rotations."""
 
 
 def _euler(order: str) -> Callable[[Float[ndarray, "n 3"]], Float[ndarray, "n 3 3"]]:
     """SciPy's order: lower case about fixed axes, upper case about moving ones."""
     return lambda angles: Rotation.from_euler(order, angles).as_matrix()
+
+
+def _as_euler(order: str) -> Callable[[Rotation], Float[ndarray, "n 3"]]:
+    return lambda rotation: rotation.as_euler(order)
+
+
+def _as_quat_wxyz(rotation: Rotation) -> Float[ndarray, "n 4"]:
+    return rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+
+
+def _as_quat_xyzw(rotation: Rotation) -> Float[ndarray, "n 4"]:
+    return rotation.as_quat(canonical=True)
 
 
 def _quat_xyzw(quat_xyzw: Float[ndarray, "n 4"]) -> Float[ndarray, "n 3 3"]:
@@ -59,21 +73,37 @@ _COLUMNS = tuple(f"m{row}{column}" for column in range(4) for row in range(4))
 # "xyz" about fixed axes is Rz(yaw)·Ry(pitch)·Rx(roll); "ZYX" about moving ones is Rz(A)·Ry(B)·Rx(C).
 CONVENTIONS = {
     "matrix": Convention(_ROWS),
-    "quat-xyzw": Convention(_XYZ + _XYZW, rotation=_quat_xyzw, quaternion=True),
-    "quat-wxyz": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True),
-    "rotation-vector": Convention(_XYZ + _VECTOR, rotation=_rotation_vector),
-    "rpy": Convention(_XYZ + _RPY, rotation=_euler("xyz")),
-    "ur": Convention(_XYZ + _VECTOR, rotation=_rotation_vector),
+    "quat-xyzw": Convention(_XYZ + _XYZW, rotation=_quat_xyzw, quaternion=True, numbers=_as_quat_xyzw),
+    "quat-wxyz": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True, numbers=_as_quat_wxyz),
+    "rotation-vector": Convention(_XYZ + _VECTOR, rotation=_rotation_vector, numbers=Rotation.as_rotvec),
+    "rpy": Convention(_XYZ + _RPY, rotation=_euler("xyz"), numbers=_as_euler("xyz")),
+    "ur": Convention(_XYZ + _VECTOR, rotation=_rotation_vector, numbers=Rotation.as_rotvec),
     "franka": Convention(_COLUMNS),
-    "xarm": Convention(_XYZ + _RPY, True, True, _euler("xyz")),
-    "xarm-axis-angle": Convention(_XYZ + _VECTOR, True, True, _rotation_vector),
-    "kuka": Convention((*_XYZ, "a", "b", "c"), True, True, _euler("ZYX")),
-    "fanuc": Convention((*_XYZ, "w", "p", "r"), True, True, _euler("xyz")),
-    "yaskawa": Convention(_XYZ + _VECTOR, True, True, _euler("xyz")),
-    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), True, rotation=_quat_wxyz, quaternion=True),
-    "unitree": Convention(_XYZ + _RPY, rotation=_euler("xyz")),
-    "realman": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True),
+    "xarm": Convention(_XYZ + _RPY, True, True, _euler("xyz"), numbers=_as_euler("xyz")),
+    "xarm-axis-angle": Convention(_XYZ + _VECTOR, True, True, _rotation_vector, numbers=Rotation.as_rotvec),
+    "kuka": Convention((*_XYZ, "a", "b", "c"), True, True, _euler("ZYX"), numbers=_as_euler("ZYX")),
+    "fanuc": Convention((*_XYZ, "w", "p", "r"), True, True, _euler("xyz"), numbers=_as_euler("xyz")),
+    "yaskawa": Convention(_XYZ + _VECTOR, True, True, _euler("xyz"), numbers=_as_euler("xyz")),
+    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), True, False, _quat_wxyz, True, numbers=_as_quat_wxyz),
+    "unitree": Convention(_XYZ + _RPY, rotation=_euler("xyz"), numbers=_as_euler("xyz")),
+    "realman": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True, numbers=_as_quat_wxyz),
 }
+
+
+def numbers_from_poses(
+    base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
+) -> Float[ndarray, "n k"]:
+    """Rows in a convention's columns, the inverse of `poses_from_numbers`; `units` likewise."""
+    form = CONVENTIONS[convention]
+    position_unit, angle_unit = _units(form, units)
+    if form.numbers is None:
+        matrices = base_from_gripper.copy()
+        matrices[:, :3, 3] /= position_unit
+        return (np.swapaxes(matrices, 1, 2) if convention == "franka" else matrices).reshape(-1, 16)
+    turn = form.numbers(Rotation.from_matrix(base_from_gripper[:, :3, :3]))
+    return np.hstack(
+        [base_from_gripper[:, :3, 3] / position_unit, turn / (1.0 if form.quaternion else angle_unit)]
+    )
 
 
 def poses_from_numbers(
@@ -95,6 +125,13 @@ def poses_from_numbers(
         matrices = numbers.reshape(-1, 4, 4)
         if convention == "franka":
             matrices = np.swapaxes(matrices, 1, 2)
+        elif np.allclose(matrices[:, :, 3], [0, 0, 0, 1], atol=1e-9) and not np.allclose(
+            matrices[:, 3], [0, 0, 0, 1], atol=1e-9
+        ):
+            raise InputError(
+                f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
+                "--pose-convention franka"
+            )
         matrices = matrices.copy()
         matrices[:, :3, 3] *= position_unit
         _check_position(matrices[:, :3, 3], position_unit, units, where)
@@ -125,7 +162,7 @@ def _check_quaternion(quaternion: Float[ndarray, "n 4"], where: str) -> None:
         row = int(off.argmax())
         raise InputError(
             f"{where}: the quaternion of pose {row + 1} has length {length[row]:.4g}, not 1; check which columns "
-            "are the quaternion (--pose-convention)"
+            "are the quaternion, and say how it is written (--pose-convention quat-xyzw or quat-wxyz)"
         )
 
 

@@ -90,7 +90,8 @@ def _paired(
     folder: Path, file: Path, table: PoseTable, options: ReadOptions
 ) -> tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]:
     if table.images is not None:
-        return [_located(folder, name, file) for name in table.images], table.base_from_gripper, ()
+        located = [_located(folder, name, file) for name in table.images]
+        return located, table.base_from_gripper, _without_pose(folder, located, file)
     pictures = _pictures(folder)
     if not pictures:
         raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
@@ -111,11 +112,31 @@ def _paired(
             return pictures, poses, (f"poses interpolated at the {len(pictures)} images' time stamps",)
     if len(pictures) != len(table.base_from_gripper):
         raise InputError(
-            f"{file}: {len(table.base_from_gripper)} poses for {len(pictures)} images in {folder}; make them "
-            "equal, or add a column with the images' names"
+            f"{file}: {len(table.base_from_gripper)} poses for {len(pictures)} images in {folder} "
+            f"({pictures[0]} … {pictures[-1]}), and no column says which belongs to which; add a column image with "
+            "their names"
         )
     how = f"rows paired with images in order of their names: {pictures[0]} … {pictures[-1]}"
     return pictures, table.base_from_gripper, (how,)
+
+
+def _without_pose(folder: Path, named: list[str], file: Path) -> tuple[str, ...]:
+    """A note on images that the table does not name; InputError where it names images that are not there."""
+    here = [name for name in _pictures(folder) if name not in named]
+    left_out = (
+        f"{len(here)} images have no pose in {file.name} and are left out: {_listed(here)}" if here else ""
+    )
+    absent = [name for name in named if not (folder / name).is_file()]
+    if absent:
+        raise InputError(
+            f"{file}: names {len(absent)} of {len(named)} images that are not in {folder}: {_listed(absent)}; add them "
+            f"or drop their rows{' (' + left_out + ')' if here else ''}"
+        )
+    return (left_out,) if here else ()
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def _located(folder: Path, name: str, file: Path) -> str:

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from jcr.capture.options import ConventionName
 from jcr.capture.plain_files import read_npy, read_text
 from jcr.errors import InputError
 
@@ -17,6 +18,7 @@ _ALIASES |= {
     for prefix in ("q_", "quat_", "quaternion_", "orientation_", "rotation_")
 }
 _ALIASES |= {f"{prefix}{axis}": f"r{axis}" for axis in "xyz" for prefix in ("rvec_", "rotvec_", "r_")}
+_UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
 _UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|m|deg|rad|s|ns)[\])]?$")
 
 
@@ -29,6 +31,8 @@ class Cells:
     units: frozenset[str]
     """That the names give: of mm, m, deg, rad."""
     rows: list[list[str]]
+    convention: ConventionName = "auto"
+    """That the notation gives away: UR's p[…]."""
 
     def columns(self) -> list[tuple[str, ...]]:
         """The cells of each column."""
@@ -37,6 +41,8 @@ class Cells:
 
 def read_cells(file: Path) -> Cells:
     """The table in a file; InputError when it is none, is empty, or a row has too many or too few cells."""
+    if file.suffix != ".npy" and (written := _ur_poses(file)) is not None:
+        return written
     header, rows = _array(file) if file.suffix == ".npy" else _text(file)
     if not rows:
         raise InputError(f"{file}: holds no poses; expected one row per image")
@@ -60,6 +66,33 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _ur_poses(file: Path) -> Cells | None:
+    """A table whose lines hold poses as URScript writes them, p[x, y, z, rx, ry, rz], and what stands before them."""
+    lines = [line.strip() for line in read_text(file).splitlines()]
+    matches = [(number, line, _UR_POSE.search(line)) for number, line in enumerate(lines, 1)]
+    if not any(match for _, _, match in matches):
+        return None
+    rows: list[list[str]] = []
+    for number, line, match in matches:
+        if match is not None:
+            before = [
+                cell for cell in re.split(r"[,;\t\s]+", line[: match.start()].strip(" \t,;\"'=:")) if cell
+            ]
+            numbers = [cell.strip() for cell in match[1].split(",")]
+            if len(numbers) != 6 or (rows and len(before) + 6 != len(rows[0])):
+                raise InputError(
+                    f"{file}: line {number}: write {line!r} as the others, with p[x, y, z, rx, ry, rz]"
+                )
+            rows.append(before[:1] + numbers if before else numbers)
+        elif rows and line and not line.startswith("#"):
+            raise InputError(
+                f"{file}: line {number} holds no p[x, y, z, rx, ry, rz]: {line!r}; complete or drop it"
+            )
+    first = len(rows[0]) - 6
+    names = (("timestamp" if is_number(rows[0][0]) else "image"),) * first + ("x", "y", "z", "rx", "ry", "rz")
+    return Cells(names, frozenset(), rows, "ur")
 
 
 def _text(file: Path) -> tuple[list[str] | None, list[list[str]]]:

@@ -17,7 +17,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
 from jcr.capture.table import PICTURES, gripper_poses
 from jcr.errors import InputError
-from jcr.records import Capture, Intrinsics
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
 FILE = "transforms.json"
 HALF_PIXEL = 0.5
@@ -71,9 +71,18 @@ def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
     if any(lens != first for lens in lenses):
         raise InputError(f"{file}: its frames have different lenses; jcr needs images of one camera")
     model = content.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
+    if model not in (
+        "OPENCV",
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "PERSPECTIVE",
+        "OPENCV_FISHEYE",
+    ):
         raise InputError(f"{file}: camera_model {model}; undistort the images to a pinhole or OPENCV camera")
-    if first.get("k4"):
+    lens_model: LensModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
+    if first.get("k4") and lens_model == "pinhole":
         raise InputError(f"{file}: a distortion with k4, which jcr does not know; undistort the images")
     width, height = size
     made_for = (first.get("w", width), first.get("h", height))
@@ -89,5 +98,5 @@ def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
         numbers = [focal, first.get("fl_y", focal), *(float(value) - HALF_PIXEL for value in centre)]
     except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError):
         raise InputError(f"{file}: fl_x, fl_y, cx, cy and camera_angle_x must be numbers") from None
-    distortion = [first.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    return checked_lens(numbers, distortion, size, str(file))
+    distortion = [first.get(key, 0.0) for key in COEFFICIENTS[lens_model]]
+    return checked_lens(numbers, distortion, size, str(file), lens_model)

@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from jcr.capture.plain_files import read_text
 from jcr.errors import InputError
+from jcr.geometry import require_rigid
 from jcr.handeye.robots import Arm
 
 if TYPE_CHECKING:
@@ -22,14 +23,46 @@ def read_chain(file: Path, dof: int, gripper: str | None = None) -> Arm:
 
     InputError where the file is no URDF, has no such chain or several, or has a joint in it that does not rotate.
     """
+    return chain_of(load_urdf(file, build_scene_graph=False), dof, str(file), gripper)
+
+
+def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
+    """The robot of a URDF file, without its meshes.
+
+    InputError where the file is none, or where its joints are not finite and rigid or lead back to where they began.
+    """
+    import lxml.etree as etree  # pyright: ignore[reportMissingImports]
     import yourdfpy
 
-    read_text(file)
     try:
+        # yourdfpy mends what is no XML, with two lines of its own on stderr.
+        etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
         urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
+        by_child = {joint.child: joint for joint in urdf.robot.joints}
+        for joint in urdf.robot.joints:
+            _check(joint, f"{file}: joint {joint.name}")
+            _chain(by_child, joint.child)
+        if build_scene_graph:
+            urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=True)
+    except InputError:
+        raise
     except Exception as error:  # the parser raises whatever its XML library does
         raise InputError(f"{file}: not a readable URDF ({error}); expand xacro first") from None
-    return chain_of(urdf, dof, str(file), gripper)
+    return urdf
+
+
+def _check(joint: "yourdfpy.Joint", where: str) -> None:
+    if joint.origin is not None:
+        if np.shape(joint.origin) != (4, 4):
+            raise InputError(f"{where}: its origin is no position and angles; correct it there")
+        require_rigid(joint.origin, f"{where}: origin")
+    axis = np.asarray(joint.axis, float)
+    if axis.shape != (3,) or not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-9):
+        raise InputError(f"{where}: its axis is no direction; correct it there")
+    limit = joint.limit
+    ends = [] if limit is None else [end for end in (limit.lower, limit.upper) if end is not None]
+    if not np.isfinite(ends).all():
+        raise InputError(f"{where}: its limits are not finite; correct them there")
 
 
 def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str, gripper: str | None = None) -> Arm:
@@ -56,6 +89,8 @@ def chain_of(urdf: "yourdfpy.URDF", dof: int, where: str, gripper: str | None = 
 def _chain(by_child: dict, link: str) -> list:
     chain = []
     while link in by_child:
+        if len(chain) > len(by_child):
+            raise InputError(f"the joints of {link} lead back to it; a robot is a tree")
         chain.insert(0, by_child[link])
         link = by_child[link].parent
     return chain

@@ -19,6 +19,7 @@ from types import ModuleType
 from jcr.errors import InputError, NotTrustedError
 
 COMMANDS = {
+    "board": "a calibration board to print, for those who want one",
     "capture": "a capture taken live, with advice while one works",
     "run": "everything: reconstruct, calibrate, map, report",
     "calibrate": "up to calibration.json",
@@ -69,9 +70,29 @@ _DISK = {
 """What the machine, not the program, has wrong, and the cure."""
 
 
+LONGEST_LINE = 2000
+"""Characters of a message."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its status."""
+    _open_closed_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # of an ASCII terminal, which has no ±
     sys.exit(dispatch(sys.argv[1:] if arguments is None else arguments))
+
+
+def _open_closed_streams() -> None:
+    """Nowhere, in place of standard streams that are closed: the next file would get their number, and be written to."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(os.dup(1), "w")
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(os.dup(2), "w")
 
 
 def dispatch(arguments: Sequence[str]) -> int:
@@ -102,23 +123,32 @@ def dispatch(arguments: Sequence[str]) -> int:
 def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
     """The exit status of the command whose module `load` gives; what goes wrong is one line on stderr."""
     try:
-        return _call(load(), program, arguments)
+        status = _call(load(), program, arguments)
+        sys.stdout.flush()
+        return status
     except InputError as error:
         return _fail(2, str(error))
     except NotTrustedError as error:
         return _fail(3, str(error))
     except BrokenPipeError:
-        # Whoever read our output has seen enough; nothing more must be written, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _write_no_more()  # whoever read our output has seen enough
         return 0
     except OSError as error:
         if error.errno not in _DISK:
             raise
+        if error.filename is None:
+            _write_no_more()
         return _fail(2, f"{error.filename or 'the output'}: {error.strerror}; {_DISK[error.errno]}")
     except BaseException as error:
         if not _interrupted(error):
             raise
         return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
+
+
+def _write_no_more() -> None:
+    """Nothing to standard output from now on, not even at exit."""
+    with contextlib.suppress(OSError):  # no file, where tests read it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted(error: BaseException | None) -> bool:
@@ -174,5 +204,7 @@ def _choices(listed: re.Match[str]) -> str:
 
 
 def _fail(status: int, message: str) -> int:
-    sys.stderr.write(f"error: {' '.join(message.split())}\n")
+    line = " ".join(message.split())
+    # What files hold is quoted in messages, and a name may have a million letters.
+    sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
     return status

@@ -8,6 +8,7 @@ import tyro
 
 from jcr.batch import BatchOptions
 from jcr.calibration.options import CalibrateOptions
+from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.options import CloudOptions, MapOptions
@@ -31,6 +32,7 @@ class Arguments:
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURES... OUT")]
     """Folders of the captures, then the folder for the results."""
+    read: ReadOptions = field(default_factory=ReadOptions)
     batch: BatchOptions = field(default_factory=BatchOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
@@ -51,7 +53,7 @@ def main(arguments: Arguments) -> int:
     options = RunOptions(arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map)
     *captures, out = arguments.paths
     with progress_bars() as progress:
-        rows = batch(captures, out, options, arguments.batch, progress)
+        rows = batch(captures, out, options, arguments.batch, progress, arguments.read)
     arguments.output.result(
         _table(rows) + f"table: {out / 'summary.html'}\n", {"captures": [asdict(row) for row in rows]}
     )

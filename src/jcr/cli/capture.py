@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
+from jcr.handeye.arms import ROBOT_NAMES, RobotName
+from jcr.live.camera import CameraOptions
 from jcr.live.collect import CollectOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from jcr.live.arm_words import ArmWords
     from jcr.live.asks import Answer, Ask
+    from jcr.live.folder import LiveFolder
 
 
 @dataclass(frozen=True)
@@ -25,18 +30,28 @@ class Arguments:
     pictures, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command goes on.
 
     examples:
-      jcr capture captures/table --camera 0 --poses ur:192.168.0.2
+      jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
+      jcr capture captures/table --camera realsense --poses franka:172.16.0.2
+      jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
       jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses tcp
-      jcr capture captures/table --camera 0 --poses typed --images 10
+      jcr capture captures/table --camera 0 --poses typed --pose-convention kuka --pose-units mm-deg
       JCR_TOKEN=secret jcr capture captures/table --camera 0 --listen 0.0.0.0:7464
     """
 
     out: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture; one that was begun is gone on with."""
+    """Folder of the capture; one that was begun is continued."""
     camera: str = "0"
-    """V4L2 device number, address of a stream (rtsp://…), or a video file."""
+    """V4L2 device number, realsense[:SERIAL], address of a stream (rtsp://…), or a recording (video file, .bag)."""
+    optics: CameraOptions = field(default_factory=CameraOptions)
     poses: str = "tcp"
-    """tcp: a program sends them (docs/capture.md); ur:HOST[:PORT]: a Universal Robots arm; typed: by hand."""
+    """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
+    hand), or tcp (a program sends them, docs/capture.md)."""
+    pose_convention: ConventionName = "auto"
+    """How poses are typed, and how the next pose is told; auto: as the arm writes them."""
+    pose_units: UnitsName = "auto"
+    """Units of typed and told poses; auto: those of the convention."""
+    robot: RobotName | None = None
+    """The arm: the next pose is told as joint angles too, within its limits."""
     listen: str = "127.0.0.1:7464"
     """With tcp: address and port to listen on; any but this machine's own needs a token."""
     token: str | None = None
@@ -44,7 +59,8 @@ class Arguments:
     timeout: float = 600.0
     """With tcp: end when no pose came for so many seconds."""
     intrinsics_from: Path | None = None
-    """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else estimated."""
+    """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else those that the camera
+    stores (RealSense), else estimated."""
     collect: CollectOptions = field(default_factory=CollectOptions)
     output: Output = field(default_factory=Output)
 
@@ -61,10 +77,13 @@ def main(arguments: Arguments) -> int:
         answers.append(answer)
         _say("\n".join(lines))
 
-    live = LiveFolder(arguments.out, _lens(arguments.intrinsics_from))
-    _say(f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
-    with opened(arguments.camera) as frames:
-        collect(live, frames, _asks(arguments), arguments.collect, tell)
+    lens = _lens(arguments.intrinsics_from)
+    with opened(arguments.camera, arguments.optics) as camera:
+        live = LiveFolder(arguments.out, lens or camera.intrinsics, arguments.robot)
+        _say(
+            f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser"
+        )
+        collect(live, camera, _asks(arguments), arguments.collect, tell, _words(arguments, live))
     more = "" if len(live.names) >= 3 else "; three or more are needed, the same command goes on"
     arguments.output.result(
         f"{len(live.names)} pictures in {arguments.out}{more}; next: jcr check {arguments.out}\n",
@@ -80,15 +99,14 @@ def _say(text: str) -> None:
 
 def _asks(arguments: Arguments) -> "Iterator[Ask]":
     from jcr.errors import InputError
+    from jcr.live import franka, rtde, ur, xarm
     from jcr.live.line_server import Listen, bound, served_poses
+    from jcr.live.rest import asks_at_rest
     from jcr.live.typed import typed_poses
-    from jcr.live.ur import ur_poses
 
     kind, _, address = arguments.poses.partition(":")
     if kind == "typed" and not address:
-        yield from typed_poses(sys.stdin, _say)
-    elif kind == "ur" and address:
-        yield from ur_poses(*_address(address, 30003, "--poses ur:"), _say)
+        yield from typed_poses(sys.stdin, _say, arguments.pose_convention, arguments.pose_units)
     elif kind == "tcp" and not address:
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
@@ -96,8 +114,34 @@ def _asks(arguments: Arguments) -> "Iterator[Ask]":
         with bound(listen) as server:
             _say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
+    elif kind in _SPOKEN and address:
+        _say(f"move the arm; a picture is taken whenever it rests ({address})")
+        if kind == "ur":
+            host, port = _address(address, 30003, "--poses ur:")
+            yield from asks_at_rest(lambda: ur.states(host, port))
+        else:
+            module = {"rtde": rtde, "franka": franka, "xarm": xarm}[kind]
+            yield from asks_at_rest(lambda: module.states(address))
     else:
-        raise InputError(f"--poses {arguments.poses}: give tcp, ur:HOST or typed")
+        raise InputError(
+            f"--poses {arguments.poses}: give ur:HOST, rtde:HOST, franka:HOST, xarm:HOST, typed or tcp"
+        )
+
+
+_SPOKEN: dict[str, ConventionName] = {"ur": "ur", "rtde": "ur", "franka": "franka", "xarm": "xarm"}
+"""How the arms' own pendants and programs write poses."""
+
+
+def _words(arguments: Arguments, live: "LiveFolder") -> "ArmWords":
+    from jcr.handeye.arms import arm_named
+    from jcr.live.arm_words import ArmWords
+
+    convention = arguments.pose_convention
+    if convention == "auto":
+        convention = _SPOKEN.get(arguments.poses.partition(":")[0], "auto")
+    name = live.rest.get("robot")
+    arm = arm_named(name) if name in ROBOT_NAMES else None
+    return ArmWords(convention, arguments.pose_units, arm)
 
 
 def _address(text: str, port: int, option: str) -> tuple[str, int]:
@@ -119,4 +163,4 @@ def _lens(file: Path | None) -> dict[str, Any] | None:
     lens = content.get("intrinsics") if isinstance(content, dict) else None
     if not isinstance(lens, dict):
         raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
-    return {key: lens[key] for key in ("fx", "fy", "cx", "cy", "distortion") if key in lens}
+    return {key: lens[key] for key in ("model", "fx", "fy", "cx", "cy", "distortion") if key in lens}

@@ -92,16 +92,13 @@ class Format:
 def main(arguments: Arguments) -> int:
     """Write the file, say where, and warn where the calibration is not to be trusted: exit status 0 or 3."""
     if arguments.format is None:
-        listed = "; ".join(f"{row.name} ({row.about})" for row in FORMATS)
-        raise InputError(f"no format is named; take one of: {listed}")
-    row = next(row for row in FORMATS if row.name == arguments.format)
-    if arguments.root_from_optical and not arguments.to_root:
-        raise InputError("--root-from-optical: needs --to-root LINK, the link it is told in")
-    run = Run(arguments)
-    path = arguments.path or arguments.out / "export" / row.file
-    if path.is_dir() and not row.file.endswith("/"):
-        raise InputError(f"{path}: is a folder; name a file for {row.name}")
-    row.write(run, path)
+        lines = "".join(f"{row.name:<14} {row.about}\n" for row in FORMATS)
+        arguments.output.result(
+            f"{lines}for one: jcr export {arguments.out} FORMAT\n",
+            {"formats": {row.name: row.about for row in FORMATS}},
+        )
+        return 0
+    run, row, path = _written(arguments)
     sys.stderr.write(f"wrote {path}: {row.about}\n")
     line, facts = "", {"file": str(path), "format": row.name, "about": row.about}
     if row.name == "ros2":
@@ -112,6 +109,35 @@ def main(arguments: Arguments) -> int:
     if run.doubt is not None:
         raise NotTrustedError(f"not to be trusted, and the file says so: {run.doubt}")
     return 0
+
+
+def export_run(
+    out: str | Path, format: FormatName, path: str | Path | None = None, **options: object
+) -> Path:
+    """Write the run folder `out` in a format of `jcr export` and return the file's, or the new folder's, path.
+
+    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does; of a
+    calibration that is rejected the file says so.
+    """
+    named = None if path is None else Path(path)
+    return _written(Arguments(Path(out), format, named, **options))[2]  # pyright: ignore[reportArgumentType]
+
+
+def _written(arguments: Arguments) -> "tuple[Run, Format, Path]":
+    """What was written, and where."""
+    row = next((row for row in FORMATS if row.name == arguments.format), None)
+    if row is None:
+        raise InputError(
+            f"{arguments.format}: no such format; choose one of {', '.join(get_args(FormatName))}"
+        )
+    if arguments.root_from_optical and not arguments.to_root:
+        raise InputError("--root-from-optical: needs --to-root LINK, the link it is told in")
+    run = Run(arguments)
+    path = arguments.path or arguments.out / "export" / row.file
+    if path.is_dir() and not row.file.endswith("/"):
+        raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    row.write(run, path)
+    return run, row, path
 
 
 class Run:

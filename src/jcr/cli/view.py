@@ -46,7 +46,15 @@ def main(arguments: Arguments) -> int:
     from jcr.errors import InputError
     from jcr.extras import extra
     from jcr.progress import progress_bars
+    from jcr.run_folder import RunFolder
 
+    if arguments.urdf is None and (arguments.joints or arguments.tip):
+        raise InputError("--joints and --tip tell how a robot stands; name its --urdf too")
+    if arguments.urdf is not None and (arguments.joints is None) == (arguments.tip is None):
+        raise InputError(
+            "--urdf: give either --joints FILE, or --tip LINK, the link whose poses the capture has"
+        )
+    RunFolder(arguments.out).calibration()  # says in a moment where there is none
     for package in ("viser", "matplotlib", "torch"):
         extra(package, "view", "jcr view")
     from jcr.view.gate import Gate
@@ -55,12 +63,6 @@ def main(arguments: Arguments) -> int:
     from jcr.view.server import is_loopback, open_server
     from jcr.view.viewer import Viewer
 
-    if arguments.urdf is None and (arguments.joints or arguments.tip):
-        raise InputError("--joints and --tip tell how a robot stands; name its --urdf too")
-    if arguments.urdf is not None and (arguments.joints is None) == (arguments.tip is None):
-        raise InputError(
-            "--urdf: give either --joints FILE, or --tip LINK, the link whose poses the capture has"
-        )
     run = read_run(arguments.out)
     robot = values = None
     if arguments.urdf is not None:

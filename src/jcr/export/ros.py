@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 from jcr import __version__
 from jcr.errors import InputError
 from jcr.geometry import inverse, roll_pitch_yaw, skew, transform
-from jcr.records import Intrinsics
+from jcr.records import COEFFICIENTS, Intrinsics
 
 PARENT, CHILD, BASE = "tool0", "camera_color_optical_frame", "base_link"
 """Frame names where the user gives none."""
 
+_DISTORTIONS = {"pinhole": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
 ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix().round(), np.zeros(3))
 """REP-103: the root link has x forward, y left, z up; the optical frame z forward, x right, y down."""
 
@@ -245,12 +246,12 @@ def camera_info(mount: CameraMount, lens: Intrinsics) -> str:
         "image_height": lens.height,
         "camera_name": mount.child.replace("/", "_"),
         "camera_matrix": matrix(lens.matrix),
-        "distortion_model": "plumb_bob",
+        "distortion_model": _DISTORTIONS[lens.model],
         "distortion_coefficients": matrix(np.array([lens.distortion])),
         "rectification_matrix": matrix(np.eye(3)),
         "projection_matrix": matrix(np.column_stack([lens.matrix, np.zeros(3)])),
     }
-    return _yaml(mount, content, "intrinsics in pixels; distortion k1 k2 p1 p2 k3")
+    return _yaml(mount, content, f"intrinsics in pixels; distortion {' '.join(COEFFICIENTS[lens.model])}")
 
 
 def notes(mount: CameraMount) -> list[str]:

@@ -20,7 +20,7 @@ from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.geometry import apply_similarity, inverse, scale_translation
 from jcr.reconstruct.sfm import camera_of
-from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction, Tracks
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, PointCloud, Reconstruction, Tracks
 from jcr.represent.cloud_ply import write_cloud
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -71,9 +71,11 @@ def write_nerfstudio(
     """
     with _new_folder(folder) as made:
         names, lens = _place_images(made / "images", views, undistorted, link)
-        k1, k2, p1, p2, k3 = lens.distortion
+        if lens.model == "rational":
+            raise InputError("nerfstudio knows no rational distortion; export with --undistort")
+        plain = lens.model == "pinhole" and not any(lens.distortion)
         content = {
-            "camera_model": "OPENCV" if any(lens.distortion) else "PINHOLE",
+            "camera_model": "PINHOLE" if plain else "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV",
             "fl_x": lens.fx,
             "fl_y": lens.fy,
             # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.
@@ -81,7 +83,7 @@ def write_nerfstudio(
             "cy": lens.cy + 0.5,
             "w": lens.width,
             "h": lens.height,
-            **({"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2} if any(lens.distortion) else {}),
+            **({} if plain else dict(zip(COEFFICIENTS[lens.model], lens.distortion, strict=True))),
             "ply_file_path": "points.ply",
             "frames": [
                 {

@@ -31,6 +31,13 @@ BETTER = 3.0
 """A reading is named when it fits so many times better than the poses as given."""
 MIN_SHARE = 0.8
 """of the images must agree under it."""
+OPTIONS = {
+    "their inverses": "add --pose-inverted",
+    "quaternions w, x, y, z": "in a table add --pose-convention quat-wxyz",
+    "quaternions x, y, z, w": "in a table add --pose-convention quat-xyzw",
+    "transposed rotations": "in a table of matrices add --pose-convention franka",
+}
+"""What reads poses so: options, by how the names of readings begin."""
 EULER_ORDERS = (
     *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
@@ -98,7 +105,9 @@ def explained(found: tuple[Reading, Reading]) -> str:
         for reading in found
     )
     name = found[0].name
-    return f"the poses fit when read as {name}: {best}, instead of {given}; correct them at their source"
+    cures = (cure for words, cure in OPTIONS.items() if name.startswith(words))
+    remedy = next(cures, "correct them at their source")
+    return f"the poses fit when read as {name}: {best}, instead of {given}; {remedy}"
 
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:

@@ -23,6 +23,8 @@ MAX_NOISE = (0.02, np.radians(3.0))
 MAX_STD = (0.02, np.radians(3.0), 0.05)
 """m, rad, relative scale: an answer less certain than this is none."""
 MIN_SHARE_USED = 0.6
+SCALE_STD = 0.002
+"""Relative; of a printed marker's size."""
 FEW = 5
 """Images, below which a wrong one cannot be outvoted and the robot's noise is hardly known."""
 SURPRISE = 1.5
@@ -36,6 +38,8 @@ def solve_hand_eye(
     robot_noise: tuple[float, float] | None = None,
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
+    scale: float | None = None,
+    scale_std: float = SCALE_STD,
     joints: ArrayLike | None = None,
     robot: str | Arm | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
@@ -52,6 +56,9 @@ def solve_hand_eye(
     poses; with neither, errors are those that poses near each other share. `systematic` is their covariance where it is
     known already (systematic.py).
 
+    `scale` (metres per unit of the camera poses, 1 where these are metric) is known to `scale_std` (relative); without
+    it the scale is found.
+
     Raises InputError on shapes, values or counts that cannot be poses, and on poses or angles that are not of the robot;
     motion that shows too little is an answer (`observability`, `converged`), not an exception.
     """
@@ -64,6 +71,12 @@ def solve_hand_eye(
         )
     if n < 2:
         raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    if scale is not None:
+        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
+            raise InputError(
+                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
+            )
+        cues = replace(cues or Cues(), scale=(scale, scale_std))
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
 

@@ -25,6 +25,8 @@ class Ask:
     """Told what came of it, by whoever asked and can listen."""
     current: Callable[[], Float[ndarray, "4 4"]] | None = None
     """Reads the pose once more after the picture; None where whoever asked vouches for it."""
+    joints: Float[ndarray, " dof"] | None = None
+    """Joint angles (rad) at rest, where the arm tells them."""
 
 
 def pose_of_numbers(numbers: list[float], where: str) -> Float[ndarray, "4 4"]:

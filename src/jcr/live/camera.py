@@ -1,21 +1,36 @@
-"""Pictures from a camera while it runs: a V4L2 index, a stream, or a video file in its place."""
+"""Pictures from a camera while it runs: a V4L2 index, a stream, a RealSense, or a video file in its place."""
 
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
 from jcr.errors import InputError
 
 TIMEOUT_S = 10.0
 """Without a picture for so long, a camera is gone."""
+REALSENSE = "realsense"
+V4L2_MANUAL_EXPOSURE = 1
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What a camera keeps to while pictures are taken."""
+
+    camera_size: tuple[int, int] | None = None
+    """Resolution in pixels, WIDTH HEIGHT; unset: what the camera gives (a RealSense: 1280 720)."""
+    exposure: float | None = None
+    """Fix the exposure, in the camera's own unit (V4L2: 0.1 ms, RealSense: µs); unset: automatic."""
+    focus: float | None = None
+    """Fix the focus, in the camera's own unit; unset: autofocus is switched off where the camera is when it opens."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +40,100 @@ class Frame:
     image: UInt8[ndarray, "h w 3"]
     """RGB."""
     time_s: float
+    depth_mm: UInt16[ndarray, "h w"] | None = None
+    """Aligned with the image, 0 where there is none; None where the camera measures no depth."""
+
+
+class Newest:
+    """The newest frame of a source that `read` waits on, kept by a thread that empties the driver's buffer."""
+
+    def __init__(self, read: Callable[[], Frame | None], name: str) -> None:
+        self._read, self._name = read, name
+        self._arrived, self._stop = threading.Condition(), threading.Event()
+        self._frame: Frame | None = None
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        while not self._stop.is_set():
+            frame = self._read()
+            with self._arrived:
+                if frame is not None:
+                    self._frame = frame
+                self._arrived.notify_all()
+            if frame is None:
+                return
+
+    def latest(self) -> Frame | None:
+        """What the camera saw last."""
+        return self._frame
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames whose taking began after they were asked for; InputError when the camera falls silent."""
+        while True:
+            asked = time.monotonic()
+
+            def is_fresh(asked: float = asked) -> bool:
+                return self._frame is not None and self._frame.time_s >= asked
+
+            with self._arrived:
+                self._arrived.wait_for(lambda: is_fresh() or not self._thread.is_alive(), TIMEOUT_S)
+                frame = self._frame
+                if frame is None or not is_fresh():
+                    raise InputError(
+                        f"--camera {self._name}: gives no more pictures; check its cable and start again: the same "
+                        "command goes on where it was"
+                    )
+            yield frame
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._stop.set()
+        self._thread.join(TIMEOUT_S)
+
+
+class Recorded:
+    """The frames of a recording, one after the other."""
+
+    def __init__(self, frames: Iterator[Frame]) -> None:
+        self._frames = frames
+        self._frame: Frame | None = None
+
+    def latest(self) -> Frame | None:
+        """What was read last."""
+        return self._frame
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            self._frame = frame
+            yield frame
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera that is open."""
+
+    frames: Iterable[Frame]
+    """Of a device or stream what it sees when it is asked, never what waited in a buffer."""
+    latest: Callable[[], Frame | None]
+    """The newest frame that is there."""
+    intrinsics: dict[str, Any] | None = None
+    """As capture.json has them, where the camera's maker stored them in it."""
 
 
 @contextmanager
-def opened(source: str) -> Iterator[Iterator[Frame]]:
-    """The frames of a camera: a number is a V4L2 device, anything with :// a stream, else a video file.
+def opened(source: str, options: CameraOptions | None = None) -> Iterator[Camera]:
+    """A camera: a number is a V4L2 device, anything with :// a stream, `realsense[:SERIAL]`, else a video file.
 
-    A device or stream gives what it sees when it is asked, never what waited in a buffer; a file gives frame
-    after frame. Raises InputError when it cannot be opened, and later when it falls silent.
+    Raises InputError when it cannot be opened or does not keep to the options, and later when it falls silent.
     """
+    options = options or CameraOptions()
+    if source == REALSENSE or source.startswith(REALSENSE + ":"):
+        from jcr.live.realsense import opened_realsense
+
+        with opened_realsense(source.partition(":")[2], options) as camera:
+            yield camera
+        return
     # OpenCV and FFmpeg write warnings of their own to stderr; the error that we raise is all a user needs.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -49,11 +149,67 @@ def opened(source: str) -> Iterator[Iterator[Frame]]:
                 "whether another program holds it, or whether the stream's address is right"
             )
         try:
-            yield _of_file(video) if is_file else _newest(video, source)
+            if isinstance(device, int):
+                keep_to(video, options, source)
+            elif options != CameraOptions():
+                raise InputError(
+                    f"--camera {source}: size, exposure and focus can be set for a device number or realsense; set "
+                    "them in the camera, and leave the options out"
+                )
+            if is_file:
+                recorded = Recorded(_of_file(video))
+                yield Camera(recorded, recorded.latest)
+            else:
+                newest = Newest(lambda: _read(video), source)
+                try:
+                    yield Camera(newest, newest.latest)
+                finally:
+                    newest.close()
         finally:
             video.release()
     finally:
         cv2.utils.logging.setLogLevel(before)
+
+
+@runtime_checkable
+class Device(Protocol):
+    """What of cv2.VideoCapture sets a camera up."""
+
+    def set(self, propid: int, value: float, /) -> bool: ...
+
+    def get(self, propid: int, /) -> float: ...
+
+
+def keep_to(video: Device, options: CameraOptions, source: str) -> None:
+    """Fix size, exposure and focus; InputError where the camera does otherwise.
+
+    A driver may take a value and not follow it, so each is read back (videoio's page on VideoCaptureProperties).
+    """
+    if options.camera_size is not None:
+        wanted = options.camera_size
+        video.set(cv2.CAP_PROP_FRAME_WIDTH, wanted[0])
+        video.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted[1])
+        size = round(video.get(cv2.CAP_PROP_FRAME_WIDTH)), round(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if size != wanted:
+            raise InputError(
+                f"--camera-size {wanted[0]} {wanted[1]}: camera {source} gives {size[0]}x{size[1]}; choose a size that "
+                "v4l2-ctl --list-formats-ext lists"
+            )
+    # A focus that changes between pictures is another lens in each. Not all cameras have one.
+    video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
+    if options.exposure is not None:
+        video.set(cv2.CAP_PROP_AUTO_EXPOSURE, V4L2_MANUAL_EXPOSURE)
+        _fix(video, cv2.CAP_PROP_EXPOSURE, options.exposure, "--exposure", source)
+    if options.focus is not None:
+        _fix(video, cv2.CAP_PROP_FOCUS, options.focus, "--focus", source)
+
+
+def _fix(video: Device, prop: int, value: float, option: str, source: str) -> None:
+    if not video.set(prop, value) or abs(video.get(prop) - value) > 0.01 * abs(value) + 1.0:
+        raise InputError(
+            f"{option} {value:g}: camera {source} stays at {video.get(prop):g}; give a value that "
+            "v4l2-ctl --list-ctrls allows, or leave the option out"
+        )
 
 
 def _video(device: int | str) -> cv2.VideoCapture:
@@ -64,48 +220,15 @@ def _video(device: int | str) -> cv2.VideoCapture:
     return cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
 
 
+def _read(video: cv2.VideoCapture) -> Frame | None:
+    began = time.monotonic()
+    good, pixels = video.read()
+    return Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), began) if good else None
+
+
 def _of_file(video: cv2.VideoCapture) -> Iterator[Frame]:
     rate = video.get(cv2.CAP_PROP_FPS) or 30.0
     number = 0
     while (read := video.read())[0]:
         yield Frame(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB), number / rate)
         number += 1
-
-
-def _newest(video: cv2.VideoCapture, source: str) -> Iterator[Frame]:
-    """Frames whose taking began after they were asked for; a thread empties the driver's buffer meanwhile."""
-    arrived, stop = threading.Condition(), threading.Event()
-    newest: list[Frame] = []
-
-    def watch() -> None:
-        while not stop.is_set():
-            began = time.monotonic()
-            good, pixels = video.read()
-            with arrived:
-                if good:
-                    newest[:] = [Frame(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), began)]
-                arrived.notify_all()
-            if not good:
-                return
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        while True:
-            asked = time.monotonic()
-
-            def fresh(asked: float = asked) -> bool:
-                return bool(newest and newest[0].time_s >= asked) or not thread.is_alive()
-
-            with arrived:
-                came = arrived.wait_for(fresh, TIMEOUT_S)
-                if not came or not (newest and newest[0].time_s >= asked):
-                    raise InputError(
-                        f"--camera {source}: gives no more pictures; check its cable and start again: the same "
-                        "command goes on where it was"
-                    )
-                frame = newest[0]
-            yield frame
-    finally:
-        stop.set()
-        thread.join(TIMEOUT_S)

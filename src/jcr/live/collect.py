@@ -4,17 +4,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from jcr.capture.images import brightness_and_sharpness, read_image
-from jcr.files import write_text
+from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
-from jcr.live.camera import Frame
-from jcr.live.coverage import as_answer, coverage, in_words, page
+from jcr.live.camera import Camera, Frame
+from jcr.live.coverage import as_answer, coverage, in_words
 from jcr.live.folder import LiveFolder
 from jcr.live.look import Picture, grid, picture
-from jcr.live.ur import REST, farther
+from jcr.live.page import ENOUGH, Window, write_page
+from jcr.live.rest import REST, farther
 
 SAME_PLACE = (0.005, np.radians(1.0))
 """m, rad: a second picture from within this adds nothing."""
@@ -30,45 +29,52 @@ class CollectOptions:
     """Seconds to wait for a picture at rest."""
     reach: tuple[float, float, float, float, float, float] | None = None
     """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
+    wanted: tuple[float, float] = ENOUGH
+    """One-sigma uncertainty of the camera on the gripper that the live page aims at, MM DEG."""
 
 
 def collect(
     live: LiveFolder,
-    frames: Iterator[Frame],
+    camera: Camera,
     asks: Iterator[Ask],
     options: CollectOptions,
     tell: Callable[[Answer, list[str]], None],
+    words: ArmWords | None = None,
 ) -> None:
     """Take pictures into the folder until there are enough, or nobody asks any more, or the video ends.
 
-    `tell` hears each answer, with the lines a person reads. live.html in the folder shows how it goes.
+    `tell` hears each answer, with the lines a person reads, where the next pose is in the arm's own `words`.
+    live.html in the folder shows how it goes.
     """
     reach = None if options.reach is None else np.array(options.reach).reshape(2, 3)
     kept = [_as_kept(live, name) for name in live.names]
-    _show(live, reach, f"{len(live.names)} pictures of {options.images}")
-    for ask in asks if len(live.names) < options.images else ():
-        try:
-            taken = _taken(live, frames, kept, ask, options.patience)
-        except StopIteration:
-            tell({"accepted": False, "reason": "the video has ended"}, ["the video has ended"])
-            ask.answer({"accepted": False, "reason": "the video has ended", "done": True})
-            return
-        if isinstance(taken, str):
-            answer: Answer = {"accepted": False, "reason": taken}
-            lines, headline = [f"refused: {taken}"], f"Refused: {taken}"
-        else:
-            name = live.add(taken.image, ask.base_from_gripper)
-            kept.append(taken)
-            found = coverage(live, reach)
-            answer = {"accepted": True, "image": name, "done": len(live.names) >= options.images}
-            answer |= as_answer(found)
-            headline = f"{len(live.names)} pictures of {options.images}"
-            lines = [f"kept {name}", *in_words(found)]
-        _show(live, reach, headline)
-        ask.answer(answer)
-        tell(answer, lines)
-        if len(live.names) >= options.images:
-            return
+    found = coverage(live, reach, words)
+    write_page(live, found, f"{len(live.names)} pictures of {options.images}", options.wanted)
+    frames = iter(camera.frames)
+    with Window(live, camera.latest):
+        for ask in asks if len(live.names) < options.images else ():
+            try:
+                taken = _taken(live, frames, kept, ask, options.patience)
+            except StopIteration:
+                tell({"accepted": False, "reason": "the video has ended"}, ["the video has ended"])
+                ask.answer({"accepted": False, "reason": "the video has ended", "done": True})
+                return
+            if isinstance(taken, str):
+                answer: Answer = {"accepted": False, "reason": taken}
+                lines, headline = [f"refused: {taken}"], f"Refused: {taken}"
+            else:
+                name = live.add(taken.image, ask.base_from_gripper, ask.joints, taken.depth_mm)
+                kept.append(taken)
+                found = coverage(live, reach, words)
+                answer = {"accepted": True, "image": name, "done": len(live.names) >= options.images}
+                answer |= as_answer(found)
+                headline = f"{len(live.names)} pictures of {options.images}"
+                lines = [f"kept {name}", *in_words(found)]
+            write_page(live, found, headline, options.wanted)
+            ask.answer(answer)
+            tell(answer, lines)
+            if len(live.names) >= options.images:
+                return
 
 
 def _taken(
@@ -86,7 +92,3 @@ def _taken(
 def _as_kept(live: LiveFolder, name: str) -> Picture:
     image = read_image(live.folder / name)
     return Picture(image, grid(image), brightness_and_sharpness(image)[1])
-
-
-def _show(live: LiveFolder, reach: Float[ndarray, "2 3"] | None, headline: str) -> None:
-    write_text(live.folder / "live.html", page(live, coverage(live, reach), headline))

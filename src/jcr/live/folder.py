@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.capture_json import FILE, read_lens
@@ -23,11 +23,13 @@ THUMBNAIL_PX = 240
 class LiveFolder:
     """A capture folder that pictures are added to; what it holds already is kept."""
 
-    def __init__(self, folder: Path, lens: dict[str, Any] | None = None):
+    def __init__(self, folder: Path, lens: dict[str, Any] | None = None, robot: str | None = None):
         """Raises InputError when `folder` holds a capture.json that cannot be gone on with."""
         self.folder = folder
         self.names: list[str] = []
         self.poses: list[Float[ndarray, "4 4"]] = []
+        self.joints: list[Float[ndarray, " dof"] | None] = []
+        self.depths: list[str | None] = []
         self.lens = lens
         self.size: tuple[int, int] | None = None
         self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
@@ -35,6 +37,8 @@ class LiveFolder:
             raise InputError(f"{folder}: is a file; name a folder for the capture")
         if (folder / FILE).exists():
             self._resume(read_json(folder / FILE))
+        if robot is not None:
+            self.rest["robot"] = robot
 
     def _resume(self, content: Any) -> None:
         file = self.folder / FILE
@@ -48,11 +52,23 @@ class LiveFolder:
             self.size = (width, height)
             self.names.append(frame["image"])
             self.poses.append(read_rigid(frame.get("base_from_gripper"), where))
+            angles, depth = frame.get("joints"), frame.get("depth")
+            self.joints.append(np.array(angles, dtype=np.float64) if isinstance(angles, list) else None)
+            self.depths.append(depth if isinstance(depth, str) else None)
         self.lens = self.lens or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
 
-    def add(self, image: UInt8[ndarray, "h w 3"], base_from_gripper: Float[ndarray, "4 4"]) -> str:
-        """Keep a picture (RGB) and its pose, and return the picture's name; capture.json is whole again after."""
+    def add(
+        self,
+        image: UInt8[ndarray, "h w 3"],
+        base_from_gripper: Float[ndarray, "4 4"],
+        joints: Float[ndarray, " dof"] | None = None,
+        depth_mm: UInt16[ndarray, "h w"] | None = None,
+    ) -> str:
+        """Keep a picture (RGB) and its pose, and return the picture's name; capture.json is whole again after.
+
+        `joints` (rad) are kept when all pictures have them.
+        """
         size = (image.shape[1], image.shape[0])
         if self.size not in (None, size):
             raise InputError(
@@ -63,6 +79,10 @@ class LiveFolder:
             read_lens(self.lens, size, self.folder / FILE)
         name = f"images/{self._next_number():03d}.png"
         write_bytes(self.folder / name, encode_png(image))
+        depth = None
+        if depth_mm is not None:
+            depth = f"depth/{Path(name).stem}.png"
+            write_bytes(self.folder / depth, encode_png(depth_mm))
         height = round(THUMBNAIL_PX * size[1] / size[0])
         bgr = np.ascontiguousarray(image[..., ::-1])
         small = cv2.resize(bgr, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
@@ -70,13 +90,27 @@ class LiveFolder:
         self.size = size
         self.names.append(name)
         self.poses.append(base_from_gripper)
-        frames = [
-            {"image": name, "base_from_gripper": pose.tolist()}
-            for name, pose in zip(self.names, self.poses, strict=True)
-        ]
+        self.joints.append(joints)
+        self.depths.append(depth)
+        self._write()
+        return name
+
+    def all_joints(self) -> Float[ndarray, "n dof"] | None:
+        """Joint angles (rad) of all pictures, or None where one lacks them."""
+        known = [angles for angles in self.joints if angles is not None]
+        return np.stack(known) if known and len(known) == len(self.joints) else None
+
+    def _write(self) -> None:
+        frames: list[dict[str, Any]] = []
+        for row, (name, pose) in enumerate(zip(self.names, self.poses, strict=True)):
+            frame: dict[str, Any] = {"image": name, "base_from_gripper": pose.tolist()}
+            if all(angles is not None for angles in self.joints):
+                frame["joints"] = np.asarray(self.joints[row]).tolist()
+            if self.depths[row] is not None:
+                frame["depth"] = self.depths[row]
+            frames.append(frame)
         content = {"frames": frames, "intrinsics": self.lens, **self.rest}
         write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")
-        return name
 
     @staticmethod
     def thumbnail(name: str) -> str:

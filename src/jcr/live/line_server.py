@@ -9,6 +9,7 @@ import hmac
 import ipaddress
 import json
 import socket
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,10 @@ from jcr.live.asks import Answer, Ask, pose_of_numbers
 
 MAX_LINE = 65_536
 """Bytes; a pose takes a few hundred."""
+MOST_REFUSED = 100
+"""Lines in a row, after which a client is no robot's program."""
+LINE_S = 10.0
+"""For a line that has begun to be whole, and for a stranger's first."""
 ANSWER_S = 10.0
 """A client that does not take its answer within this is gone."""
 
@@ -74,14 +79,13 @@ def bound(listen: Listen) -> socket.socket:
 
 def _served(client: socket.socket, listen: Listen):
     """Requests of one client; returns whether it said that it is done."""
-    stream = client.makefile("rb")
-    welcome = listen.token is None
-    if not welcome:
-        client.settimeout(ANSWER_S)  # a stranger who says nothing must not keep others waiting
+    received = bytearray()
+    welcome, refused = listen.token is None, 0
     while True:
         try:
-            line = stream.readline(MAX_LINE + 1)
-        except TimeoutError:
+            # A stranger who says nothing must not keep others waiting, nor anybody who drips a line byte by byte.
+            line = _line(client, received, listen.timeout_s if welcome else LINE_S)
+        except _NobodyError:
             if not welcome:
                 return False
             raise _silence(listen) from None
@@ -92,14 +96,17 @@ def _served(client: socket.socket, listen: Listen):
         if len(line) > MAX_LINE:
             _dismiss(client, f"a line of more than {MAX_LINE} bytes")
             return False
+        if refused >= MOST_REFUSED:
+            _dismiss(client, f"{MOST_REFUSED} lines in a row were refused")
+            return False
         message = parsed(line)
+        refused += 1
         if not welcome:
             given = message.get("token") if isinstance(message, dict) else None
             if not hmac.compare_digest(str(given).encode(), str(listen.token).encode()):
                 _dismiss(client, "the first line must be the right token")
                 return False
-            welcome = True
-            client.settimeout(listen.timeout_s)
+            welcome, refused = True, 0
             _answer(client, {"accepted": True})
         elif isinstance(message, dict) and message.get("done") is True:
             return True
@@ -107,9 +114,42 @@ def _served(client: socket.socket, listen: Listen):
             _answer(client, _refusal(message))
         else:
             try:
-                yield Ask(pose_of(message), lambda answer: _answer(client, answer))
+                pose = pose_of(message)
             except InputError as error:
                 _answer(client, _refusal(str(error)))
+                continue
+            refused = 0
+            yield Ask(pose, lambda answer: _answer(client, answer))
+
+
+class _NobodyError(Exception):
+    """No line began in time."""
+
+
+def _line(client: socket.socket, received: bytearray, patience_s: float) -> bytes:
+    """The next line, of at most one byte more than MAX_LINE; empty where the client is gone or drips.
+
+    `received` is what came behind the line before. Raises _NobodyError where none begins within `patience_s`.
+    """
+    deadline = time.monotonic() + (LINE_S if received else patience_s)
+    while b"\n" not in received and len(received) <= MAX_LINE:
+        client.settimeout(max(deadline - time.monotonic(), 1e-3))
+        try:
+            more = client.recv(MAX_LINE)
+        except TimeoutError:
+            if received:
+                return b""
+            raise _NobodyError from None
+        if not more:
+            break
+        if not received:
+            deadline = time.monotonic() + LINE_S
+        received += more
+    end = received.find(b"\n")
+    length = min(end + 1 if end >= 0 else len(received), MAX_LINE + 1)
+    line = bytes(received[:length])
+    del received[:length]
+    return line
 
 
 def parsed(line: bytes) -> dict[str, Any] | str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
@@ -26,6 +26,7 @@ class Picture:
     image: UInt8[ndarray, "h w 3"]
     grid: Float32[ndarray, "gh gw"]
     sharpness: float
+    depth_mm: UInt16[ndarray, "h w"] | None = None
 
 
 def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> Picture | str:
@@ -56,7 +57,7 @@ def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> 
                 "the gripper moved but the picture is as before; is the stream frozen, the camera another?"
             )
         else:
-            return Picture(frame.image, now, sharpness)
+            return Picture(frame.image, now, sharpness, frame.depth_mm)
         if frame.time_s > end:
             return reason
 

@@ -8,16 +8,14 @@ groups of doubles. From software 3.0 (CB3, e-Series) nine groups of six precede 
 
 import socket
 import struct
-from collections import deque
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
+from jcr.capture.capture_json import MOST_TURNS
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_angle
-from jcr.live.asks import Answer, Ask, pose_of_numbers
+from jcr.live.asks import pose_of_numbers
+from jcr.live.rest import State
 
 TIMEOUT_S = 5.0
 TOOL_VECTOR_SINCE_3_0, TOOL_VECTOR_BEFORE = 444, 588
@@ -25,61 +23,15 @@ TOOL_VECTOR_SINCE_3_0, TOOL_VECTOR_BEFORE = 444, 588
 BEFORE_3_0 = (764, 812)
 SINCE_3_0 = range(1044, 4096)
 """Lengths of packets; each release since 3.0 (1044 bytes) appended to the one before."""
-REST_S = 0.5
-REST = (2e-4, np.radians(0.03))
-"""m, rad: an arm that stays within this for REST_S is at rest."""
-MOVED_ON = (0.01, np.radians(3.0))
-"""m, rad: as far as this from the last picture, rest asks for the next one."""
-TRY_AGAIN = (1e-3, np.radians(0.2))
-"""m, rad: as far as this from a pose that was refused, likewise."""
-
-State = tuple[float, Float[ndarray, "4 4"]]
-"""Time of the controller (s), base_from_gripper of the tool centre point set in the installation."""
-
-
-def ur_poses(host: str, port: int, say: Callable[[str], None]) -> Iterator[Ask]:
-    """A request whenever the arm has come to rest in a new place; drive it by its program or by hand.
-
-    Raises InputError when the robot cannot be reached, falls silent or sends something else.
-    """
-    say(f"move the arm; a picture is taken whenever it rests ({host})")
-    last, limit = None, MOVED_ON
-
-    def heard(answer: Answer) -> None:
-        nonlocal limit
-        limit = MOVED_ON if answer["accepted"] else TRY_AGAIN
-
-    while True:
-        pose = _at_rest(host, port, last, limit)
-        # The connection is closed meanwhile: packets that wait would tell where the arm has been.
-        yield Ask(pose, heard, current=lambda: next(states(host, port))[1])
-        last = pose
-
-
-def _at_rest(
-    host: str, port: int, last: Float[ndarray, "4 4"] | None, limit: tuple[float, float]
-) -> Float[ndarray, "4 4"]:
-    """Where the arm rests, once it is farther than `limit` from `last`."""
-    recent: deque[State] = deque()
-    for time_s, pose in states(host, port):
-        while recent and farther(recent[0][1], pose, REST):
-            recent.popleft()
-        recent.append((time_s, pose))
-        while len(recent) > 1 and time_s - recent[1][0] >= REST_S:
-            recent.popleft()
-        if time_s - recent[0][0] >= REST_S and (last is None or farther(last, pose, limit)):
-            return pose
-    raise AssertionError("states() never ends but by raising")
-
-
-def farther(a: Float[ndarray, "4 4"], b: Float[ndarray, "4 4"], limit: tuple[float, float]) -> bool:
-    """Whether two poses are more than (m, rad) apart."""
-    motion = inverse(a) @ b
-    return bool(np.linalg.norm(motion[:3, 3]) > limit[0] or rotation_angle(motion[:3, :3]) > limit[1])
+JOINTS = 252
+"""Byte at which the six actual joint angles (rad) begin, in every version."""
 
 
 def states(host: str, port: int) -> Iterator[State]:
-    """What the robot says from now on, 125 or 500 times a second."""
+    """What the robot says from now on, 125 or 500 times a second.
+
+    Raises InputError when the robot cannot be reached, falls silent or sends something else.
+    """
     where = f"--poses ur:{host}:{port}"
     try:
         with socket.create_connection((host, port), TIMEOUT_S) as connection:
@@ -107,4 +59,7 @@ def _state(head: bytes, read: Callable[[int], bytes], where: str) -> State:
         raise InputError(f"{where}: the connection broke; the same command goes on")
     offset = TOOL_VECTOR_BEFORE if length in BEFORE_3_0 else TOOL_VECTOR_SINCE_3_0
     tool = struct.unpack_from("!6d", packet, offset)
-    return struct.unpack_from("!d", packet, 4)[0], pose_of_numbers(list(tool), where)
+    joints = np.array(struct.unpack_from("!6d", packet, JOINTS))
+    # A last joint without limits may have gone round more often than a capture.json allows.
+    plausible = joints if (np.abs(joints) < MOST_TURNS).all() else None
+    return State(struct.unpack_from("!d", packet, 4)[0], pose_of_numbers(list(tool), where), plausible)

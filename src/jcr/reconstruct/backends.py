@@ -25,7 +25,11 @@ INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps dept
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 
-    return reconstruct(capture, ColmapOptions(seed=options.seed, **_dense(options)), progress)
+    features = "sift" if options.features == "auto" else options.features
+    if features != "sift":
+        extra("torch", "match", f"--features {features}")
+    made = ColmapOptions(seed=options.seed, features=features, **_dense(options))
+    return reconstruct(capture, made, progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -205,8 +209,10 @@ BACKENDS: dict[str, Backend] = {
         Backend(
             "colmap",
             _colmap,
-            "BSD-3-Clause",
+            "BSD-3-Clause; XFeat and LightGlue Apache-2.0, ALIKED BSD-3-Clause",
             auto=True,
+            options=("features",),
+            selected_by="features",
             accuracy="0.05 mm and 0.005° on the bundled capture (docs/results/run.md)",
         ),
         Backend(
@@ -358,6 +364,9 @@ class ReconstructOptions:
     """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
     """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
+    """What is matched between images; selects the back end colmap. SIFT, or learned features for little texture, whose
+    weights come with the extra match; auto tries sift, then xfeat where it is installed and the first is rejected."""
     board: str | None = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
@@ -473,6 +482,30 @@ def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
                 f"give --backend {' or '.join(users)}"
             )
     return names
+
+
+def tries(options: ReconstructOptions) -> list[ReconstructOptions]:
+    """The options of every attempt that `auto` may make, the best first.
+
+    Of the candidates the two best, where one network that sees all views does not count, and no second such one; COLMAP
+    with SIFT, then with learned features where their weights are installed. Raises as `candidates` does.
+    """
+    names = candidates(options)
+    networks = [name for name in names if BACKENDS[name].sees_all_views]
+    asked = [name for name in names if name not in networks[1:]]
+    made = []
+    for one in (for_backend(options, name) for name in asked[: 3 if networks else 2]):
+        made.append(one)
+        if one.backend == "colmap" and one.features == "auto" and options.backend == "auto" and _has_xfeat():
+            made[-1:] = [replace(one, features="sift"), replace(one, features="xfeat")]
+    return made
+
+
+def _has_xfeat() -> bool:
+    """Whether the default learned features can run here; nothing is imported."""
+    from jcr.match.weights import LIGHTERGLUE, XFEAT
+
+    return is_installed("torch") and bool(XFEAT.found() and LIGHTERGLUE.found())
 
 
 def for_backend(options: ReconstructOptions, name: BackendName) -> ReconstructOptions:

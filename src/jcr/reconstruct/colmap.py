@@ -8,6 +8,7 @@ from PIL import ExifTags, Image
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
+from jcr.match.matchers import FeatureName
 from jcr.progress import Progress, silent
 from jcr.reconstruct.depth.dense import DenseOptions, plan_memory, with_pointmaps
 from jcr.records import Capture, Intrinsics, Reconstruction
@@ -29,6 +30,10 @@ class ColmapOptions(DenseOptions):
     """Same seed, same result, bit for bit."""
     verbose: bool = False
     """Let COLMAP's own log through."""
+    features: FeatureName = "sift"
+    """What is matched between images."""
+    robot_checks: bool = True
+    """Let the gripper poses check the matches; off, images alone decide."""
 
 
 def reconstruct(
@@ -59,6 +64,9 @@ def reconstruct(
             options.verbose,
             report,
             options.memory_gb,
+            options.features,
+            capture.base_from_gripper if options.robot_checks else None,
+            capture.images,
         )
     except NotTrustedError as error:
         raise NotTrustedError("; ".join([str(error), *notes])) from None

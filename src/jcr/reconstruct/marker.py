@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project
+from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
@@ -136,13 +136,20 @@ def _within(sightings: Sequence[Sighting], lens: Intrinsics, fold_px: float) -> 
 def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
     """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
     x, x_px = sighting.x_in_body, sighting.x_px
+    seen, camera = x_px, (lens.matrix, np.array(lens.distortion))
+    if lens.model == "fisheye":
+        # OpenCV's solvers know the other two: they get a pinhole's image of the same rays.
+        straight = without_distortion(lens)
+        seen, camera = (
+            project(straight, unproject(lens, x_px)),
+            (straight.matrix, np.array(straight.distortion)),
+        )
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
         return None
-    camera = lens.matrix, np.array(lens.distortion)
-    count, rotations, translations, _ = cv2.solvePnPGeneric(x, x_px, *camera, flags=cv2.SOLVEPNP_IPPE)
+    count, rotations, translations, _ = cv2.solvePnPGeneric(x, seen, *camera, flags=cv2.SOLVEPNP_IPPE)
     found = []
     for k in range(count):
-        turn, shift = cv2.solvePnPRefineLM(x, x_px, *camera, rotations[k], translations[k])
+        turn, shift = cv2.solvePnPRefineLM(x, seen, *camera, rotations[k], translations[k])
         pose = transform(rotation_exp(turn.ravel()), shift.ravel())
         missed = project(lens, apply(pose, x)) - x_px
         found.append(Pose(pose, float(np.sqrt((missed**2).sum(1).mean()))))

@@ -4,18 +4,72 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jcr.capture.plain_files import first_fault, shown
 from jcr.errors import InputError
 from jcr.files import written_whole
-from jcr.records import CameraEvidence, Intrinsics, Reconstruction, Tracks
+from jcr.geometry import HUGE, require_rigid
+from jcr.records import (
+    COEFFICIENTS,
+    CameraEvidence,
+    Intrinsics,
+    LensModel,
+    Reconstruction,
+    Tracks,
+    coefficients_of,
+)
 
 FORMAT = "jcr.reconstruction/4"
 """Changes with what the file holds."""
 OLD = "jcr.reconstruction/3"
 """Without reasons and sigmas of depths, which were all matched; else the same."""
+
+
+MOST_PIXELS = 100_000
+"""Across an image; no camera's is wider."""
+Positive = Annotated[float, Field(gt=0, lt=HUGE)]
+Pixels = Annotated[int, Field(ge=1, le=MOST_PIXELS)]
+
+
+class Lens(BaseModel):
+    """Of an image or a pointmap."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    width: Pixels
+    height: Pixels
+    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
+    model: LensModel = "pinhole"
+
+    def record(self) -> Intrinsics:
+        """As a record; ValueError where the model has another number of coefficients."""
+        names = COEFFICIENTS[self.model]
+        if len(self.distortion) != len(names):
+            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} lens has {names}")
+        size = self.width, self.height
+        return Intrinsics(
+            self.fx, self.fy, self.cx, self.cy, *size, coefficients_of(self.distortion), self.model
+        )
+
+
+class About(BaseModel):
+    """What is no array."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    format: str
+    backend: str
+    is_metric: bool
+    metric_std: Positive | None
+    notes: list[str]
+    intrinsics: Lens
+    pointmap_intrinsics: Lens
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
@@ -59,16 +113,16 @@ def read_reconstruction(path: Path) -> Reconstruction:
     try:
         # NumPy leaves a file open that it cannot read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
-            if about["format"] not in (FORMAT, OLD):
-                raise InputError(
-                    f"{path}: format {about['format']!r}, not {FORMAT!r}; delete it and run again"
-                )
-            return Reconstruction(
+            text = str(file["about"])
+            kind = json.loads(text)["format"]
+            if kind not in (FORMAT, OLD):
+                raise InputError(f"{path}: format {shown(kind)}, not {FORMAT!r}; delete it and run again")
+            about = About.model_validate_json(text, strict=True)
+            found = Reconstruction(
                 image_index=file["image_index"],
                 recon_from_camera=file["recon_from_camera"],
-                intrinsics=_intrinsics(about["intrinsics"]),
-                pointmap_intrinsics=_intrinsics(about["pointmap_intrinsics"]),
+                intrinsics=about.intrinsics.record(),
+                pointmap_intrinsics=about.pointmap_intrinsics.record(),
                 points_in_recon=file["points_in_recon"],
                 confidence=file["confidence"],
                 colors=file["colors"],
@@ -79,16 +133,20 @@ def read_reconstruction(path: Path) -> Reconstruction:
                     file["track_points_in_recon"],
                     bool(file["tracks_from_pointmaps"]),
                 ),
-                backend=about["backend"],
-                is_metric=about["is_metric"],
-                metric_std=about["metric_std"],
-                notes=tuple(about["notes"]),
+                backend=about.backend,
+                is_metric=about.is_metric,
+                metric_std=about.metric_std,
+                notes=tuple(about.notes),
                 reason=file.get("reason"),
                 depth_std=file.get("depth_std"),
                 evidence=_evidence(file),
             )
+            _check(found)
+            return found
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
+    except ValidationError as error:
+        raise InputError(f"{path}: about: {first_fault(error)}; delete it and run again") from None
     except InputError:
         raise
     except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
@@ -101,6 +159,46 @@ def _evidence(file: Mapping[str, np.ndarray]) -> CameraEvidence | None:
     return CameraEvidence(file["evidence_recon_from_camera"], file["evidence_covariance"])
 
 
-def _intrinsics(fields: dict[str, Any]) -> Intrinsics:
-    numbers: dict[str, Any] = fields | {"distortion": tuple(fields["distortion"])}
-    return Intrinsics(**numbers)
+def _check(found: Reconstruction) -> None:
+    """ValueError where the arrays do not belong together, or hold what cannot be."""
+    m, tracks, evidence = len(found.image_index), found.tracks, found.evidence
+    height, width = found.pointmap_intrinsics.height, found.pointmap_intrinsics.width
+    k, p = len(tracks.image), len(tracks.points_in_recon)
+    maps = found.points_in_recon.shape[1:3]  # none at all where no depth was made
+    shapes = {
+        "recon_from_camera": (found.recon_from_camera, (m, 4, 4)),
+        "image_index": (found.image_index, (m,)),
+        "points_in_recon": (found.points_in_recon, (m, *maps, 3)),
+        "confidence": (found.confidence, (m, *maps)),
+        "colors": (found.colors, (m, *maps, 3)),
+        "track_image": (tracks.image, (k,)),
+        "track_x_px": (tracks.x_px, (k, 2)),
+        "track_point": (tracks.point, (k,)),
+        "track_points_in_recon": (tracks.points_in_recon, (p, 3)),
+    }
+    if evidence is not None:
+        shapes["evidence_recon_from_camera"] = evidence.recon_from_camera, (m, 4, 4)
+        shapes["evidence_covariance"] = evidence.covariance, (6 * m, 6 * m)
+    if found.reason is not None:
+        shapes["reason"] = found.reason, (m, *maps)
+    if found.depth_std is not None:
+        shapes["depth_std"] = found.depth_std, (m, *maps)
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+    if maps not in ((height, width), (0, 0)):
+        raise ValueError(f"pointmaps of {maps}, their intrinsics of {(height, width)} pixels")
+    for name, index, end in (
+        ("image_index", found.image_index, np.inf),
+        ("track_image", tracks.image, m),
+        ("track_point", tracks.point, p),
+    ):
+        if index.dtype.kind not in "iu" or (index < 0).any() or (index >= end).any():
+            raise ValueError(f"{name} counts rows that are not there")
+    if (np.diff(found.image_index) <= 0).any():
+        raise ValueError("image_index does not ascend")
+    for cameras in (found.recon_from_camera, *(() if evidence is None else (evidence.recon_from_camera,))):
+        for row, camera in enumerate(cameras):
+            require_rigid(camera, f"camera {row}")

@@ -1,4 +1,4 @@
-"""Structure from motion with pycolmap: SIFT, exhaustive matching, incremental mapping, bundle adjustment.
+"""Structure from motion with pycolmap: features, matches that the robot checks, incremental mapping, bundle adjustment.
 
 COLMAP has the centre of the top-left pixel at (0.5, 0.5); this file is the border where that half pixel,
 the working size and COLMAP's camera models are converted.
@@ -7,14 +7,17 @@ Method: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 
 import math
 import os
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
@@ -22,15 +25,39 @@ from jcr.camera import fold_distance_px, resized
 from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
+from jcr.match.guided import guided
+from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
+from jcr.match.pairs import all_pairs
+from jcr.match.stage import Matched, Matcher, match_with_robot
+from jcr.match.verify import HALF_PIXEL, View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
 from jcr.reconstruct.depth.dense import SparseModel
+from jcr.reconstruct.placed import (
+    LEAST_SHARED,
+    joined,
+    poses_of,
+    predicted_cameras,
+    resectioned,
+    retriangulated,
+    shared_points,
+)
 from jcr.records import Intrinsics, Tracks
 
-HALF_PIXEL = 0.5
+if (
+    threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+):
+    # pycolmap's logger answers it with a page of C++ frames.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
 BYTES_OF_FEATURES = 330
 """Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
 _MIN_REGISTERED = 3
+_GUIDED_PARTNERS = 6
+"""Images with which one that was left out is matched along epipolar lines."""
+_PREDICTED_STD = 0.008
+"""rad, of directions predicted by X and the robot."""
 _FEW_FEATURES = 1000
 """Per image; textured tabletops give 1500 to 5000, a chessboard before a plain background 400."""
 
@@ -44,8 +71,13 @@ def structure_from_motion(
     verbose: bool,
     report: Progress,
     memory_gb: float = 8.0,
+    features: FeatureName = "sift",
+    base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
+    names: Sequence[str] = (),
 ) -> SparseModel:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
+
+    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes.
 
     A `known` lens is the only one of `lenses`, does not fold over, and is held; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
@@ -53,16 +85,24 @@ def structure_from_motion(
     """
     with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb)
-        report("matching", 0.0)
-        match(database, seed)
-        report("matching", 1.0)
+        if features == "sift":
+            cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb)
+            matcher: Matcher = SiftMatcher(database, len(images), seed)
+        else:
+            cameras, _ = _enter(database, images, lenses, known, working_size_px)
+            matcher = LearnedMatcher(
+                features, images, database, cameras[0], _at_work(lenses[0], cameras[0]), known, seed, report
+            )
+        matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
         model = _map_incrementally(database, len(images), cameras, known, seed, report)
+        if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
+            model, placed = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
+            matched = replace(matched, notes=(*matched.notes, *placed))
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise NotTrustedError(_why_not_registered(database, len(images), model))
         _adjust_robustly(model, hold_lens=known)
-        lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), []
-        if fold_distance_px(lens) is not None:
+        lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
+        if not known and fold_distance_px(lens) is not None:
             notes.append("the views do not determine the lens distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
             _adjust_robustly(model, hold_lens=True)
@@ -88,25 +128,8 @@ def extract(
 
     As many threads are used as the budget, a peak resident set, has room for.
     """
-    width, height = lenses[0].width, lenses[0].height
-    scale = min(1.0, working_size_px / max(width, height))
-    size = round(width * scale), round(height * scale)
-    cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
-    names = [f"{row:05d}.png" for row in range(len(images))]
-    # Images are entered beforehand: extraction threads would number them in the order in which they finish.
-    with closing(pycolmap.Database.open(database)) as db:
-        db.write_camera(cameras[0], use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(cameras[0].sensor_id)
-        db.write_rig(rig, use_rig_id=True)
-        for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
-            grey = Image.fromarray(pixels).convert("L").resize(size, Image.Resampling.BOX)
-            (database.parent / name).write_bytes(encode_png(np.asarray(grey)))
-            image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
-            db.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
-            frame.add_data_id(image.data_id)
-            db.write_frame(frame, use_frame_id=True)
+    cameras, names = _enter(database, images, lenses, known, working_size_px)
+    size = cameras[0].width, cameras[0].height
     cpu = pycolmap.Device.cpu
     cores = os.cpu_count() or 1
     extraction = pycolmap.FeatureExtractionOptions()
@@ -128,14 +151,78 @@ def extract(
     return cameras
 
 
+def _enter(
+    database: Path,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    lenses: Sequence[Intrinsics],
+    known: bool,
+    working_size_px: int,
+) -> tuple[list[pycolmap.Camera], list[str]]:
+    """A new database of grey images at the working size; the lenses as COLMAP's cameras, and the images' names."""
+    width, height = lenses[0].width, lenses[0].height
+    scale = min(1.0, working_size_px / max(width, height))
+    size = round(width * scale), round(height * scale)
+    cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
+    names = [f"{row:05d}.png" for row in range(len(images))]
+    # Images are entered beforehand: extraction threads would number them in the order in which they finish.
+    with closing(pycolmap.Database.open(database)) as db:
+        db.write_camera(cameras[0], use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(cameras[0].sensor_id)
+        db.write_rig(rig, use_rig_id=True)
+        for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
+            grey = Image.fromarray(pixels).convert("L").resize(size, Image.Resampling.BOX)
+            (database.parent / name).write_bytes(encode_png(np.asarray(grey)))
+            image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
+            db.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+    return cameras, names
+
+
 def match(database: Path, seed: int) -> None:
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    # With COLMAP's 15, a view of a board was registered by the wrong squares, 30 cm from its place.
-    verification.min_num_inliers = 25
-    # The gripper's fingers, or text drawn into the pictures, keep their pixels while the scene moves.
-    verification.filter_stationary_matches = True
-    pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+    """All pairs of the images in a database, by images alone."""
+    pycolmap.match_exhaustive(database, verification_options=verification(seed), device=pycolmap.Device.cpu)
+
+
+def _matched(
+    database: Path,
+    matcher: Matcher,
+    base_from_gripper: Float[ndarray, "n 4 4"] | None,
+    lens: Intrinsics,
+    cameras: list[pycolmap.Camera],
+    known: bool,
+    names: Sequence[str],
+    report: Progress,
+) -> Matched:
+    """The pairs that a mapper may believe, written into the database; a lens that the robot found comes first."""
+    report("matching", 0.0)
+    working = _at_work(lens, cameras[0])
+    if base_from_gripper is None:
+        n = len(matcher.x_px)
+        pairs = all_pairs(n)
+        matched = Matched(matcher.geometries(pairs, np.zeros((len(pairs), 2))), None, working, len(pairs))
+    else:
+        matched = match_with_robot(
+            matcher,
+            base_from_gripper,
+            working,
+            known,
+            names,
+            (lens.width, lens.height),
+            lambda fraction: report("matching", fraction),
+        )
+    write_geometries(database, matched.geometries)
+    if not known and matched.lens != working:
+        cameras.insert(0, camera_of(matched.lens, known))
+    report("matching", 1.0)
+    return matched
+
+
+def _at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
+    """The lens of the images at the working size."""
+    return resized(lens, camera.width, camera.height)
 
 
 def _map_incrementally(
@@ -150,15 +237,8 @@ def _map_incrementally(
 
     The share of images in the model is reported; it falls back where another start is tried.
     """
-    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline = _pipeline(known, seed)
     mapper = pipeline.mapper
-    pipeline.min_model_size = 2
-    pipeline.multiple_models = pipeline.extract_colors = False
-    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
-    pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
-    if known:
-        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
-        mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
     best, registered = None, 0
     for init_inliers, init_angle_deg, inliers in ((100, 16.0, 30), (50, 8.0, 15)):
         mapper.init_min_num_inliers, mapper.init_min_tri_angle = init_inliers, init_angle_deg
@@ -175,6 +255,116 @@ def _map_incrementally(
         if registered >= _MIN_REGISTERED:
             return best
     return best
+
+
+def _placed(
+    database: Path,
+    model: pycolmap.Reconstruction,
+    matcher: Matcher,
+    matched: Matched,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    known: bool,
+    seed: int,
+    names: Sequence[str],
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The model with images that the mapper left out and the robot helps to place, and notes that name them."""
+    predicted = predicted_cameras(model, base_from_gripper)
+    if predicted is None:
+        return model, ()
+    rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
+    left = [row for row in range(len(base_from_gripper)) if row not in rows]
+    camera = model.camera(1)
+    lens = matched.lens if known else _lens_of(camera, matched.lens)
+    _match_guided(
+        database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left, known, seed
+    )
+    poses = dict(zip(rows, poses_of(model, rows), strict=True))
+    apart = _second_model(database, left, camera, known, seed)
+    together = joined(apart, predicted) if apart is not None else {}
+    for row in left:
+        if (pose := resectioned(database, model, row, predicted[row])) is not None:
+            together.pop(row, None)
+            poses[row] = pose
+    resected = poses.keys() - set(rows)
+    if not resected and not together:
+        return model, ()
+    larger = retriangulated(database, camera, poses | together, lambda made: _adjust_robustly(made, True))
+    notes = []
+    if together and shared_points(larger, set(together)) < LEAST_SHARED:
+        listed = ", ".join(names[row] for row in sorted(together))
+        notes.append(
+            f"{listed} make a model of their own that nothing in the images ties to the rest: left out; add images "
+            "between them"
+        )
+        if not resected:
+            return model, tuple(notes)
+        larger = retriangulated(database, camera, poses, lambda made: _adjust_robustly(made, True))
+    elif together:
+        listed = ", ".join(names[row] for row in sorted(together))
+        notes.append(f"{listed} were mapped apart, and joined through the robot's motion")
+    if resected:
+        listed = ", ".join(names[row] for row in sorted(resected))
+        notes.append(f"{listed} were placed near the pose that the robot predicts")
+    return larger, tuple(notes)
+
+
+def _match_guided(
+    database: Path,
+    matcher: Matcher,
+    view: View,
+    camera: pycolmap.Camera,
+    matched: Matched,
+    predicted: Float[ndarray, "n 4 4"],
+    left: Sequence[int],
+    known: bool,
+    seed: int,
+) -> None:
+    """Further verified pairs of images that are not mapped, along predicted epipolar lines, into the database."""
+    found = read_geometries(database)
+    upright = np.zeros(len(predicted)) if matched.upright is None else matched.upright
+    toward = predicted[:, :3, 2]
+    for row in left:
+        near = np.argsort(-(toward @ toward[row]), kind="stable")
+        for other in [int(k) for k in near if k != row][:_GUIDED_PARTNERS]:
+            i, j = min(row, other), max(row, other)
+            if (i, j) in found:
+                continue
+            i_from_j = inverse(predicted[i]) @ predicted[j]
+            geometry = guided(matcher, view, camera, i, j, i_from_j, upright, _PREDICTED_STD, seed, known)
+            if geometry is not None:
+                found[i, j] = geometry
+    write_geometries(database, found)
+
+
+def _second_model(
+    database: Path, left: Sequence[int], camera: pycolmap.Camera, known: bool, seed: int
+) -> pycolmap.Reconstruction | None:
+    """What the mapper makes of the images that are left, its lens that of the map; None where it makes nothing."""
+    if len(left) < 2:
+        return None
+    with closing(pycolmap.Database.open(database)) as db:
+        db.update_camera(camera)
+    pipeline = _pipeline(known, seed)
+    pipeline.image_names = [f"{row:05d}.png" for row in left]
+    pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
+    pipeline.mapper.abs_pose_min_num_inliers = 15
+    models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
+    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return largest if largest is not None and largest.num_reg_images() >= 2 else None
+
+
+def _pipeline(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """COLMAP's incremental mapping, the same for the same seed."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    mapper = pipeline.mapper
+    pipeline.min_model_size = 2
+    pipeline.multiple_models = pipeline.extract_colors = False
+    pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
+    pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
+    if known:
+        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
+        mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
+    return pipeline
 
 
 def _models(
@@ -268,8 +458,11 @@ def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     centre = [lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL]
     if not known:
         name, params = "RADIAL", [lens.fx, *centre, 0.0, 0.0]
+    elif lens.model == "fisheye":
+        name, params = "OPENCV_FISHEYE", [lens.fx, lens.fy, *centre, *lens.distortion]
     elif any(lens.distortion):
-        name, params = "FULL_OPENCV", [lens.fx, lens.fy, *centre, *lens.distortion, 0.0, 0.0, 0.0]
+        eight = [*lens.distortion, 0.0, 0.0, 0.0][:8]
+        name, params = "FULL_OPENCV", [lens.fx, lens.fy, *centre, *eight]
     else:
         name, params = "PINHOLE", [lens.fx, lens.fy, *centre]
     camera = pycolmap.Camera(model=name, width=lens.width, height=lens.height, params=params, camera_id=1)

@@ -10,7 +10,7 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import attempt_in_words, budget_in_words, missed, pixels
 from jcr.extras import is_installed
 from jcr.geometry import Transforms, scale_translation
-from jcr.records import Capture
+from jcr.records import COEFFICIENTS, Capture
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.map_pictures import map_section
 from jcr.report.map_samples import sample_surface
@@ -187,7 +187,7 @@ def _details(
             "size": f"{lens.width} × {lens.height} px",
             "focal length": f"{lens.fx:.2f}, {lens.fy:.2f}{_plus_minus(lens.std, 0)} px",
             "principal point": f"{lens.cx:.2f}, {lens.cy:.2f}{_plus_minus(lens.std, 2)} px",
-            "k1 k2 p1 p2 k3": ", ".join(f"{k:.5g}" for k in lens.distortion),
+            " ".join(COEFFICIENTS[lens.model]): ", ".join(f"{k:.5g}" for k in lens.distortion),
         }
     if (uncertainty := calibration.uncertainty) is not None and uncertainty.budget is not None:
         blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)

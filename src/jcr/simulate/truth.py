@@ -3,14 +3,17 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.camera import rays
 from jcr.capture.images import encode_png
+from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
@@ -19,6 +22,9 @@ from jcr.simulate.robots import BentArm
 
 _DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Numbers3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 @dataclass(frozen=True)
@@ -85,35 +91,72 @@ def write_robot(truth: Truth, bent: BentArm, joints: Float[ndarray, "n dof"]) ->
 def read_truth(folder: Path) -> Truth:
     """The truth of a simulated capture folder; InputError where there is none."""
     path = folder / "truth" / "scene.json"
+    if not path.is_file():
+        raise InputError(f"{path}: not found; only captures made by jcr simulate have the truth")
+    read_json(path)  # says what is no JSON
     try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: not found; only captures made by jcr simulate have the truth") from None
-    camera = content["intrinsics"]
-    return Truth(
-        folder=folder,
-        scene=content["scene"],
-        seed=content["seed"],
-        images=tuple(content["images"]),
-        gripper_from_camera=np.array(content["gripper_from_camera"]),
-        base_from_gripper=np.array(content["base_from_gripper"]),
-        base_from_camera=np.array(content["base_from_camera"]),
-        intrinsics=Intrinsics(**camera | {"distortion": tuple(camera["distortion"])}),
-        labels=tuple(content["labels"]),
-        table_height=content["table_height"],
-        workspace_in_base=np.array(content["workspace_in_base"]),
-        objects=tuple(
-            TrueObject(
-                name=thing["name"],
-                label=thing["label"],
-                height=thing["height"],
-                footprint_in_base=np.array(thing["footprint_in_base"]),
-                base_from_box=np.array(thing["base_from_box"]),
-                box_size=np.array(thing["box_size"]),
-            )
-            for thing in content["objects"]
-        ),
+        content = _Content.model_validate_json(path.read_bytes(), strict=True)
+    except ValidationError as error:
+        raise InputError(f"{path}: {first_fault(error)}; simulate the capture again") from None
+    parts = {name: value for name, value in vars(content).items() if name not in ("format", "depth_unit_m")}
+    for name in ("gripper_from_camera", "base_from_gripper", "base_from_camera", "workspace_in_base"):
+        parts[name] = np.array(parts[name], float)
+    for name in ("images", "labels"):
+        parts[name] = tuple(parts[name])
+    things = tuple(
+        TrueObject(
+            thing.name,
+            thing.label,
+            thing.height,
+            np.array(thing.footprint_in_base, float),
+            np.array(thing.base_from_box, float),
+            np.array(thing.box_size, float),
+        )
+        for thing in content.objects
     )
+    lens = Intrinsics(**vars(content.intrinsics))
+    return Truth(**parts | {"folder": folder, "objects": things, "intrinsics": lens})
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _Lens(_Part):
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float, float]
+
+
+class _Thing(_Part):
+    name: str
+    label: int
+    height: float
+    footprint_in_base: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=3)
+    ]
+    base_from_box: Matrix
+    box_size: Numbers3
+
+
+class _Content(_Part):
+    format: str
+    depth_unit_m: float
+    scene: str
+    seed: int
+    images: list[str]
+    gripper_from_camera: Matrix
+    base_from_gripper: Annotated[list[Matrix], Field(min_length=1)]
+    base_from_camera: Annotated[list[Matrix], Field(min_length=1)]
+    intrinsics: _Lens
+    labels: list[str]
+    table_height: float
+    workspace_in_base: Annotated[list[Numbers3], Field(min_length=2, max_length=2)]
+    objects: list[_Thing]
 
 
 def write_depth(truth: Truth, image: int, depth: Float[ndarray, "h w"]) -> None:

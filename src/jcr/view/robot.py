@@ -9,6 +9,7 @@ from numpy import ndarray
 from scipy.optimize import least_squares
 
 from jcr.capture.plain_files import read_npy
+from jcr.capture.urdf_chain import load_urdf
 from jcr.errors import InputError
 from jcr.geometry import ARM, step_between
 
@@ -27,6 +28,7 @@ def read_urdf(path: Path) -> "yourdfpy.URDF":
 
     if not path.is_file():
         raise InputError(f"{path}: no such URDF file")
+    load_urdf(path, build_scene_graph=False)
     try:
         robot = yourdfpy.URDF.load(str(path))
     except Exception as error:  # whatever XML and mesh readers raise

@@ -1,0 +1,162 @@
+"""Does the error change with the order of the images? A slip of the camera, a drift, poses that are read late.
+
+One calibration holds for all images, in whatever order they were taken. Against that stand hypotheses with few more
+unknowns, linear about the fit: another X after some image (6), an X that drifts evenly (6), poses that are those of a
+moment later (1). Each is an F test of the poses' residuals (Seber and Lee, Linear Regression Analysis, 2003, ch. 4),
+whose p is multiplied by the number of places that were tried.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+from scipy.linalg import solve_triangular
+from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.stats import f as f_distribution
+
+from jcr.calibration.camera_faults import Fault
+from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
+from jcr.records import HandEye
+from jcr.rounding import significant
+
+LOG_P = float(np.log(1e-4))
+"""Chance of any one alarm where there is nothing."""
+MATERIAL = 0.5
+"""Standard deviations that the answer would move by on an axis, or nobody need know."""
+LEAST_PART = 3
+"""Images on either side of a change."""
+MIN_IMAGES = 7
+MANY_PLACES = 60
+"""Of a longer capture changes are looked for at so many places."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    log_p: float
+    value: Float[ndarray, " p"]
+    covariance: Float[ndarray, "p p"]
+    shift: Float[ndarray, "7"]
+
+
+def sequence_fault(
+    hand_eye: HandEye,
+    base_from_gripper: Poses,
+    recon_from_camera: Poses,
+    images: Sequence[str],
+    systematic: Float[ndarray, "r r"],
+    time_s: Float[ndarray, " m"] | None = None,
+    still: bool = False,
+) -> Fault | None:
+    """What the order of the images says against one calibration of them; None where it says nothing.
+
+    `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
+    poses at 1 rad, `time_s` when they were taken; without, delay is counted in
+    intervals between images. `still`: the arm is known to have stood at each, and nothing can be read late.
+    """
+    m = len(base_from_gripper)
+    if m < MIN_IMAGES or not hand_eye.observability.observable:
+        return None
+    residual, by = residuals(
+        hand_eye.gripper_from_camera,
+        hand_eye.scale,
+        hand_eye.base_from_recon,
+        base_from_gripper,
+        recon_from_camera,
+    )
+    robot = hand_eye.robot_noise
+    white = np.diag(np.tile(np.repeat((robot.translation, robot.rotation), 3), m) ** 2)
+    factor = np.linalg.cholesky(white + robot.systematic**2 * systematic)
+
+    def whitened(columns: Float[ndarray, "m 6 p"]) -> Float[ndarray, "r p"]:
+        return solve_triangular(factor, columns.reshape(6 * m, -1), lower=True)
+
+    flat, design = whitened(residual[..., None])[:, 0], whitened(by)
+    of_x = by[:, :, [*range(*TRANSLATION.indices(13)), *range(*ROTATION.indices(13))]]
+    std = np.sqrt(np.diag(hand_eye.covariance)[:6])
+
+    places = np.unique(
+        np.linspace(LEAST_PART, m - LEAST_PART, min(m - 2 * LEAST_PART + 1, MANY_PLACES)).astype(int)
+    )
+    slips = []
+    for k in places.tolist():
+        after = (np.arange(m) >= k).astype(float)
+        slips.append((_tested(flat, design, whitened(of_x * after[:, None, None])), k))
+    slip, k = min(slips, key=lambda one: one[0].log_p)
+    evenly = np.linspace(-0.5, 0.5, m)
+    drift = _tested(flat, design, whitened(of_x * evenly[:, None, None]))
+    found = [(slip.log_p + np.log(len(places)), slip, "slip"), (drift.log_p, drift, "drift")]
+    if not still:
+        ordered = time_s is not None and (np.diff(time_s) > 0).all()
+        moment = time_s if time_s is not None and ordered else np.arange(m, dtype=float)
+        delay = _tested(flat, design, whitened(_velocity(base_from_gripper, moment)[..., None]))
+        found.append((delay.log_p, delay, "delay"))
+    log_p, best, kind = min(found, key=lambda one: one[0])
+    if log_p > LOG_P:
+        return None
+    p = f"p = {np.exp(max(log_p, -700)):.0e}"
+    if kind == "delay":
+        if not (np.abs(best.shift[:6]) > MATERIAL * std).any():
+            return None
+        value, error = float(best.value[0]), float(np.sqrt(best.covariance[0, 0]))
+        size = abs(value)
+        how = (
+            f"{1e3 * size:.0f} ± {significant(1e3 * error)} ms"
+            if time_s is not None
+            else f"{size:.3f} ± {significant(error)} of the time from one image to the next"
+        )
+        late = "late" if value > 0 else "early"
+        return Fault(
+            f"the gripper poses look as if read {how} too {late} ({p}): stop the arm at each image, or read "
+            "pose and image by the same clock",
+            best.shift,
+        )
+    metres, radians = np.linalg.norm(best.value[:3]), np.linalg.norm(best.value[3:])
+    size = f"{1e3 * metres:.1f} mm and {np.degrees(radians):.2f}°"
+    if not (np.abs(best.value) > MATERIAL * std).any():
+        return None
+    if kind == "drift":
+        return Fault(
+            f"the camera seems to drift on the gripper by {size} from the first image to the last ({p}): tighten its "
+            "mount, let it warm up, and take the images again",
+            np.r_[best.value / 2, 0.0],
+        )
+    more, part = max(
+        (k, f"the {k} images up to {images[k - 1]}"), (m - k, f"the {m - k} images from {images[k]} on")
+    )
+    return Fault(
+        f"the camera seems to have moved on the gripper by {size} after {images[k - 1]} ({p}): calibrate "
+        f"{part} alone, and those of the other part only where the camera still sits as it did then",
+        np.r_[best.value * (m - more) / m, 0.0],
+        rejects=True,
+    )
+
+
+def _tested(
+    flat: Float[ndarray, " n"], design: Float[ndarray, "n 13"], more: Float[ndarray, "n p"]
+) -> _Found:
+    """The F test of more columns, in units of the noise; their size, and how X moves with them."""
+    prior = np.concatenate([np.diag(1 / PRIOR_STD), np.zeros((7, 6))], axis=1)
+    n, p = len(flat), more.shape[1]
+    stacked = np.concatenate([design, prior])
+    target = np.concatenate([-flat, np.zeros(7)])
+    without, *_ = np.linalg.lstsq(stacked, target, rcond=None)
+    both = np.concatenate([stacked, np.concatenate([more, np.zeros((7, p))])], axis=1)
+    found, *_ = np.linalg.lstsq(both, target, rcond=None)
+    least, most = (float(((a @ s - target) ** 2).sum()) for a, s in ((both, found), (stacked, without)))
+    freedom = n - 13 - p
+    ratio = (most - least) / p / max(least / freedom, 1e-12)
+    inverse = np.linalg.pinv(both.T @ both) * least / freedom
+    shift = found[:7] - without[:7]
+    return _Found(float(f_distribution.logsf(ratio, p, freedom)), found[13:], inverse[13:, 13:], shift)
+
+
+def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:
+    """Steps per unit of time (base axes) at each image of an arm that goes smoothly through all of them."""
+    position = CubicSpline(moment, base_from_gripper[:, :3, 3])
+    rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
+    little = 1e-3 * float(np.diff(moment).min())
+    turned = rotation(moment + little) * rotation(moment - little).inv()
+    return np.concatenate([position(moment, 1), turned.as_rotvec() / (2 * little)], axis=1)

@@ -1,0 +1,49 @@
+"""`jcr board`: a calibration board to print."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jcr.cli.output import Output
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Write a ChArUco board or chessboard at its exact size, with rulers to check the printer.
+
+    Print it at 100 %, measure the rulers, and calibrate with the --board that the sheet names.
+
+    examples:
+      jcr board board.pdf
+      jcr board board.svg charuco:9x6:0.040:0.030:DICT_5X5_100 --paper a3
+      jcr board board.pdf chessboard:9x6:0.025
+    """
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """File to write: .pdf or .svg."""
+    board: Annotated[str, tyro.conf.Positional] = "charuco:8x5:0.030:0.022:DICT_4X4_50"
+    """charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, lengths in metres."""
+    paper: Literal["a4", "a3", "a2", "letter"] = "a4"
+    """Paper, the long side across."""
+    output: Output = field(default_factory=Output)
+
+
+def main(arguments: Arguments) -> int:
+    """Write the sheet and print the option that it is used with."""
+    from jcr.errors import InputError
+    from jcr.export.board_sheet import as_pdf, as_svg, board_sheet
+    from jcr.files import write_bytes
+
+    kind = arguments.out.suffix.lower()
+    if kind not in (".pdf", ".svg"):
+        raise InputError(f"jcr board {arguments.out}: writes .pdf and .svg; name a file that ends so")
+    sheet = board_sheet(arguments.board, arguments.paper)
+    write_bytes(arguments.out, as_pdf(sheet) if kind == ".pdf" else as_svg(sheet).encode())
+    arguments.output.result(
+        f"{arguments.out}: print at 100 % on {arguments.paper}, measure the rulers, then calibrate with "
+        f"--board {arguments.board}\n",
+        {"file": str(arguments.out), "board": arguments.board, "paper": arguments.paper},
+    )
+    return 0

@@ -1,0 +1,90 @@
+"""The next pose in the words of the arm: what its pendant shows, a line for its program, its joint angles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.options import ConventionName, UnitsName
+from jcr.capture.robot_poses import CONVENTIONS, numbers_from_poses
+from jcr.geometry import inverse, rotation_angle
+from jcr.handeye.inverse_kinematics import FITS, inverse_kinematics, reach_toward
+from jcr.handeye.robots import Arm, forward_kinematics
+
+
+@dataclass(frozen=True)
+class ArmWords:
+    """How poses are written for one arm."""
+
+    convention: ConventionName = "auto"
+    """auto: quat-xyzw."""
+    units: UnitsName = "auto"
+    arm: Arm | None = None
+    """Known: joint angles are given too, and poses out of its reach are not proposed."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Where an arm has been."""
+
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    joints: Float[ndarray, "n dof"] | None = None
+    """rad; None where they were not recorded."""
+
+
+def pose_lines(
+    pose: Float[ndarray, "4 4"], words: ArmWords, joints: Float[ndarray, " dof"] | None = None
+) -> list[str]:
+    """The pose as the arm's pendant or program writes it, and its joint angles where they are known."""
+    convention = "quat-xyzw" if words.convention == "auto" else words.convention
+    if convention == "ur":
+        row = numbers_from_poses(pose[None], "ur")[0]
+        shown = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in zip("xyz", row[:3], strict=True))
+        turn = ", ".join(
+            f"{name} {value:.4f}" for name, value in zip(("rx", "ry", "rz"), row[3:], strict=True)
+        )
+        numbers = ", ".join(f"{value:.5f}" for value in row)
+        lines = [f"pendant: {shown} mm, {turn} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
+    elif convention in ("franka", "matrix"):
+        row = numbers_from_poses(pose[None], convention, words.units)[0]
+        order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
+        lines = [f"{order}: [{', '.join(f'{value:.5f}' for value in row)}]"]
+    else:
+        lines = [named_numbers(pose, convention, words.units)]
+    if joints is not None:
+        degrees = ", ".join(f"{value:.2f}" for value in np.degrees(joints))
+        lines.append(f"joints: {degrees} ° ({', '.join(f'{value:.4f}' for value in joints)} rad)")
+    return lines
+
+
+def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
+    """The pose's numbers, each with its name, and the units."""
+    form = CONVENTIONS[convention]
+    length, angle = "mm" if form.millimetres else "m", "°" if form.degrees else "rad"
+    if units != "auto":
+        length, _, angle = units.replace("deg", "°").partition("-")
+    row = numbers_from_poses(pose[None], convention, units)[0]
+    digits = [1 if length == "mm" else 4] * 3 + [5 if form.quaternion else 2 if angle == "°" else 4] * 4
+    text = [f"{name} {value:.{k}f}" for name, value, k in zip(form.columns, row, digits, strict=False)]
+    turn = " ".join(text[3:]) + ("" if form.quaternion else f" {angle}")
+    return f"{' '.join(text[:3])} {length}, {turn}"
+
+
+def joints_at(arm: Arm, path: Path, goal: Float[ndarray, "4 4"]) -> Float[ndarray, " dof"] | None:
+    """Joint angles (rad) within the limits that reach `goal` from where the arm is; None where none do.
+
+    With recorded angles the tool is what they and their pose say, and the answer the branch that the arm is in.
+    """
+    if path.joints is not None:
+        now = path.joints[-1:]
+        flange_from_tool = (inverse(forward_kinematics(arm, now)) @ path.base_from_gripper[-1:])[0]
+        flange = (goal @ inverse(flange_from_tool))[None]
+        found = reach_toward(arm, flange, now, steps=60)
+        off = inverse(forward_kinematics(arm, found)) @ flange
+        if np.linalg.norm(off[0, :3, 3]) < FITS[0] and float(rotation_angle(off[0, :3, :3])) < FITS[1]:
+            return found[0]
+        return None
+    posture = inverse_kinematics(arm, np.concatenate([path.base_from_gripper, goal[None]]))
+    reached = posture.missed_m[-1] < FITS[0] and posture.missed_rad[-1] < FITS[1]
+    return posture.joints[-1] if reached else None

@@ -1,0 +1,1 @@
+"""Features, matches and the two-view geometries that the robot confirms, in front of any mapper."""

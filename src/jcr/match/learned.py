@@ -1,0 +1,157 @@
+"""Features by networks, found in images that are turned about the viewing axis first.
+
+The networks are not made for images that are turned against each other.
+"""
+
+import math
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from jcr.match import aliked, weights, xfeat
+from jcr.match.gate import by_quarters
+from jcr.match.lightglue import LightGlue
+
+LONG_SIDE_PX = 1024
+"""Larger images are reduced to this."""
+KEYPOINTS = {"xfeat": 1280, "aliked": 1024}
+"""Of an image at most. ALIKED's matcher is ten times slower than XFeat's."""
+MULTIPLE = 32
+
+
+@dataclass(frozen=True)
+class _Set:
+    """Keypoints found in an image that was turned."""
+
+    start: int
+    """Row of the first among all keypoints of the image."""
+    x_px: Float[Tensor, "k 2"]
+    """In the turned image."""
+    descriptor: Float[Tensor, "k d"]
+    size: tuple[int, int]
+    """Of the turned image: width, height."""
+
+
+class LearnedFeatures:
+    """Keypoints of a capture's images, and a matcher that turns the images as it is told.
+
+    What the networks find does not turn with the image (of a thousand keypoints chance finds as many again): every angle
+    has keypoints of its own, and `x_px` grows as angles are asked for.
+    """
+
+    def __init__(self, kind: Literal["xfeat", "aliked"], images: Sequence[UInt8[ndarray, "h w 3"]]) -> None:
+        self._kind, self._images = kind, images
+        self._network, self._matcher = _networks(kind)
+        self._sets: dict[tuple[int, int], _Set] = {}
+        self.x_px: list[Float[ndarray, "k 2"]] = [np.zeros((0, 2)) for _ in images]
+        """Of every image, all angles together; pixel centres are whole numbers."""
+
+    def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
+        """Rows of the keypoints of images i and j that match, the images turned by these angles (rad) before."""
+        first, second = self._found(i, roll_i), self._found(j, roll_j)
+        with _one_thread():
+            early = self._kind == "aliked"  # XFeat's matcher was trained without
+            rows, _ = self._matcher(
+                first.x_px, second.x_px, first.descriptor, second.descriptor, first.size, second.size, early
+            )
+        return rows.numpy() + [first.start, second.start]
+
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
+        found = self._found(row, roll)
+        return found.start, found.descriptor.numpy()
+
+    def _found(self, row: int, roll: float) -> _Set:
+        roll = by_quarters(roll)
+        key = row, round(math.degrees(roll))
+        if key not in self._sets:
+            pixels, given_from_turned = _prepared(self._images[row], roll)
+            count = KEYPOINTS[self._kind]
+            with _one_thread():
+                if isinstance(self._network, xfeat.XFeat):
+                    x_px, descriptor = xfeat.detect(self._network, pixels, count)
+                else:
+                    x_px, descriptor = aliked.detect(self._network, pixels, count)
+            given = _mapped(x_px.double().numpy(), given_from_turned)
+            height, width = self._images[row].shape[:2]
+            inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in what fills the corners
+            kept = torch.from_numpy(inside)
+            start = len(self.x_px[row])
+            self.x_px[row] = np.concatenate([self.x_px[row], given[inside]])
+            self._sets[key] = _Set(start, x_px[kept], descriptor[kept], (pixels.shape[2], pixels.shape[1]))
+        return self._sets[key]
+
+
+def _networks(kind: str) -> tuple[xfeat.XFeat | aliked.Aliked, LightGlue]:
+    """The published networks of one kind of features; raises as WeightsFile.read does."""
+    if kind == "xfeat":
+        network, of_network = xfeat.XFeat(), weights.XFEAT.read()
+        matcher = LightGlue(64, 96, heads=1, layers=6)
+        of_matcher = {
+            name.removeprefix("matcher."): value
+            for name, value in weights.LIGHTERGLUE.read().items()
+            if name.startswith("matcher.")
+        }
+        of_network = {
+            name: value for name, value in of_network.items() if not name.startswith("fine_matcher")
+        }
+    else:
+        network, of_network = aliked.Aliked(), weights.ALIKED_N16.read()
+        matcher, of_matcher = LightGlue(128, 256, heads=4, layers=9), weights.ALIKED_LIGHTGLUE.read()
+    of_matcher = {name: value for name, value in of_matcher.items() if name != "confidence_thresholds"}
+    network.load_state_dict(of_network)
+    matcher.load_state_dict(of_matcher)
+    return network.eval(), matcher.eval()
+
+
+def _prepared(
+    image: UInt8[ndarray, "h w 3"], roll: float
+) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "3 3"]]:
+    """The image turned, reduced and padded for a network, values in 0..1, and given from prepared pixels."""
+    height, width = image.shape[:2]
+    scale = min(1.0, LONG_SIDE_PX / max(height, width))
+    small_size = round(width * scale), round(height * scale)
+    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    sx, sy = width / small_size[0], height / small_size[1]
+    given_from_small = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    cosine, sine = math.cos(roll), math.sin(roll)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    w, h = small_size
+    corners = turn @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
+    low, extent = corners.min(1), corners.max(1) - corners.min(1)
+    turned_from_small = np.eye(3)
+    turned_from_small[:2, :2], turned_from_small[:2, 2] = turn, -low
+    out = [MULTIPLE * math.ceil((round(float(side)) + 1) / MULTIPLE) for side in extent]
+    turned = cv2.warpAffine(
+        small,
+        turned_from_small[:2],
+        (out[0], out[1]),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    pixels = torch.from_numpy(np.ascontiguousarray(turned)).permute(2, 0, 1).float() / 255
+    return pixels, given_from_small @ np.linalg.inv(turned_from_small)
+
+
+def _mapped(x_px: Float[ndarray, "k 2"], to_from: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2"]:
+    """Pixels under an affine map."""
+    return x_px @ to_from[:2, :2].T + to_from[:2, 2]
+
+
+@contextmanager
+def _one_thread():
+    """Torch's threads wait for each other after every short operation, ten times slower where cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,81 @@
+"""Which pairs of images to match: all of a few images, of many those that are near or see the same."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import inverse, rotation_angle
+from jcr.match.epipolar import scene_points, translation_of_x
+from jcr.match.gate import Gate
+from jcr.match.verify import View
+
+NEIGHBOURS = 8
+"""Of an image, by the way between grippers, before X is known."""
+PARTNERS = 10
+"""Of an image, by what both see, once X is known."""
+ARM_M = 0.45
+"""A rotation of one rad counts as a way of this; views of a table that is so far away differ alike by either."""
+WIDEST = math.radians(60)
+"""Between two viewing directions: nothing matches beyond."""
+LEAST_COMMON = 0.25
+"""Share of the scene in an image that the other must see, too."""
+
+Key = tuple[int, int]
+
+
+def all_pairs(n: int) -> list[Key]:
+    """Every pair of n images."""
+    return [(i, j) for i in range(n) for j in range(i + 1, n)]
+
+
+def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int = NEIGHBOURS) -> list[Key]:
+    """The nearest neighbours of every image by the gripper's way; in proportion to n."""
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
+    way = np.hypot(ARM_M * angle, np.linalg.norm(motion[..., :3, 3], axis=-1))
+    return _best(-way, neighbours)
+
+
+def seen_in_common(
+    view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], upright: Float[ndarray, " n"]
+) -> list[Key]:
+    """The partners of every image with which it shares most of the scene, by X and the points seen so far."""
+    x = translation_of_x(found, motion)
+    if x is None:
+        return []
+    points = scene_points(view, found, motion, x)
+    if len(points) < 20:
+        return []
+    first_from_camera = motion[0] @ x.gripper_from_camera
+    camera_from_first = inverse(first_from_camera)
+    in_camera = (
+        np.einsum("nij,pj->npi", camera_from_first[:, :3, :3], points) + camera_from_first[:, None, :3, 3]
+    )
+    depth = in_camera[..., 2]
+    lens = view.lens
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = lens.fx * in_camera[..., 0] / depth + lens.cx
+        v = lens.fy * in_camera[..., 1] / depth + lens.cy
+    inside = (depth > 0) & (u > 0) & (u < lens.width - 1) & (v > 0) & (v < lens.height - 1)
+    common = inside.astype(float) @ inside.T.astype(float)
+    share = common / np.maximum(inside.sum(1), 1)[:, None]
+    toward = first_from_camera[:, :3, 2]
+    between = np.arccos(np.clip(toward @ toward.T, -1, 1))
+    score = np.where((between < WIDEST) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
+    return _best(score, PARTNERS)
+
+
+def _best(score: Float[ndarray, "n n"], count: int) -> list[Key]:
+    """The `count` partners of every image with the highest finite scores, as pairs."""
+    score = score.copy()
+    np.fill_diagonal(score, -np.inf)
+    order = np.argsort(-score, axis=1, kind="stable")[:, :count]
+    return sorted(
+        {
+            (min(i, int(j)), max(i, int(j)))
+            for i, partners in enumerate(order)
+            for j in partners
+            if np.isfinite(score[i, j])
+        }
+    )

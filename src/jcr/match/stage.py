@@ -1,0 +1,358 @@
+"""Which images see the same: matches that the robot checks, for every kind of features.
+
+Pairs that the gripper turns little against each other are matched as they are; those that the robot confirms give X's
+rotation, and with it every image is turned upright before the others are matched. While too few agree, quarter turns
+are guessed.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.geometry import rotation_angle
+from jcr.match import gate as robot
+from jcr.match.epipolar import translation_of_x
+from jcr.match.focal import focal_by_robot
+from jcr.match.gate import Gate, Pair
+from jcr.match.moved import in_words as moved_in_words
+from jcr.match.moved import moved_things, second_motions
+from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
+from jcr.match.still import hidden, still_cells
+from jcr.match.still import in_words as still_in_words
+from jcr.match.verify import View, pair_of
+from jcr.records import Intrinsics
+
+Key = tuple[int, int]
+Geometries = dict[Key, pycolmap.TwoViewGeometry]
+
+AS_TAKEN = math.radians(50)
+"""Networks match images that are turned against each other by up to this; no rotation is larger than its angle."""
+STILL = (5e-3, math.radians(1))
+"""m, rad: a gripper that moved by this moves the whole image."""
+GUESSED_AT_ONCE = 6
+"""Pairs whose quarter turns are guessed before the robot is asked again."""
+GUESSED_AT_MOST = 30
+
+
+class Matcher(Protocol):
+    """Features of a capture's images, of any kind."""
+
+    @property
+    def x_px(self) -> Sequence[Float[ndarray, "k 2"]]:
+        """Keypoints at the working size; pixel centres are whole numbers."""
+        ...
+
+    @property
+    def minds_roll(self) -> bool:
+        """Whether images must be turned upright for it."""
+        ...
+
+    @property
+    def raw(self) -> Mapping[Key, Int[ndarray, "m 2"]]:
+        """All matches of the pairs that were tried last, right or wrong."""
+        ...
+
+    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
+        """The geometry of some of a pair's matches; None where too few agree on one."""
+        ...
+
+    @property
+    def every_pair(self) -> int:
+        """Captures of up to so many images have all pairs matched; of more, pairs grow in proportion to the images."""
+        ...
+
+    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
+        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
+        ...
+
+    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
+        """Verified two-view geometries of pairs, their images turned (rad) before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What matching found."""
+
+    geometries: Geometries
+    """Those that a mapper may believe."""
+    gate: Gate | None
+    """None where the robot had no say."""
+    lens: Intrinsics
+    """At the working size: given, or as the robot and the images have it."""
+    pairs_tried: int
+    upright: Float[ndarray, " n"] | None = None
+    """Angles (rad) by which the images were turned, once X's rotation was known."""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Search:
+    """What is known while pairs are matched."""
+
+    matcher: Matcher
+    motion: Float[ndarray, "n n 4 4"]
+    view: View
+    known: bool
+    """Whether the lens is given."""
+    geometries: Geometries = field(default_factory=dict)
+    pairs: dict[Key, Pair] = field(default_factory=dict)
+    still: Bool[ndarray, "r c"] | None = None
+    """Parts of the image that do not move."""
+    tried: set[tuple[int, int, int, int]] = field(default_factory=set)
+    """Pairs, and the angles (degrees) by which their images were turned."""
+
+    @property
+    def systematic(self) -> float:
+        return robot.SYSTEMATIC if self.known else robot.SYSTEMATIC_OF_GUESS
+
+    def match(
+        self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None, guess: float = 0.0
+    ) -> None:
+        """Match pairs with images turned by `rolls`, or the second of each by a guess; the better of two is kept."""
+        todo, turns = [], []
+        for i, j in pairs:
+            turn = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
+            if not self.matcher.minds_roll:
+                turn = (0.0, 0.0)
+            turn = robot.by_quarters(turn[0]), robot.by_quarters(turn[1])
+            how = (i, j, round(math.degrees(turn[0])), round(math.degrees(turn[1])))
+            if how in self.tried:
+                continue
+            self.tried.add(how)
+            todo.append((i, j))
+            turns.append(turn)
+        if not todo:
+            return
+        found = self.matcher.geometries(todo, np.array(turns))
+        self.view = View.of(
+            self.matcher.x_px, self.view.lens
+        )  # an image that is turned brings keypoints of its own
+        for key, geometry in found.items():
+            clean = self._seen(key, geometry)
+            if clean is None:
+                continue
+            pair = pair_of(self.view, *key, clean)
+            if key not in self.geometries or self._better(pair, self.pairs[key]):
+                self.geometries[key], self.pairs[key] = clean, pair
+
+    def hide_still_parts(self) -> None:
+        """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
+        angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
+        way = np.linalg.norm(self.motion[..., :3, 3], axis=-1)
+        moving = [key for key in self.matcher.raw if angle[key] > STILL[1] or way[key] > STILL[0]]
+        size = self.view.lens.width, self.view.lens.height
+        still = still_cells(self.matcher.x_px, self.matcher.raw, size, moving)
+        if not still.any():
+            return
+        self.still = still
+        for key, geometry in list(self.geometries.items()):
+            clean = self._seen(key, geometry)
+            if clean is None:
+                del self.geometries[key], self.pairs[key]
+            elif clean is not geometry:
+                self.geometries[key], self.pairs[key] = clean, pair_of(self.view, *key, clean)
+
+    def without_first_motion(self, pairs: Sequence[Pair]) -> dict[Key, tuple[Pair, pycolmap.TwoViewGeometry]]:
+        """What else moves in pairs beside their first geometry."""
+        found = {}
+        for pair in pairs:
+            raw = self._visible(pair.key, self.matcher.raw.get(pair.key, np.zeros((0, 2), dtype=int)))
+            taken = {(int(a), int(b)) for a, b in pair.rows}
+            left = np.array([row for row in raw if (int(row[0]), int(row[1])) not in taken], dtype=int)
+            if len(left) and (geometry := self.matcher.verified(pair.key, left)) is not None:
+                found[pair.key] = pair_of(self.view, *pair.key, geometry), geometry
+        return found
+
+    def second_motions_confirmed(self, found: Gate) -> Gate:
+        """The gate after contradicted pairs were asked for a second geometry: the first may be of a thing that moved."""
+        others = self.without_first_motion(found.contradicted)
+        judged = robot.judge([pair for pair, _ in others.values()], self.motion, self.systematic, found.of_x)
+        for pair in judged.confirmed:
+            self.geometries[pair.key], self.pairs[pair.key] = others[pair.key][1], pair
+        return self.gate(found) if judged.confirmed else found
+
+    def visible_matches(self) -> dict[Key, Int[ndarray, "m 2"]]:
+        """All matches of the pairs, right or wrong, outside of parts of the image that do not move."""
+        return {key: self._visible(key, rows) for key, rows in self.matcher.raw.items()}
+
+    def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "m 2"]:
+        """Without matches in parts of the image that do not move."""
+        if self.still is None or not len(rows):
+            return rows
+        i, j = key
+        dark = hidden(self.matcher.x_px[i][rows[:, 0]], self.still)
+        return rows[~(dark | hidden(self.matcher.x_px[j][rows[:, 1]], self.still))]
+
+    def _seen(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
+        """The geometry, verified again where some of its matches lie in parts that do not move."""
+        inside = np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
+        if len(self._visible(key, inside)) == len(inside):
+            return geometry
+        return self.matcher.verified(key, self._visible(key, self.matcher.raw[key]))
+
+    def gate(self, known: Gate | None = None) -> Gate:
+        """The robot's judgement of all pairs so far."""
+        of_x = None if known is None else known.of_x
+        return robot.judge(list(self.pairs.values()), self.motion, self.systematic, of_x)
+
+    def _better(self, new: Pair, old: Pair) -> bool:
+        """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
+        first, second = (self._agrees(pair) for pair in (new, old))
+        # The later one is of images turned upright, whose keypoints all pairs share.
+        return first if first != second else 2 * len(new.rows) > len(old.rows)
+
+    def _agrees(self, pair: Pair) -> bool:
+        angle = float(rotation_angle(self.motion[pair.key][:3, :3]))
+        return any(
+            abs(float(rotation_angle(r.rotation)) - angle)
+            < robot.angle_tolerance(angle, r.angle_std(), self.systematic)
+            for r in pair.readings
+        )
+
+
+def match_with_robot(
+    matcher: Matcher,
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    lens: Intrinsics,
+    known: bool,
+    names: Sequence[str],
+    original: tuple[int, int],
+    report: Callable[[float], None] = lambda fraction: None,
+) -> Matched:
+    """The pairs of images that match and that the robot does not contradict.
+
+    `original` is the size of the images as they were taken, for notes. `lens` is at the working size, and a first guess
+    unless `known`. Where X's rotation cannot be found from the pairs, the robot has no say: its poses may be of another
+    convention, or too few pairs match.
+    """
+    n = len(base_from_gripper)
+    motion = robot.gripper_motions(base_from_gripper)
+    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
+    search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
+    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)
+    first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]
+    search.match(first)
+    search.hide_still_parts()
+    report(0.3)
+    found = _with_lens(search, lens)
+    if found.of_x is None and matcher.minds_roll:
+        found = _guessed(search, everything, angle, found)
+    report(0.5)
+    if found.of_x is None:
+        search.match(everything)
+        found = _with_lens(search, lens)
+    if found.of_x is None:
+        notes = _beside(search, found, names, original)
+        return Matched(search.geometries, None, search.view.lens, len(search.tried), None, notes)
+    upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
+    if matcher.minds_roll:
+        search.match(everything, upright)
+    found = search.gate(found)
+    report(0.8)
+    if n > matcher.every_pair:
+        search.match(seen_in_common(search.view, found, motion, upright), upright)
+        found = search.gate(found)
+    found = search.second_motions_confirmed(found)
+    stale = _contradicted_by_all(found, motion)
+    believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
+    believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
+    if known:
+        # Of a pair that cannot say how it turns, only what the known rotation explains would be right.
+        believed -= {pair.key for pair in found.undecided}
+    report(1.0)
+    kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
+    notes = (*_notes(found, stale, names), *_beside(search, found, names, original))
+    return Matched(kept, found, search.view.lens, len(search.tried), upright, notes)
+
+
+def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
+    """The gate through the lens that is known, or else through the one by which most pairs agree with the robot."""
+    if search.known:
+        return search.gate()
+    size = guess.width, guess.height
+    lens = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
+    if lens is not None:
+        search.view = View.of(search.matcher.x_px, lens)
+        search.pairs = {key: pair_of(search.view, *key, found) for key, found in search.geometries.items()}
+    return search.gate()
+
+
+def _guessed(search: _Search, pairs: Sequence[Key], angle: Float[ndarray, "n n"], found: Gate) -> Gate:
+    """The gate after quarter turns of further pairs, the least turned first, until X's rotation is known."""
+    confirmed = {pair.key for pair in found.confirmed}
+    left = sorted((key for key in pairs if key not in confirmed), key=lambda key: float(angle[key]))
+    for start in range(0, min(len(left), GUESSED_AT_MOST), GUESSED_AT_ONCE):
+        for quarter in range(4):
+            search.match(left[start : start + GUESSED_AT_ONCE], guess=quarter * math.pi / 2)
+        found = search.gate()
+        if found.of_x is not None:
+            break
+    return found
+
+
+def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[int]:
+    """Images whose pairs agree with each other and contradict their gripper pose: the pose is wrong, not the matches."""
+    assert found.of_x is not None
+    x = found.of_x.rotation
+    confirmed = {row for pair in found.confirmed for row in pair.key}
+    suspects = {row for pair in found.contradicted for row in pair.key} - confirmed
+    stale = set()
+    for row in sorted(suspects):
+        # By how much the gripper would have to be turned for each pair; sound pairs ask for the same.
+        corrections = []
+        for pair in found.contradicted:
+            if row not in pair.key or not (set(pair.key) - {row}) & confirmed:
+                continue
+            of_gripper = motion[pair.key][:3, :3]
+            camera = x @ pair.readings[0].rotation @ x.T
+            corrections.append(of_gripper.T @ camera if pair.j == row else of_gripper @ camera.T)
+        if len(corrections) < 3:
+            continue
+        together = rotation_angle(
+            np.swapaxes(np.array(corrections), 1, 2)[:, None] @ np.array(corrections)[None]
+        )
+        if np.median(together) < math.radians(3):
+            stale.add(row)
+    return stale
+
+
+def _notes(found: Gate, stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
+    """What the robot changed, in one line each."""
+    notes = []
+    if found.contradicted:
+        count = len(found.contradicted)
+        total = count + len(found.confirmed)
+        notes.append(
+            f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out"
+        )
+    if stale:
+        listed = ", ".join(names[row] for row in sorted(stale))
+        notes.append(
+            f"the matches of {listed} agree with each other and contradict the reported gripper rotation"
+        )
+    return tuple(notes)
+
+
+def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:
+    """What is left out of the matches because it does not move with the scene."""
+    notes, size = [], (search.view.lens.width, search.view.lens.height)
+    if search.still is not None:
+        place = still_in_words(search.still, size, original)
+        notes.append(
+            f"a part of the image does not move while the gripper does, fingers or a logo: {place} px: left out"
+        )
+    x = translation_of_x(found, search.motion)
+    if x is not None:
+        second = second_motions(search.view, found.confirmed, search.visible_matches(), search.motion, x)
+        moved = moved_things(search.view, second, [p.key for p in found.confirmed], len(search.motion))
+        if moved is not None:
+            place = moved_in_words(moved, names, original[0] / size[0])
+            notes.append(f"something seems to stand elsewhere than in the other images in {place}: left out")
+    return tuple(notes)

@@ -1,0 +1,167 @@
+"""The relative rotation of two cameras from matched directions, its alternatives, and how sure each is.
+
+A homography has two readings that put the scene in front of both cameras (Malis and Vargas, INRIA RR-6303, 2007), and
+the essential matrix of a nearly plane scene is loose along the way between them. Each is refined on the Sampson error
+(Hartley and Zisserman, section 11.4.3), whose curvature gives the covariance.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import rotation_exp, skew
+
+STEPS = 8
+LEAST_SIGMA_PX = 0.3
+"""Of a match; no detector is better over a whole image."""
+LARGEST_SIGMA_PX = 3.0
+"""An alternative that fits its own inliers worse is none."""
+STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way in which two images can have been taken."""
+
+    rotation: Float[ndarray, "3 3"]
+    """i_from_j."""
+    direction: Float[ndarray, "3"]
+    """From camera i to camera j, in camera i's frame; a unit vector."""
+    covariance: Float[ndarray, "5 5"]
+    """Of (rotation vector in camera i's axes, two components of the direction), rad."""
+    sigma_px: float
+    """Robust size of the matches' distances from their epipolar lines."""
+
+    def angle_std(self) -> float:
+        """Of the angle of rotation, rad."""
+        rotation = self.covariance[:3, :3]
+        axis = np.linalg.norm(_axis(self.rotation))
+        if axis < 1e-3:
+            return float(np.sqrt(np.trace(rotation) / 3))
+        unit = _axis(self.rotation) / axis
+        return float(np.sqrt(max(unit @ rotation @ unit, 0.0)))
+
+
+def readings(
+    ray_i: Float[ndarray, "m 2"],
+    ray_j: Float[ndarray, "m 2"],
+    focal_px: float,
+    j_from_i_essential: Float[ndarray, "3 3"] | None,
+    j_from_i_homography: Float[ndarray, "3 3"] | None,
+) -> list[Reading]:
+    """All ways to read matched directions (x/z, y/z), best first; empty where none fits.
+
+    The matrices are of normalised coordinates, each where one was found.
+    """
+    starts: list[tuple[ndarray, ndarray]] = []
+    if j_from_i_essential is not None:
+        starts += _of_essential(j_from_i_essential, ray_i, ray_j)
+    if j_from_i_homography is not None:
+        starts += _of_homography(j_from_i_homography, ray_i)
+    found: list[Reading] = []
+    for rotation, direction in starts:
+        reading = _refined(rotation, direction, ray_i, ray_j, focal_px)
+        if reading is None or reading.sigma_px > LARGEST_SIGMA_PX:
+            continue
+        if all(np.linalg.norm(other.rotation - reading.rotation) > 0.02 for other in found):
+            found.append(reading)
+    return sorted(found, key=lambda reading: reading.sigma_px)
+
+
+def sampson_px(
+    rotation: Float[ndarray, "3 3"],
+    direction: Float[ndarray, "3"],
+    ray_i: Float[ndarray, "m 2"],
+    ray_j: Float[ndarray, "m 2"],
+    focal_px: float,
+) -> Float[ndarray, " m"]:
+    """Signed distances of matches from their epipolar lines, both images together."""
+    essential = skew(direction) @ rotation  # x_i · E x_j = 0
+    h_i, h_j = (np.concatenate([ray, np.ones((len(ray), 1))], 1) for ray in (ray_i, ray_j))
+    line_i, line_j = h_j @ essential.T, h_i @ essential
+    norm = np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1))
+    return focal_px * (h_i * line_i).sum(1) / np.maximum(norm, 1e-12)
+
+
+def _of_essential(
+    j_from_i: Float[ndarray, "3 3"], ray_i: Float[ndarray, "m 2"], ray_j: Float[ndarray, "m 2"]
+) -> list[tuple[ndarray, ndarray]]:
+    """The one of four decompositions that puts most points in front of both cameras."""
+    _, rotation, translation, _ = cv2.recoverPose(j_from_i, ray_i, ray_j, np.eye(3), distanceThresh=1e6)[:4]
+    return [(rotation.T, _unit(-rotation.T @ translation[:, 0]))]
+
+
+def _of_homography(
+    j_from_i: Float[ndarray, "3 3"], ray_i: Float[ndarray, "m 2"]
+) -> list[tuple[ndarray, ndarray]]:
+    """Decompositions whose plane lies in front of camera i at every match; both where the camera did not move."""
+    count, rotations, translations, normals = cv2.decomposeHomographyMat(j_from_i, np.eye(3))
+    h_i = np.concatenate([ray_i, np.ones((len(ray_i), 1))], 1)
+    return [
+        (rotations[k].T, _unit(-rotations[k].T @ translations[k][:, 0]))
+        for k in range(count)
+        if np.mean(h_i @ normals[k][:, 0] > 0) > 0.9 and np.linalg.norm(translations[k]) > 1e-6
+    ]
+
+
+def _refined(
+    rotation: Float[ndarray, "3 3"],
+    direction: Float[ndarray, "3"],
+    ray_i: Float[ndarray, "m 2"],
+    ray_j: Float[ndarray, "m 2"],
+    focal_px: float,
+) -> Reading | None:
+    """Gauss-Newton over five numbers under a Cauchy loss."""
+    if len(ray_i) < 8:
+        return None
+    damping, sigma, information = 1e-3, LEAST_SIGMA_PX, np.eye(5)
+    residual = sampson_px(rotation, direction, ray_i, ray_j, focal_px)
+    for _ in range(STEPS):
+        sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
+        weight = 1 / (1 + (residual / (2 * sigma)) ** 2)
+        jacobian = np.stack(
+            [
+                (sampson_px(*_moved(rotation, direction, STEP * unit), ray_i, ray_j, focal_px) - residual)
+                / STEP
+                for unit in np.eye(5)
+            ],
+            1,
+        )
+        information = jacobian.T @ (weight[:, None] * jacobian)
+        gradient = jacobian.T @ (weight * residual)
+        step = -np.linalg.solve(information + damping * np.diag(np.diag(information) + 1e-9), gradient)
+        moved = _moved(rotation, direction, step)
+        tried = sampson_px(*moved, ray_i, ray_j, focal_px)
+        cost, before = (np.log1p((of / (2 * sigma)) ** 2).sum() for of in (tried, residual))
+        if cost > before:
+            damping *= 10
+            continue
+        (rotation, direction), residual, damping = moved, tried, damping / 10
+        if np.abs(step).max() < 1e-6:
+            break
+    # Matches of one detector share errors with their neighbours: no more than a hundred count as independent.
+    independent = min(len(ray_i), 100) / len(ray_i)
+    covariance = sigma**2 * np.linalg.inv(independent * information + 1e-6 * np.eye(5))
+    return Reading(rotation, direction, covariance, sigma)
+
+
+def _moved(
+    rotation: Float[ndarray, "3 3"], direction: Float[ndarray, "3"], step: Float[ndarray, "5"]
+) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]:
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    across = _unit(np.cross(direction, helper))
+    sideways = step[3] * across + step[4] * np.cross(direction, across)
+    return rotation_exp(step[:3]) @ rotation, _unit(direction + sideways)
+
+
+def _axis(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
+    values, vectors = np.linalg.eigh(rotation + rotation.T)
+    angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
+    return vectors[:, int(np.argmax(values))] * min(angle, 1.0)
+
+
+def _unit(v: Float[ndarray, "3"]) -> Float[ndarray, "3"]:
+    return v / max(float(np.linalg.norm(v)), 1e-12)

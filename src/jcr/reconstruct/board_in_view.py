@@ -1,0 +1,100 @@
+"""Whether images show a calibration board or tags, and the --board that would use it: for those who did not say so."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from jcr.reconstruct.board import boards
+
+LOOKED_AT = 3
+"""Images; a board that helps is in most of them."""
+FAMILIES = ("4X4", "5X5", "6X6", "7X7", "APRILTAG_36h11", "APRILTAG_25h9")
+SIZES = (50, 100, 250, 1000)
+RATIOS = (0.75, 0.7, 0.8, 0.6, 0.5)
+"""Of marker to square of a ChArUco board."""
+FEWEST = 2
+"""Images in which the same tags are found, or the same chessboard: one may be a trick of the texture."""
+SMALLEST = 4
+"""Inner corners on a side of a chessboard; three by three are found in windows and keyboards, too."""
+LONG_SIDE_PX = 800
+
+
+def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
+    """A --board for what the images show, with SIDE (and MARKER) for the lengths that nobody can see; None: nothing."""
+    chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
+    grey = [_smaller(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in chosen]
+    return _tags(grey) or _chessboard(grey)
+
+
+def _smaller(grey: UInt8[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2"]:
+    factor = LONG_SIDE_PX / max(grey.shape)
+    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else grey
+
+
+def _tags(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
+    best: tuple[int, str, set[int]] = (0, "", set())
+    for family in FAMILIES:
+        name = f"DICT_{family}" if "APRIL" in family else f"DICT_{family}_1000"
+        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))
+        seen = [
+            {int(number) for number in np.ravel(ids)} if ids is not None else set[int]()
+            for _, ids, _ in map(detector.detectMarkers, grey)
+        ]
+        again = {number for number in set[int]().union(*seen) if sum(number in ids for ids in seen) >= FEWEST}
+        if len(again) > best[0]:
+            best = len(again), family, again
+    _, family, numbers = best
+    if not numbers:
+        return None
+    if family.startswith("APRILTAG"):
+        return f"apriltag:SIDE:{family.removeprefix('APRILTAG_')}"
+    size = next(size for size in SIZES if max(numbers) < size)
+    dictionary = f"DICT_{family}_{size}"
+    return _charuco(grey, dictionary, max(numbers) + 1) or f"aruco:SIDE:{dictionary}"
+
+
+def _charuco(grey: list[UInt8[ndarray, "h w"]], dictionary: str, markers: int) -> str | None:
+    """The board whose corners lie between the markers; None where there are too few corners for one."""
+    best: tuple[int, str] = (0, "")
+    for down, across in product(range(3, 16), repeat=2):
+        # A marker in every second square; of the last ones none may have been in view.
+        if across < down or not markers <= across * down // 2 <= markers + 1:
+            continue
+        for ratio in RATIOS:
+            for reading in boards(f"charuco:{across}x{down}:0.1:{0.1 * ratio:.3f}:{dictionary}"):
+                count = sum(len(s.index) for image in grey for s in reading.detect(image))
+                if count > best[0]:
+                    squares = reading.name.split(":")[1]
+                    best = count, f"charuco:{squares}:SIDE:MARKER:{dictionary}"
+            if best[0] >= len(grey) * (across - 1) * (down - 1) // 2:
+                return best[1]
+    return best[1] if best[0] >= 6 * len(grey) else None
+
+
+def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
+    sizes = []
+    for image in grey:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(
+            image, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+        )
+        if found and meta is not None and min(meta.shape[:2]) >= SMALLEST:
+            sizes.append(tuple(sorted(meta.shape[:2], reverse=True)))
+    if len(sizes) < FEWEST:
+        return None
+    # Where the border of a board leaves the frame, it is found smaller.
+    across, down = max(set(sizes), key=lambda size: (sizes.count(size), size))
+    return f"chessboard:{across}x{down}:SIDE"
+
+
+def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
+    """A sentence that proposes the board in view; None where there is none."""
+    if (spec := board_in_view(images)) is None:
+        return None
+    lengths = "SIDE of a square and MARKER" if "MARKER" in spec else "SIDE"
+    return (
+        f"a calibration board is in view: try --board {spec} with its {lengths} in metres (docs/markers.md)"
+    )

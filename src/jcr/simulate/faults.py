@@ -1,0 +1,120 @@
+"""Captures that something is wrong with, without pictures: gripper poses, image observations, and the truth.
+
+What is reported is what a user would have; what was is what the fault made of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with_parameters, zoomed
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.records import Intrinsics, Tracks
+from jcr.simulate.poses import gripper_poses, random_hand_eye
+from jcr.simulate.problem import TARGET_IN_BASE, disturbed
+
+LENS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
+"""What the user believes the camera to be."""
+POINTS, NOISE_PX = 500, 0.4
+"""On the table and what stands on it, and one sigma of their observations."""
+LOW, HIGH = np.array([0.2, -0.3, 0.0]), np.array([0.8, 0.3, 0.15])
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong; nothing, by default."""
+
+    focal_by_distance: float = 0.0
+    """Relative growth of the focal length from the nearest view to the farthest."""
+    focal_scatter: float = 0.0
+    """Relative, one sigma, between images."""
+    zoom: float = 0.0
+    """Relative, in the second half of the capture."""
+    lens: tuple[tuple[str, float], ...] = ()
+    """Names of its parameters, and by how much the true one is more than the believed one."""
+    rolling_px: float = 0.0
+    """By how much the last row is shifted against the first in x."""
+    slip: tuple[float, float] = (0.0, 0.0)
+    """m, rad about random axes: the camera moves on the gripper."""
+    slip_after: float = 0.5
+    """Share of the images before it."""
+    pose_scale: float = 1.0
+    """Of the reported positions."""
+    delay_s: float = 0.0
+    """By which poses are read late while the arm moves."""
+    view_s: float = 2.0
+    """From one view to the next, of an arm that moves."""
+    robot_noise: tuple[float, float] = (3e-4, 0.001)
+    """m, rad: one sigma per axis, white."""
+
+
+@dataclass(frozen=True)
+class FaultyCapture:
+    """What a user would have, and what was."""
+
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    """As reported."""
+    tracks: Tracks
+    """Its points are where they are in the base, up to the noise of a first estimate."""
+    base_from_camera: Float[ndarray, "n 4 4"]
+    """Where the cameras were."""
+    gripper_from_camera: Float[ndarray, "4 4"]
+    """Before a slip."""
+    gripper_from_camera_after: Float[ndarray, "4 4"]
+    """After it."""
+    lens: Intrinsics
+    """As believed."""
+
+
+def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = Faults()) -> FaultyCapture:
+    """Varied views of a table with relief, in the order in which an arm would go through them."""
+    x = random_hand_eye(rng)
+    true = gripper_poses("varied", images, TARGET_IN_BASE, x, rng)
+    axes = rng.normal(size=(2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    slipped = x @ transform(rotation_exp(faults.slip[1] * axes[0]), faults.slip[0] * axes[1])
+    first = round(faults.slip_after * images)
+    mounted = np.stack([x if k < first else slipped for k in range(images)])
+    cameras = true @ mounted
+    reported = _late(true, faults) if faults.delay_s else true
+    reported = disturbed(reported, faults.robot_noise, rng)
+    reported[:, :3, 3] *= faults.pose_scale
+    points = rng.uniform(LOW, HIGH, (POINTS, 3))
+    depth = np.median(apply_all(inverse(cameras), points)[..., 2], axis=1)
+    share = (depth - depth.mean()) / max(float(np.ptp(depth)), 1e-9)
+    focal = np.exp(faults.focal_by_distance * share + faults.focal_scatter * rng.normal(size=images))
+    focal *= np.where(np.arange(images) < images / 2, 1.0, 1 + faults.zoom)
+    off = dict(faults.lens)
+    camera = with_parameters(
+        LENS, parameters(LENS) + np.array([off.get(name, 0.0) for name in parameter_names(LENS)])
+    )
+    image, point, pixels = [], [], []
+    for k in range(images):
+        x_in_camera = apply(inverse(cameras[k]), points)
+        x_px = project(zoomed(camera, float(focal[k])), x_in_camera)
+        x_px[:, 0] += faults.rolling_px * (x_px[:, 1] / LENS.height - 0.5)
+        inside = (x_px > 0).all(1) & (x_px < [LENS.width, LENS.height]).all(1) & (x_in_camera[:, 2] > 0)
+        seen = np.flatnonzero(inside)
+        image.append(np.full(len(seen), k))
+        point.append(seen)
+        pixels.append(x_px[seen] + NOISE_PX * rng.normal(size=(len(seen), 2)))
+    tracks = Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), points)
+    return FaultyCapture(reported, tracks, cameras, x, slipped, LENS)
+
+
+def apply_all(a_from_b: Float[ndarray, "n 4 4"], x_in_b: Float[ndarray, "p 3"]) -> Float[ndarray, "n p 3"]:
+    """Points under each of the transforms."""
+    return x_in_b @ np.swapaxes(a_from_b[:, :3, :3], 1, 2) + a_from_b[:, None, :3, 3]
+
+
+def _late(true: Float[ndarray, "n 4 4"], faults: Faults) -> Float[ndarray, "n 4 4"]:
+    """Poses of an arm that moves through these without a stop, a little later."""
+    at = faults.view_s * np.arange(len(true))
+    later = at + faults.delay_s
+    position = CubicSpline(at, true[:, :3, 3])(later)
+    rotation = RotationSpline(at, Rotation.from_matrix(true[:, :3, :3]))(later)
+    return transform(rotation.as_matrix(), position)

@@ -1,0 +1,82 @@
+"""What looks like nothing and moves the answer is named with its size, and counts as uncertainty."""
+
+import re
+
+import numpy as np
+import pytest
+
+from benchmarks.attack import calibrated, outcome
+from jcr.calibration.options import CalibrateOptions
+from jcr.geometry import step_between
+from jcr.simulate.faults import LENS, Faults
+
+pytestmark = pytest.mark.slow
+
+NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
+    "focus follows distance": (
+        Faults(focal_by_distance=0.02),
+        r"the focal length grows by ([\d.]+) ± \S+ % from the nearest view",
+        [2.0],
+        0.3,  # simulated as linear in the distance, named by its logarithm
+    ),
+    "focus scatters": (
+        Faults(focal_scatter=0.01),
+        r"the focal length differs between images by ([\d.]+) % \(rms",
+        [1.0],
+        0.6,
+    ),
+    "zoom": (Faults(zoom=0.03), r"changes by \+([\d.]+) ± \S+ % after 05.png", [3.0], 0.2),
+    "principal point": (
+        Faults(lens=(("cx", 12.0),)),
+        r"a principal point of \(([\d.]+), ([\d.]+)\)",
+        [LENS.cx + 12, LENS.cy],
+        3.0,
+    ),
+    "k1": (
+        Faults(lens=(("k1", -0.03),)),
+        r"a distortion k1, k2 of \((-[\d.]+),",
+        [-0.03],
+        0.01,
+    ),
+    "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
+    "slip": (
+        Faults(slip=(3.6e-3, np.radians(1.1))),
+        r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
+        [3.6, 1.1],
+        0.6,
+    ),
+    "delay": (
+        Faults(delay_s=0.1, view_s=4.0),
+        r"as if read ([\d.]+) ± \S+ of the time from one image to the next too late",
+        [0.025],
+        0.003,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: str):
+    faults, words, sizes, within = NAMED[name]
+    found, hand_eye = calibrated(faults, 3)
+    said = [match for text in hand_eye.warnings if (match := re.search(words, text))]
+    assert said, hand_eye.warnings
+    assert [float(size) for size in said[0].groups()] == pytest.approx(sizes, abs=within)
+    assert outcome(found, hand_eye).is_sound
+    # No one answer is right on both sides of a slip.
+    assert hand_eye.converged is (name != "slip")
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
+    for seed in range(3):
+        _, hand_eye = calibrated(Faults(), seed, (8, 12, 16)[seed], estimated)
+        assert hand_eye.warnings == ()
+
+
+def test_a_focus_that_varies_is_modelled():
+    """Held, the same focal length puts the camera 30 mm off."""
+    found, hand_eye = calibrated(Faults(focal_by_distance=0.03), 0, options=CalibrateOptions(focus="varies"))
+    step = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    assert (np.abs(step) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
+    assert np.linalg.norm(step[:3]) < 4e-3
+    assert hand_eye.converged and not hand_eye.warnings

@@ -1,0 +1,111 @@
+"""Where and how a run is started: no HOME, locale C, umask, odd paths, closed or full outputs, a signal."""
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture_writers import write_easy_handeye2
+from jcr.calibration.calibration_json import read_calibration
+from jcr.geometry import scale_translation
+from jcr.simulate.problem import hand_eye_problem
+
+pytestmark = pytest.mark.slow
+
+RESULTS = ("calibration.json", "log.txt")
+ODD = "a b'c\"d $HOME `x` *;&|<é>"
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is unusual, and how the command must end."""
+
+    status: int = 0
+    said: str = ""
+    shell: str = '"$@"'
+    """How it is started."""
+    without: tuple[str, ...] = ()
+    environment: dict[str, str] = field(default_factory=dict)
+    folder: str = "place"
+    check: Callable[[Path], bool] = lambda out: True
+
+
+def private(out: Path) -> bool:
+    return all(stat.S_IMODE((out / name).stat().st_mode) == 0o600 for name in RESULTS)
+
+
+CASES = {
+    "no HOME": Surroundings(without=("HOME", "XDG_CACHE_HOME", "USER", "LOGNAME")),
+    "locale C": Surroundings(environment={"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
+    "umask 077": Surroundings(shell='umask 077; "$@"', check=private),
+    "paths with spaces and quotes": Surroundings(folder=ODD),
+    "closed stdout": Surroundings(shell='"$@" >&-'),
+    "closed stderr": Surroundings(shell='"$@" 2>&-'),
+    "closed stdin": Surroundings(shell='"$@" <&-'),
+    "full stdout": Surroundings(2, "No space left", shell='"$@" >/dev/full'),
+    "output that nobody may write": Surroundings(2, "cannot be written", folder="/proc/1/jcr"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path: Path):
+    case = CASES[name]
+    problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=(3e-4, 1e-3))
+    samples = write_easy_handeye2(
+        tmp_path / ODD, problem.base_from_gripper, scale_translation(problem.recon_from_camera, problem.scale)
+    )
+    out = tmp_path / case.folder / "out"
+    environment = {key: value for key, value in os.environ.items() if key not in case.without}
+    command = [sys.executable, "-m", "jcr", "calibrate", str(samples), str(out)]
+    finished = subprocess.run(
+        ["sh", "-c", case.shell, "sh", *command],
+        env=environment | case.environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+    assert finished.returncode == case.status, finished.stderr
+    assert "Traceback" not in finished.stderr and case.said in finished.stderr
+    if case.folder.startswith("/"):
+        return
+    # What was found is kept, whatever became of the words about it.
+    assert read_calibration(out).converged and all((out / name).is_file() for name in RESULTS)
+    assert case.check(out) and not list(out.glob("*.part*"))
+
+
+def test_a_run_that_is_told_to_end_leaves_nothing_half_written_and_goes_on(
+    small_capture: Path, tmp_path: Path
+):
+    out = tmp_path / "out"
+    command = [
+        sys.executable,
+        "-m",
+        "jcr",
+        "calibrate",
+        str(small_capture),
+        str(out),
+        "--no-dense",
+        "--quiet",
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
+        while run.poll() is None and not (out / ".lock").exists():
+            time.sleep(0.01)
+        time.sleep(0.3)
+        run.send_signal(signal.SIGTERM)
+        assert "Traceback" not in run.communicate(timeout=60)[1]
+        assert run.returncode in (-signal.SIGTERM, 143, 130, 0)
+    for name in RESULTS:
+        if name.endswith(".json") and (out / name).exists():
+            json.loads((out / name).read_text())
+    assert subprocess.run(command, check=False, timeout=200).returncode == 0
+    assert read_calibration(out).converged and not list(out.glob(".*.part*"))

@@ -1,0 +1,94 @@
+"""Each value of each structured file exchanged for one of another kind: read or refused, soon, and never status 1.
+
+A share by default; JCR_TEST_FUZZ=2 or more tries all, as does `python tests/fuzz/structure.py`.
+"""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jcr
+from jcr.capture.lerobot_files import Info
+from jcr.capture.urdf_chain import read_chain
+from jcr.errors import InputError
+from structure import TOO_LONG_S, VALUES, Document, documents, places, tried
+
+pytestmark = pytest.mark.slow
+
+EVERY = 25 if os.environ.get("JCR_TEST_FUZZ", "1") == "1" else 1
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Document]:
+    return documents(tmp_path_factory.mktemp("structure"))
+
+
+def test_every_document_is_read_as_it_is(readers: dict[str, Document]):
+    for document in readers.values():
+        document.write(document.content)
+        document.read()
+        document.write(document.content)
+
+
+def test_no_value_of_another_kind_makes_a_traceback_or_takes_long(readers: dict[str, Document]):
+    cases = [
+        (name, place, value)
+        for name, document in readers.items()
+        for place in places(document.content)
+        for value in VALUES
+    ]
+    shuffled = np.random.default_rng(0).permutation(len(cases))[::EVERY]
+    bad, ended = [], []
+    for name, place, value in (cases[k] for k in shuffled):
+        how, seconds = tried(readers[name], place, VALUES[value])
+        readers[name].write(readers[name].content)
+        ended.append(how)
+        if how not in ("read", "status 2", "status 3") or seconds > TOO_LONG_S:
+            bad.append(f"{name} {place} = {value}: {how} ({seconds:.1f} s)")
+    assert not bad
+    # Most values have a kind, and some may be anything: a fuzzer that is always refused tests nothing.
+    assert 0.1 < ended.count("read") / len(ended) < 0.4
+
+
+def test_thirty_thousand_missing_images_are_refused_at_once(tmp_path: Path):
+    frames = [{"image": f"images/{k}.png", "base_from_gripper": np.eye(4).tolist()} for k in range(30_000)]
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames}))
+    start = time.perf_counter()
+    with pytest.raises(
+        InputError, match=r"30000 of 30000 images are not there: images/0.png, .* and 29990 more"
+    ):
+        jcr.read_capture(tmp_path)
+    assert time.perf_counter() - start < TOO_LONG_S
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "{episode_index:01000000000d}",
+        "{episode_index.__class__}",
+        "{0}",
+        "{}",
+        "{video_key!r}",
+        "{x",
+        "{video_key:>9999}",
+    ],
+)
+def test_a_path_in_info_json_is_no_program(path: str):
+    with pytest.raises(ValueError, match="data_path"):
+        Info.model_validate({"features": {}, "fps": 10, "data_path": path}, strict=True)
+
+
+def test_joints_that_lead_back_are_refused(tmp_path: Path):
+    joints = "".join(
+        f'<joint name="{a}{b}" type="revolute"><parent link="{a}"/><child link="{b}"/><axis xyz="0 0 1"/></joint>'
+        for a, b in ("ab", "bc", "ca")
+    )
+    (tmp_path / "ring.urdf").write_text(
+        f'<robot name="ring"><link name="a"/><link name="b"/><link name="c"/>{joints}</robot>'
+    )
+    with pytest.raises(InputError, match="lead back"):
+        read_chain(tmp_path / "ring.urdf", 3)

@@ -1,0 +1,184 @@
+"""Cameras and arms through their makers' packages, against simulators of the makers or fakes of the protocols."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import jcr
+from fake_arms import fake
+from jcr.camera import project
+from jcr.geometry import inverse, rotation_exp, transform
+from jcr.handeye.arms import arm_named
+from jcr.handeye.robots import forward_kinematics
+from jcr.live.camera import CameraOptions, keep_to
+from jcr.records import Intrinsics
+from places import ROOT
+
+POSE = transform(rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.42, -0.11, 0.36]))
+JOINTS = np.array([0.3, -1.2, 1.5, -1.8, -1.5, 0.4])
+
+
+def needs(*packages: str) -> None:
+    """Skip where one is missing, without importing it: one of them broke the process in which tests ran on."""
+    if missing := [name for name in packages if find_spec(name) is None]:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+
+
+def told_by(script: str, *words: object) -> Any:
+    """What a script of its own process prints as JSON, its last line; garbage is collected before it ends."""
+    lines = [*script.strip("\n").splitlines(), "    import gc", "    gc.collect()"]
+    command = [sys.executable, "-c", "\n".join(line.removeprefix("    ") for line in lines), *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+ASK = """
+    import json, sys, importlib
+    from jcr.errors import InputError
+    from jcr.live.rest import asks_at_rest
+    source = importlib.import_module("jcr.live." + sys.argv[1])
+    ask = next(asks_at_rest(lambda: source.states(sys.argv[2])))
+    try:
+        next(source.states(sys.argv[3]))
+    except InputError as error:
+        refused = str(error)
+    print(json.dumps([ask.base_from_gripper.tolist(), ask.joints.tolist(), refused]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "package", "off"), [("rtde", "rtde_receive", 1e-9), ("xarm", "xarm", 1e-6)])
+def test_an_arm_gives_pose_and_joints_through_its_makers_package(name: str, package: str, off: float):
+    needs(package)
+    with fake(name, "127.0.0.7", POSE, JOINTS):
+        pose, joints, refused = told_by(ASK, name, "127.0.0.7", "127.0.0.8")
+    # An xArm tells float32, of which its package keeps six digits.
+    assert np.allclose(pose, POSE, atol=off) and np.allclose(joints, JOINTS, atol=off)
+    assert f"{name}:127.0.0.8" in refused and "check the address" in refused
+
+
+@contextmanager
+def simulated_franka(host: str) -> Iterator[None]:
+    """franky-sim in a process of its own: an FR3 in MuJoCo behind the Franka Control Interface."""
+    command = [sys.executable, "-u", "-m", "franky_sim.run_server", "-s", "mujoco", "--hostname", host]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert any("Press Ctrl+C" in line for line in process.stdout)
+            yield
+        finally:
+            process.terminate()
+
+
+MOVED_FRANKA = """
+    import json, sys, franky
+    import numpy as np
+    from jcr.live import franka
+    from jcr.live.rest import asks_at_rest
+    asks = asks_at_rest(lambda: franka.states(sys.argv[1]))
+    first = next(asks)
+    robot = franky.Robot(sys.argv[1], realtime_config=franky.RealtimeConfig.Ignore)
+    robot.relative_dynamics_factor = 0.3
+    goal = np.array(robot.state.q) + np.array([0.3, 0, 0, 0, 0, 0.2, 0])
+    robot.move(franky.JointMotion(goal))
+    del robot
+    second = next(asks)
+    print(json.dumps([[a.base_from_gripper.tolist() for a in (first, second)],
+                      [a.joints.tolist() for a in (first, second)], goal.tolist()]))
+"""
+
+
+@pytest.mark.slow
+def test_a_simulated_franka_gives_pose_and_joints():
+    needs("franky", "franky_sim")
+    with simulated_franka("127.0.0.9"):
+        poses, joints, goal = map(np.array, told_by(MOVED_FRANKA, "127.0.0.9"))
+    assert np.allclose(joints[1], goal, atol=0.05)
+    # The end effector is the hand, constant in the flange.
+    tools = inverse(forward_kinematics(arm_named("fr3"), joints)) @ poses
+    assert np.allclose(tools[0], tools[1], atol=2e-4)
+    assert np.allclose(tools[0][:3, 3], [0, 0, 0.1034], atol=1e-3)
+
+
+FILMED = """
+    import json, sys
+    import numpy as np
+    import pyrealsense2 as rs
+    import record_realsense
+    from jcr.live.camera import opened
+    with opened("realsense:" + sys.argv[1]) as camera:
+        frames = list(camera.frames)
+    rays = [rs.rs2_deproject_pixel_to_point(record_realsense.lens(rs), x, 1.0) for x in json.loads(sys.argv[2])]
+    depth = np.unique(frames[0].depth_mm).tolist()
+    print(json.dumps([len(frames), frames[0].image.shape, depth, camera.intrinsics, rays]))
+"""
+
+
+@pytest.mark.slow
+def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its_maker(tmp_path: Path):
+    needs("pyrealsense2")
+    file = tmp_path / "recording.db3"
+    path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", path)
+        made = subprocess.run(
+            [sys.executable, ROOT / "tests" / "record_realsense.py", file], capture_output=True
+        )
+        if b"libusb" in made.stderr:
+            pytest.skip("pyrealsense2 needs libusb-1.0")
+        assert made.returncode == 0, made.stderr
+        pixels = [[10.0, 20.0], [600.0, 30.0], [320.0, 240.0], [630.0, 470.0]]
+        count, shape, depth_mm, lens, rays = told_by(FILMED, file, pixels)
+    assert count >= 3 and shape == [480, 640, 3]
+    # 1001 units of half a millimetre.
+    assert set(depth_mm) <= {0, 500, 501}
+    assert (lens["fx"], lens["cy"]) == (600.0, 242.0)
+    found = Intrinsics(lens["fx"], lens["fy"], lens["cx"], lens["cy"], 640, 480, tuple(lens["distortion"]))
+    assert np.allclose(project(found, np.array(rays)), pixels, atol=0.05)
+
+
+class Device:
+    """A cv2.VideoCapture that follows some settings and not others."""
+
+    def __init__(self, fixed: dict[int, float]):
+        self.fixed: dict[int, float] = fixed
+        self.values: dict[int, float] = {}
+
+    def set(self, prop: int, value: float) -> bool:
+        self.values[prop] = self.fixed.get(prop, value)
+        return True
+
+    def get(self, prop: int) -> float:
+        return self.values.get(prop, self.fixed.get(prop, 0.0))
+
+
+def test_a_device_keeps_to_size_exposure_and_focus_or_says_what_it_does_instead():
+    device = Device({})
+    keep_to(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
+    assert device.values == {
+        cv2.CAP_PROP_FRAME_WIDTH: 1280,
+        cv2.CAP_PROP_FRAME_HEIGHT: 720,
+        cv2.CAP_PROP_AUTOFOCUS: 0,
+        cv2.CAP_PROP_AUTO_EXPOSURE: 1,
+        cv2.CAP_PROP_EXPOSURE: 200.0,
+        cv2.CAP_PROP_FOCUS: 30.0,
+    }
+    with pytest.raises(jcr.InputError, match="--camera-size 1280 720: camera 0 gives 640x480"):
+        keep_to(
+            Device({cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}),
+            CameraOptions((1280, 720)),
+            "0",
+        )
+    with pytest.raises(jcr.InputError, match="--focus 30: camera 0 stays at 7"):
+        keep_to(Device({cv2.CAP_PROP_FOCUS: 7.0}), CameraOptions(focus=30.0), "0")

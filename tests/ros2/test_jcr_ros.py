@@ -1,0 +1,271 @@
+"""The ROS 2 package: its core with an arm and a camera that are played, its node with stand-ins for rclpy."""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from jcr_ros.core import Session, Settings
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+import jcr
+from jcr.capture.images import read_image
+from jcr.live.rest import State
+from places import ROOT
+
+PACKAGE = ROOT / "ros2" / "jcr_ros"
+
+
+class Played:
+    """An arm that stands at one pose, and a camera that sees its image, until it is moved on."""
+
+    def __init__(self, tabletop: Path) -> None:
+        frames = json.loads((tabletop / "capture.json").read_text())["frames"]
+        self.poses = [np.array(frame["base_from_gripper"]) for frame in frames]
+        self.images = [read_image(tabletop / frame["image"]) for frame in frames]
+        self.at = 0
+        self.start = time.monotonic()
+
+    @property
+    def time_s(self) -> float:
+        return 20 * (time.monotonic() - self.start)  # the arm lives twenty times as fast
+
+    def gripper(self) -> State:
+        return State(self.time_s, self.poses[self.at])
+
+    def message(self) -> SimpleNamespace:
+        image = self.images[self.at]
+        height, width = image.shape[:2]
+        stamp = SimpleNamespace(sec=int(self.time_s), nanosec=int(1e9 * (self.time_s % 1)))
+        return SimpleNamespace(
+            header=SimpleNamespace(stamp=stamp), height=height, width=width, encoding="rgb8", step=3 * width,
+            data=image.ravel(),
+        )  # fmt: skip
+
+    def film(self, push: Callable[[Any, float], None], over: threading.Event) -> None:
+        while not over.wait(0.04):
+            push(self.message(), self.time_s)
+
+
+def camera_info(**more: Any) -> SimpleNamespace:
+    k = [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]
+    return SimpleNamespace(width=640, height=480, k=k, d=[0.0] * 5, distortion_model="plumb_bob", **more)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def filmed(tabletop: Path) -> Iterator[Callable[[Session, Played], None]]:
+    over, threads = threading.Event(), []
+
+    def film(session: Session, played: Played) -> None:
+        threads.append(threading.Thread(target=played.film, args=(session.image, over)))
+        threads[-1].start()
+
+    yield film
+    over.set()
+    for thread in threads:
+        thread.join()
+
+
+@pytest.mark.slow
+def test_samples_are_taken_by_service_and_at_rest_and_the_next_pose_is_proposed(
+    tmp_path: Path, tabletop: Path, filmed: Callable[[Session, Played], None]
+):
+    played, said, proposed = Played(tabletop), [], []
+    session = Session(
+        Settings(tmp_path / "c", images=4),
+        played.gripper,
+        said.append,
+        lambda pose, answer: proposed.append(pose),
+    )
+    session.camera_info(camera_info())
+    filmed(session, played)
+    session.start()
+    for k in range(3):  # the arm rests: nobody asks
+        played.at = k
+        until(lambda k=k: len(proposed) == k + 1)
+    assert proposed[0] is None and np.linalg.det(proposed[2][:3, :3]) == pytest.approx(1)
+    assert session.take() == (False, "the gripper is where images/002.png was taken; move on")
+    session.stop()
+
+    by_hand = Session(
+        Settings(tmp_path / "c", images=4, at_rest=False), played.gripper, said.append, lambda *_: None
+    )
+    filmed(by_hand, played)
+    by_hand.start()
+    played.at = 3
+    assert by_hand.take() == (True, "kept images/003.png")
+    until(lambda: any("enough images" in text for text in said))
+    assert by_hand.take()[0] is False
+    by_hand.stop()
+    capture = jcr.read_capture(tmp_path / "c")
+    assert len(capture) == 4 and capture.intrinsics is not None and capture.intrinsics.fx == 600
+    assert np.allclose(capture.base_from_gripper, played.poses[:4])
+
+
+def test_a_lens_that_is_not_known_and_a_gripper_that_is_not_in_tf_are_said(tmp_path: Path):
+    session = Session(Settings(tmp_path / "c"), lambda: None, lambda text: None, lambda *_: None)
+    with pytest.raises(jcr.InputError, match="camera_info"):
+        info = camera_info()
+        info.distortion_model, info.d = "thin_prism", [0.1] * 12
+        session.camera_info(info)
+    assert "gripper_frame" in session.take()[1]
+
+
+class Message(SimpleNamespace):
+    """Any message: parts are made when they are asked for."""
+
+    def __getattr__(self, name: str) -> "Message":
+        if name.startswith("__"):
+            raise AttributeError(name)
+        part = Message()
+        setattr(self, name, part)
+        return part
+
+
+class FakeNode:
+    """rclpy.node.Node, as far as the node uses it."""
+
+    parameters: dict[str, Any] = {}
+
+    def __init__(self, name: str) -> None:
+        self.subscriptions_made: dict[str, Callable[[Any], None]] = {}
+        self.services: dict[str, Callable[[Any, Any], Any]] = {}
+        self.published: list[Any] = []
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        return SimpleNamespace(value=self.parameters.get(name, default))
+
+    def create_subscription(
+        self, kind: Any, topic: str, heard: Callable[[Any], None], qos: Any, **_: Any
+    ) -> str:
+        self.subscriptions_made[topic] = heard
+        return topic
+
+    def destroy_subscription(self, subscription: str) -> None:
+        del self.subscriptions_made[subscription]
+
+    def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+        return SimpleNamespace(publish=self.published.append)
+
+    def create_service(self, kind: Any, name: str, answer: Callable[[Any, Any], Any], **_: Any) -> None:
+        self.services[name] = answer
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(info=lambda text: None, error=lambda text, **_: None)
+
+    def get_clock(self) -> Any:
+        return Message(now=lambda: Message(to_msg=Message))
+
+
+@pytest.fixture
+def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    any_message = dict.fromkeys(
+        ("PoseStamped", "TransformStamped", "CameraInfo", "CompressedImage", "Image", "String", "Trigger"),
+        Message,
+    )
+    parts: dict[str, dict[str, Any]] = {
+        "rclpy": {},
+        "rclpy.callback_groups": {"ReentrantCallbackGroup": Message},
+        "rclpy.executors": {"ExternalShutdownException": Exception, "MultiThreadedExecutor": Message},
+        "rclpy.node": {"Node": FakeNode},
+        "rclpy.qos": {"qos_profile_sensor_data": None},
+        "rclpy.time": {"Time": Message},
+        "tf2_ros": {"TransformException": KeyError, "TransformListener": lambda buffer, node: None},
+    }
+    parts |= {
+        f"{name}.{kind}": any_message for name, kind in (("geometry_msgs", "msg"), ("sensor_msgs", "msg"))
+    }
+    parts |= {"std_msgs.msg": any_message, "std_srvs.srv": any_message}
+    parts |= {name.partition(".")[0]: {} for name in parts if "msgs" in name or "srvs" in name}
+    for name, content in parts.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "jcr_ros.node", raising=False)
+    sent: list[Any] = []
+    vars(sys.modules["tf2_ros"]).update(
+        Buffer=lambda: SimpleNamespace(lookup_transform=None),
+        StaticTransformBroadcaster=lambda node: SimpleNamespace(sendTransform=sent.append, sent=sent),
+    )
+    from jcr_ros import node
+
+    return node
+
+
+def stamped(pose: ndarray, time_s: float) -> Any:
+    message = Message()
+    translation, rotation = message.transform.translation, message.transform.rotation
+    translation.x, translation.y, translation.z = pose[:3, 3]
+    rotation.x, rotation.y, rotation.z, rotation.w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    message.header.stamp.sec, message.header.stamp.nanosec = int(time_s), int(1e9 * (time_s % 1))
+    return message
+
+
+@pytest.mark.slow
+def test_the_node_takes_samples_solves_and_publishes_the_transform(
+    tmp_path: Path, tabletop: Path, node_module: ModuleType, monkeypatch: pytest.MonkeyPatch
+):
+    played = Played(tabletop)
+    monkeypatch.setattr(
+        FakeNode, "parameters", {"folder": str(tmp_path / "c"), "images": 6, "depth_topic": "/depth"}
+    )
+    node = node_module.Calibrator()
+    node.buffer.lookup_transform = lambda base, gripper, at: stamped(played.poses[played.at], played.time_s)
+    node.subscriptions_made["/camera/color/camera_info"](camera_info())
+    depth = np.full((480, 640), 0.5, np.float32)
+    node.subscriptions_made["/depth"](
+        SimpleNamespace(encoding="32FC1", height=480, width=640, data=depth.tobytes())
+    )
+    over = threading.Event()
+    film = threading.Thread(
+        target=played.film,
+        args=(lambda message, at: node.subscriptions_made["/camera/color/image_raw"](message), over),
+    )
+    film.start()
+    try:
+        assert node.services["~/start"](None, Message()).success
+        for k in range(6):
+            played.at = k
+            until(lambda k=k: (tmp_path / f"c/images/{k:03d}.png").exists())
+    finally:
+        over.set()
+        film.join()
+    answer = node.services["~/solve"](None, Message())
+    assert answer.success, answer.message
+    (sent,) = node.broadcaster.sent
+    assert (sent.header.frame_id, sent.child_frame_id) == ("tool0", "camera_color_optical_frame")
+    truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    place = sent.transform.translation
+    assert np.linalg.norm(np.array([place.x, place.y, place.z]) - truth[:3, 3]) < 5e-3
+    assert read_depth(tmp_path / "c") == 500
+
+
+def read_depth(folder: Path) -> int:
+    import cv2
+
+    frame = json.loads((folder / "capture.json").read_text())["frames"][0]
+    return int(np.median(cv2.imread(str(folder / frame["depth"]), cv2.IMREAD_UNCHANGED)))
+
+
+def test_the_package_names_what_it_installs():
+    setup = (PACKAGE / "setup.py").read_text()
+    for file in ("launch/calibrate.launch.py", "rviz/calibrate.rviz", "package.xml", "resource/jcr_ros"):
+        assert (PACKAGE / file).is_file() and file.rpartition("/")[2] in setup
+    shown = yaml.safe_load((PACKAGE / "rviz/calibrate.rviz").read_text())["Visualization Manager"]["Displays"]
+    assert {"/jcr/next_pose"} <= {display["Topic"]["Value"] for display in shown if "Topic" in display}
+    compile((PACKAGE / "launch/calibrate.launch.py").read_text(), "launch", "exec")
