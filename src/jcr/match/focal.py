@@ -23,7 +23,7 @@ MATCHES = 200
 
 
 def focal_by_robot(
-    x_px: list[Float[ndarray, "k 2"]],
+    x_px: list[Float[ndarray, "_ 2"]],
     size: tuple[int, int],
     geometries: Iterable[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
     motion: Float[ndarray, "n n 4 4"],
@@ -46,7 +46,7 @@ def focal_by_robot(
 
 
 def _angles(
-    x_px: list[Float[ndarray, "k 2"]],
+    x_px: list[Float[ndarray, "_ 2"]],
     lens: Intrinsics,
     key: tuple[int, int],
     geometry: pycolmap.TwoViewGeometry,

@@ -51,7 +51,7 @@ class LearnedFeatures:
         self._kind, self._images = kind, images
         self._network, self._matcher = _networks(kind)
         self._sets: dict[tuple[int, int], _Set] = {}
-        self.x_px: list[Float[ndarray, "k 2"]] = [np.zeros((0, 2)) for _ in images]
+        self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Of every image, all angles together; pixel centres are whole numbers."""
 
     def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:

@@ -97,7 +97,7 @@ class LearnedMatcher:
         self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
 
     @property
-    def x_px(self) -> list[Float[ndarray, "k 2"]]:
+    def x_px(self) -> list[Float[ndarray, "_ 2"]]:
         """Keypoints found so far, at the working size; more come with every angle by which an image is turned."""
         return [(x + 0.5) * self._scale - 0.5 for x in self._features.x_px]
 

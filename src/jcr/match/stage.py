@@ -8,7 +8,7 @@ are guessed.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
@@ -31,6 +31,8 @@ from jcr.records import Intrinsics
 Key = tuple[int, int]
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
+WORTH_SAYING = 0.1
+"""Share of the matched pairs: a few wrong ones are left out of every set."""
 AS_TAKEN = math.radians(50)
 """Networks match images that are turned against each other by up to this; no rotation is larger than its angle."""
 STILL = (5e-3, math.radians(1))
@@ -40,11 +42,12 @@ GUESSED_AT_ONCE = 6
 GUESSED_AT_MOST = 30
 
 
+@runtime_checkable
 class Matcher(Protocol):
     """Features of a capture's images, of any kind."""
 
     @property
-    def x_px(self) -> Sequence[Float[ndarray, "k 2"]]:
+    def x_px(self) -> Sequence[Float[ndarray, "_ 2"]]:
         """Keypoints at the working size; pixel centres are whole numbers."""
         ...
 
@@ -326,9 +329,9 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
 def _notes(found: Gate, stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
     """What the robot changed, in one line each."""
     notes = []
-    if found.contradicted:
-        count = len(found.contradicted)
-        total = count + len(found.confirmed)
+    count = len(found.contradicted)
+    total = count + len(found.confirmed)
+    if count > WORTH_SAYING * total:
         notes.append(
             f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out"
         )

@@ -40,15 +40,15 @@ def verification(seed: int, known: bool = False) -> pycolmap.TwoViewGeometryOpti
 class View:
     """What verification needs of the images, at the working size."""
 
-    x_px: Sequence[Float[ndarray, "k 2"]]
+    x_px: Sequence[Float[ndarray, "_ 2"]]
     """Keypoints of every image; pixel centres are whole numbers."""
     lens: Intrinsics
     """Given, or a guess."""
-    rays: Sequence[Float[ndarray, "k 2"]]
+    rays: Sequence[Float[ndarray, "_ 2"]]
     """x/z, y/z of the keypoints through that lens."""
 
     @staticmethod
-    def of(x_px: Sequence[Float[ndarray, "k 2"]], lens: Intrinsics) -> "View":
+    def of(x_px: Sequence[Float[ndarray, "_ 2"]], lens: Intrinsics) -> "View":
         """The keypoints with their rays."""
         return View(x_px, lens, [unproject(lens, x)[:, :2] for x in x_px])
 
@@ -66,7 +66,7 @@ class View:
 
 
 def matched(
-    x_px: Sequence[Float[ndarray, "k 2"]],
+    x_px: Sequence[Float[ndarray, "_ 2"]],
     camera: pycolmap.Camera,
     i: int,
     j: int,
@@ -118,7 +118,7 @@ def _between_centres(fundamental: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"
     return move.T @ fundamental @ move
 
 
-def read_keypoints(database: Path, count: int) -> list[Float[ndarray, "k 2"]]:
+def read_keypoints(database: Path, count: int) -> list[Float[ndarray, "_ 2"]]:
     """Of every image in a database; pixel centres are whole numbers."""
     with closing(pycolmap.Database.open(database)) as db:
         return [
@@ -126,7 +126,7 @@ def read_keypoints(database: Path, count: int) -> list[Float[ndarray, "k 2"]]:
         ]
 
 
-def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "k 2"]]) -> None:
+def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]]) -> None:
     """Into a database that has the images already; of those that it had, the first stay what they were."""
     with closing(pycolmap.Database.open(database)) as db:
         for row, x in enumerate(x_px):
