@@ -29,7 +29,11 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
-    (("camera.py", "projection, distortion, derivatives", 1), ("least_squares.py", "damped Gauss-Newton", 1)),
+    (
+        ("camera.py", "projection, distortion, derivatives", 1),
+        ("intrinsics_json.py", "intrinsics in our files", 1),
+        ("least_squares.py", "damped Gauss-Newton", 1),
+    ),
     (
         ("geometry.py", "SE(3), one retraction", 1.3),
         ("records.py", "what flows", 1),

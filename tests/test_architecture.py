@@ -15,7 +15,7 @@ LAYERS = [
     {"deflate", "errors"},
     {"extras"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},
-    {"camera", "least_squares"},
+    {"camera", "intrinsics_json", "least_squares"},
     {"handeye"},
     {"capture"},
     {"match"},

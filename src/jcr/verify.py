@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.calibration_json import CalibrationFile, intrinsics_of
+from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
@@ -208,7 +208,7 @@ def _by_recalibration(
     """Another scene: a calibration of its own, and the difference of the two against both covariances."""
     assert calibration.uncertainty is not None  # a converged calibration has one
     if calibration.intrinsics is not None:
-        new = replace(new, intrinsics=intrinsics_of(calibration.intrinsics))
+        new = replace(new, intrinsics=calibration.intrinsics.record())
     reconstruction = reconstruct(new, reconstruct_options, progress)
     hand_eye = calibrate(new, reconstruction)
     if not hand_eye.converged:

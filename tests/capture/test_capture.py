@@ -206,7 +206,10 @@ FAULTS = {
         "frame 1 .*4x4",
     ),
     "lens outside": (lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)), "outside the 640x480"),
-    "lens short": (lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])), "not the five"),
+    "lens short": (
+        lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])),
+        "not the 5 of a pinhole",
+    ),
     "lens negative": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)), "must be positive"),
     "path outside": (
         lambda c: edit(c, lambda j: j["frames"][1].update(image="../x.jpg")),

@@ -360,7 +360,7 @@ def test_faults_of_given_cameras_are_named(tmp_path: Path, capture: Capture, pro
     folder = writers.write_transforms(tmp_path, capture, problem.recon_from_camera)
     content = json.loads((folder / "transforms.json").read_text())
     for change, words in (
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR"),
         ({"w": 320}, "w, h are 320x480"),
         ({"frames": [{"file_path": "../secret.png", "transform_matrix": []}]}, "leads out of"),
         ({"frames": []}, 'no list "frames"'),

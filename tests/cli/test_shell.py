@@ -99,7 +99,7 @@ TYPED = {
     "jcr run --backend col": {"colmap"},
     "jcr map out --segments ta": {"tabletop"},
     "jcr export out octo": {"octomap"},
-    "jcr run --pos": {"--poses", "--pose-convention", "--pose-units"},
+    "jcr run --pos": {"--poses", "--pose-convention", "--pose-inverted", "--pose-units"},
     "jcr run --no-b": {"--no-bundle-adjustment"},
     "jcr check ima": {"images/"},
     "jcr check --poses ima": {"images/"},

@@ -14,25 +14,21 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
-from jcr.geometry import HUGE, require_rigid
+from jcr.geometry import require_rigid
+from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import (
-    COEFFICIENTS,
     COVARIANCE_ORDER,
     Attempt,
     Capture,
     HandEye,
     ImageVerdict,
     Intrinsics,
-    LensModel,
     PosePairs,
     Reconstruction,
-    coefficients_of,
 )
 from jcr.rounding import significant
 
 FORMAT = "jcr.calibration/1"
-LARGEST = 100_000
-"""Pixels across; no camera's image is wider."""
 
 
 def _rigid(rows: list[list[float]]) -> list[list[float]]:
@@ -63,8 +59,6 @@ Spread = Annotated[float, Field(ge=0)]
 Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3)]
 Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
 Covariance = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_covariance)]
-Pixels = Annotated[int, Field(ge=1, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 
 
 class _Part(BaseModel):
@@ -165,24 +159,14 @@ class Image(_Part):
     reprojection_px: float | None = None
 
 
-class Lens(_Part):
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
-    width: Pixels
-    height: Pixels
-    model: LensModel = "pinhole"
+class Lens(IntrinsicsJson):
+    """With what is known of their errors."""
+
     std: list[Spread] | None = None
     """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
 
     @model_validator(mode="after")
-    def _as_many_as_the_model_has(self) -> "Lens":
-        if len(self.distortion) != len(COEFFICIENTS[self.model]):
-            raise ValueError(
-                f"{len(self.distortion)} coefficients, but a {self.model} lens has {COEFFICIENTS[self.model]}"
-            )
+    def _one_of_each(self) -> "Lens":
         if self.std is not None and len(self.std) != 4 + len(self.distortion):
             raise ValueError(
                 f"{len(self.std)} standard deviations, but a {self.model} lens has {4 + len(self.distortion)} parameters"
@@ -546,17 +530,3 @@ def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "q q"] | Non
         return None
     std = None if covariance is None else np.sqrt(np.diag(covariance)).tolist()
     return Lens.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion), "std": std})
-
-
-def intrinsics_of(lens: Lens) -> Intrinsics:
-    """The record of a file's lens."""
-    return Intrinsics(
-        lens.fx,
-        lens.fy,
-        lens.cx,
-        lens.cy,
-        lens.width,
-        lens.height,
-        coefficients_of(lens.distortion),
-        lens.model,
-    )

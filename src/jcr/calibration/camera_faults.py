@@ -376,4 +376,4 @@ def _is_common(by: dict[str, float], error: dict[str, float], given: Intrinsics)
     """Whether fx and fy are off by one factor, surely."""
     x, y = by["fx"] / given.fx, by["fy"] / given.fy
     sure = abs(by["fx"]) > SURE * error["fx"] and abs(by["fy"]) > SURE * error["fy"]
-    return sure and abs(x - y) < max(0.2 * abs(x), 2e-3)
+    return bool(sure and abs(x - y) < max(0.2 * abs(x), 2e-3))

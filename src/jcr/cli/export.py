@@ -197,15 +197,13 @@ class Run:
     @property
     def lens(self) -> "Intrinsics":
         """As calibrated."""
-        from jcr.calibration.calibration_json import intrinsics_of
-
         lens = self.calibration.intrinsics
         if lens is None:
             raise InputError(
                 f"{self.arguments.out}: knows no intrinsics, for camera poses were given and no images; export "
                 "something else"
             )
-        return intrinsics_of(lens)
+        return lens.record()
 
     @cached_property
     def scene(self) -> "SceneMap":

@@ -33,7 +33,7 @@ class SiftMatcher:
     def __init__(self, database: Path, count: int, seed: int) -> None:
         self._database, self._seed = database, seed
         self.x_px = read_keypoints(database, count)
-        self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
+        self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
         with closing(pycolmap.Database.open(database)) as db:
             self._camera = db.read_camera(1)
 
@@ -94,7 +94,7 @@ class LearnedMatcher:
         self._scale = np.array([lens.width / width, lens.height / height])
         self._database = database
         self._camera, self._known, self._seed, self._report = camera, known, seed, report
-        self.raw: dict[Key, Int[ndarray, "m 2"]] = {}
+        self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
 
     @property
     def x_px(self) -> list[Float[ndarray, "_ 2"]]:

@@ -44,10 +44,10 @@ class Moved:
 def second_motions(
     view: View,
     confirmed: Sequence[Pair],
-    raw: Mapping[Key, Int[ndarray, "m 2"]],
+    raw: Mapping[Key, Int[ndarray, "_ 2"]],
     motion: Float[ndarray, "n n 4 4"],
     x: RoughX,
-) -> dict[Key, Int[ndarray, "m 2"]]:
+) -> dict[Key, Int[ndarray, "_ 2"]]:
     """Matches of confirmed pairs that lie off the predicted epipolar lines and on one plane's image in both.
 
     A face of a thing is plane enough; an essential matrix would take in whatever is left over.
@@ -89,7 +89,7 @@ def _has_place_of_its_own(view: View, rows: Int[ndarray, "m 2"], of_scene: Pair)
 
 
 def moved_things(
-    view: View, second: Mapping[Key, Int[ndarray, "m 2"]], confirmed: Sequence[Key], count: int
+    view: View, second: Mapping[Key, Int[ndarray, "_ 2"]], confirmed: Sequence[Key], count: int
 ) -> Moved | None:
     """The smaller group of images between which and the rest something moved; None where nothing did.
 

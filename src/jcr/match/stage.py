@@ -57,7 +57,7 @@ class Matcher(Protocol):
         ...
 
     @property
-    def raw(self) -> Mapping[Key, Int[ndarray, "m 2"]]:
+    def raw(self) -> Mapping[Key, Int[ndarray, "_ 2"]]:
         """All matches of the pairs that were tried last, right or wrong."""
         ...
 
@@ -181,11 +181,11 @@ class _Search:
             self.geometries[pair.key], self.pairs[pair.key] = others[pair.key][1], pair
         return self.gate(found) if judged.confirmed else found
 
-    def visible_matches(self) -> dict[Key, Int[ndarray, "m 2"]]:
+    def visible_matches(self) -> dict[Key, Int[ndarray, "_ 2"]]:
         """All matches of the pairs, right or wrong, outside of parts of the image that do not move."""
         return {key: self._visible(key, rows) for key, rows in self.matcher.raw.items()}
 
-    def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "m 2"]:
+    def _visible(self, key: Key, rows: Int[ndarray, "m 2"]) -> Int[ndarray, "visible 2"]:
         """Without matches in parts of the image that do not move."""
         if self.still is None or not len(rows):
             return rows

@@ -20,7 +20,7 @@ LEAST_CELLS = 3
 
 def still_cells(
     x_px: Sequence[Float[ndarray, "_ 2"]],
-    raw: Mapping[Key, Int[ndarray, "m 2"]],
+    raw: Mapping[Key, Int[ndarray, "_ 2"]],
     size: tuple[int, int],
     moving: Iterable[Key],
 ) -> Bool[ndarray, "r c"]:

@@ -4,59 +4,21 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.capture.plain_files import first_fault, shown
 from jcr.errors import InputError
 from jcr.files import written_whole
-from jcr.geometry import HUGE, require_rigid
-from jcr.records import (
-    COEFFICIENTS,
-    CameraEvidence,
-    Intrinsics,
-    LensModel,
-    Reconstruction,
-    Tracks,
-    coefficients_of,
-)
+from jcr.geometry import require_rigid
+from jcr.intrinsics_json import IntrinsicsJson, Positive
+from jcr.records import CameraEvidence, Reconstruction, Tracks
 
 FORMAT = "jcr.reconstruction/4"
 """Changes with what the file holds."""
 OLD = "jcr.reconstruction/3"
 """Without reasons and sigmas of depths, which were all matched; else the same."""
-
-
-MOST_PIXELS = 100_000
-"""Across an image; no camera's is wider."""
-Positive = Annotated[float, Field(gt=0, lt=HUGE)]
-Pixels = Annotated[int, Field(ge=1, le=MOST_PIXELS)]
-
-
-class Lens(BaseModel):
-    """Of an image or a pointmap."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    width: Pixels
-    height: Pixels
-    distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
-    model: LensModel = "pinhole"
-
-    def record(self) -> Intrinsics:
-        """As a record; ValueError where the model has another number of coefficients."""
-        names = COEFFICIENTS[self.model]
-        if len(self.distortion) != len(names):
-            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} lens has {names}")
-        size = self.width, self.height
-        return Intrinsics(
-            self.fx, self.fy, self.cx, self.cy, *size, coefficients_of(self.distortion), self.model
-        )
 
 
 class About(BaseModel):
@@ -68,8 +30,8 @@ class About(BaseModel):
     is_metric: bool
     metric_std: Positive | None
     notes: list[str]
-    intrinsics: Lens
-    pointmap_intrinsics: Lens
+    intrinsics: IntrinsicsJson
+    pointmap_intrinsics: IntrinsicsJson
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:

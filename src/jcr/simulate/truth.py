@@ -17,6 +17,7 @@ from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.geometry import apply
+from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
 from jcr.simulate.robots import BentArm
 
@@ -114,22 +115,11 @@ def read_truth(folder: Path) -> Truth:
         )
         for thing in content.objects
     )
-    lens = Intrinsics(**vars(content.intrinsics))
-    return Truth(**parts | {"folder": folder, "objects": things, "intrinsics": lens})
+    return Truth(**parts | {"folder": folder, "objects": things, "intrinsics": content.intrinsics.record()})
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _Lens(_Part):
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-    distortion: tuple[float, float, float, float, float]
 
 
 class _Thing(_Part):
@@ -152,7 +142,7 @@ class _Content(_Part):
     gripper_from_camera: Matrix
     base_from_gripper: Annotated[list[Matrix], Field(min_length=1)]
     base_from_camera: Annotated[list[Matrix], Field(min_length=1)]
-    intrinsics: _Lens
+    intrinsics: IntrinsicsJson
     labels: list[str]
     table_height: float
     workspace_in_base: Annotated[list[Numbers3], Field(min_length=2, max_length=2)]

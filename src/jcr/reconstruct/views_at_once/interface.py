@@ -85,7 +85,7 @@ def normalised(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
 
 def unit_range(colors: UInt8[ndarray, "n h w 3"], device: str) -> torch.Tensor:
     """Images (n,3,h,w) in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(colors)).to(device).permute(0, 3, 1, 2) / 255
+    return torch.from_numpy(np.array(colors)).to(device).permute(0, 3, 1, 2) / 255
 
 
 def output(answer: Any, name: str, shape: tuple[int, ...], model: str) -> ndarray:
