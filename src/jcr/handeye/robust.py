@@ -71,7 +71,7 @@ def robust_fit(
 
     trusted = np.ones(n, dtype=bool)
     if n >= 5:
-        trusted = _least_trimmed(base_from_gripper, recon_from_camera)
+        trusted, _ = least_trimmed(base_from_gripper, recon_from_camera)
         for _ in range(10):
             agreeing = _agreeing(fitted(trusted, averaged=False))
             if agreeing.sum() < 4 or (agreeing == trusted).all():
@@ -110,8 +110,8 @@ def _agreeing(fit: PoseFit) -> Bool[ndarray, " n"]:
     return within_noise | small
 
 
-def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[ndarray, " n"]:
-    """The subset of images with the least trimmed squared error over all candidate triples."""
+def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Bool[ndarray, " n"], float]:
+    """The subset of images with the least trimmed squared error over all candidate triples, and its root mean (m)."""
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
     triples = _congruent_triples(motions(base_from_gripper), motions(recon_from_camera))
@@ -138,7 +138,7 @@ def _least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> Bool[n
             cost = float(np.sort(subset)[:keep].sum())
             if cost < best_cost:
                 best, best_cost = chosen, cost
-    return best
+    return best, float(np.sqrt(best_cost / keep))
 
 
 def _squared_error(
