@@ -234,9 +234,10 @@ def _of_runs(folder: Path, capture: Capture, in_file: Any, found: dict[str, Docu
 
 def _batch_state(folder: Path, capture: Capture, in_file: Any) -> None:
     from jcr.batch import Row, Task
+    from jcr.capture.options import ReadOptions
     from jcr.results import RunOptions
 
-    task = Task(capture.folder, folder / "batch", RunOptions(), True)
+    task = Task(capture.folder, folder / "batch", RunOptions(), True, ReadOptions())
     task.out.mkdir()
     row = vars(
         Row(str(capture.folder), str(task.out), "done", "colmap", 4, 4, 1.0, 0.1, 0.1, 1.0, 0.1, 1.0, "")

@@ -12,6 +12,7 @@ import pytest
 from dying_process import dies_on_bad
 from jcr import batch as module
 from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
+from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import RunOptions
 
@@ -94,7 +95,7 @@ def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         raise ZeroDivisionError("oops")
 
     monkeypatch.setattr(module, "calibrate", broken)
-    row = run_one(Task(captures[1], tmp_path / "out", RunOptions(), calibrate_only=True))
+    row = run_one(Task(captures[1], tmp_path / "out", RunOptions(), calibrate_only=True, read=ReadOptions()))
     assert row.status == "failed" and "ZeroDivisionError: oops" in row.reason
     assert not (tmp_path / "out" / STATE).exists()
 

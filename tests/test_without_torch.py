@@ -16,7 +16,8 @@ from places import ROOT
 pytestmark = pytest.mark.slow
 
 MAY_NEED_TORCH = (
-    "match/aliked", "match/learned", "match/lightglue", "match/xfeat", "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
+    "match/aliked", "match/learned", "match/lightglue", "match/xfeat",
+    "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
     "reconstruct/views_at_once/", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
     "export/mesh", "export/rrd", "export/volume", "view/",
 )  # fmt: skip

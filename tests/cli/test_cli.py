@@ -107,7 +107,9 @@ def test_the_map_answers_points(done: Path, tabletop: Path, tmp_path: Path):
     assert answers["occupancy"][0] < 0.5 and not answers["unknown"][0]
     assert answers["unknown"][1]
     assert np.mean(np.array(answers["occupancy"][2:]) > 0.5) > 0.5
-    assert np.median(np.abs(answers["distance"][2:])) < 0.01
+    distance = np.array(answers["distance"][2:], float)
+    assert np.isfinite(distance).mean() > 0.98  # the map's box holds all but a hundredth of the points
+    assert np.nanmedian(np.abs(distance)) < 0.01
 
 
 def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
@@ -175,7 +177,7 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
         (["fly"], "no command"),
         (["run"], "required"),
         (["run", "nowhere", "out"], "nowhere"),
-        (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, direct, dust3r, given, "),
+        (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
         (["compare", "nowhere", "nowhere"], "nowhere"),
         (["query", "nowhere", "nowhere"], "nowhere"),
         (["map", "nowhere"], "nowhere"),

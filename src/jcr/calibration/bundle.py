@@ -287,7 +287,8 @@ def _pixel_errors(view: _View, problem: _Problem) -> PixelErrors:
     column, row = (CELLS * problem.x_px / problem.intrinsics.width).astype(int).T
     _, cell = np.unique(np.stack([problem.image, row, column]), axis=1, return_inverse=True)
     sums = sum(np.bincount(cell, along) ** 2 for along in pull.T)
-    return PixelErrors(sigma_px, max(1.0, float(np.sum(sums) / (pull**2).sum())))
+    # Of points that are all behind their cameras nothing pulls.
+    return PixelErrors(sigma_px, max(1.0, float(np.sum(sums) / max((pull**2).sum(), 1e-300))))
 
 
 def _weights(view: _View, pixels: PixelErrors) -> Float[ndarray, " k"]:

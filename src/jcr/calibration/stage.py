@@ -181,16 +181,19 @@ def _calibrated(
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
+    faults: tuple[Fault, ...] = ()
     if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
-        faults = _camera_faults(
+        found = _camera_faults(
             hand_eye, capture, reconstruction, tracks, noise, adjusted, options, systematic
         )
+        faults = found.faults
         if options.focus == "varies" and hand_eye.converged:
-            hand_eye = _refined(hand_eye, faults.adjusted, gripper, camera, reconstruction)
-            hand_eye.covariance[:6, :6] += faults.more_covariance
+            hand_eye = _refined(hand_eye, found.adjusted, gripper, camera, reconstruction)
+            hand_eye.covariance[:6, :6] += found.more_covariance
             hand_eye = judged(hand_eye)
-        if faults.faults:
-            return _with_faults(hand_eye, faults.faults)
+    lens_fault = next((fault.text for fault in faults if fault.of_lens), None)
+    if faults and (lens_fault is None or capture.intrinsics is None):
+        return _with_faults(hand_eye, faults)
     if (
         adjusted is None
         and hand_eye.converged
@@ -224,7 +227,10 @@ def _calibrated(
         _of_poses(systematic, np.flatnonzero(used)),
         adjusted,
     )
-    return hand_eye if doubt is None else _with_faults(kept, [Fault(doubt.text, doubt.shift, of_lens=True)])
+    if doubt is None:
+        return _with_faults(hand_eye, faults)
+    others = [fault for fault in faults if not fault.of_lens]
+    return _with_faults(kept, [*others, Fault(lens_fault or doubt.text, doubt.shift, of_lens=True)])
 
 
 def _with_faults(hand_eye: HandEye, faults: Sequence[Fault]) -> HandEye:

@@ -20,6 +20,8 @@ CLEAR = 0.01
 SURE = 2.5
 """Standard deviations from which a joint's offset, or a ratio of angles, is named."""
 NOTABLE_RATIO = 0.003
+NOTABLE_ERRORS = 0.03, 0.003
+"""mm, degrees; real arms err by more, and of less nobody need hear."""
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
 
@@ -76,7 +78,11 @@ def found(content: "CalibrationFile") -> list[str]:
 def robot_in_words(content: "CalibrationFile") -> list[str]:
     """What the poses tell of the robot itself, where they tell it clearly."""
     lines = []
-    if (errors := content.robot_errors) is not None and errors.p is not None and errors.p < CLEAR:
+    errors = content.robot_errors
+    notable = errors is not None and (
+        errors.translation_mm > NOTABLE_ERRORS[0] or errors.rotation_deg > NOTABLE_ERRORS[1]
+    )
+    if errors is not None and notable and errors.p is not None and errors.p < CLEAR:
         chance = f"p = {errors.p:.1g}" if errors.p > 1e-6 else "p < 1e-6"
         off = [
             (k, joint)

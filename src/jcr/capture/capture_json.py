@@ -80,7 +80,8 @@ def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None
 def lens_as_json(lens: Intrinsics) -> dict[str, Any]:
     """The "intrinsics" of a capture.json."""
     model = {} if lens.model == "pinhole" else {"model": lens.model}
-    return model | {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy", "distortion")}
+    numbers = {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
+    return model | numbers | {"distortion": list(lens.distortion)}
 
 
 def _intrinsics_std(given: Any, lens: Intrinsics | None, file: Path) -> Float[ndarray, " p"] | None:
