@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.words import angles_in_words
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
@@ -14,6 +15,7 @@ from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
+from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.solve import solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
@@ -36,6 +38,9 @@ class Examination:
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
     """From sparse features, where the pictures were looked at and registered."""
+    angle_ratio: tuple[float, float] | None
+    """Rotation angles between cameras over those between grippers, and its standard deviation; 1 is right whatever
+    gripper_from_camera is. None without cameras to compare with."""
     faults: tuple[str, ...]
     """Why a calibration of this capture would not be trusted."""
     remarks: tuple[str, ...]
@@ -73,7 +78,7 @@ def check(
             f"the gripper moves by at most {1e3 * move:.2g} mm while it turns by {np.degrees(turn):.0f}°: "
             "positions that were divided by 1000 look so"
         )
-    hand_eye, faults = None, []
+    hand_eye, ratio, faults = None, None, []
     found: Reconstruction | PosePairs | None = capture if isinstance(capture, PosePairs) else None
     if look and isinstance(capture, Capture):
         try:
@@ -91,6 +96,9 @@ def check(
         if (reading := better_reading(used, found.recon_from_camera)) is not None:
             faults.append(explained(reading))
         faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
+        if hand_eye.converged and hand_eye.inliers.sum() >= 3:
+            ratio = angle_ratio(used[hand_eye.inliers], found.recon_from_camera[hand_eye.inliers])
+            remarks += angles_in_words(*ratio)
     trusted = hand_eye is not None and hand_eye.converged
     x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
     seen = hand_eye.observability if hand_eye is not None else observability(gripper)
@@ -101,7 +109,7 @@ def check(
         noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
     expected, suggestions = next_poses(gripper, suggest, x, noise, reach, seed)
     return Examination(
-        sharp, move, turn, seen, expected, tuple(suggestions), hand_eye, tuple(faults), tuple(remarks)
+        sharp, move, turn, seen, expected, tuple(suggestions), hand_eye, ratio, tuple(faults), tuple(remarks)
     )
 
 

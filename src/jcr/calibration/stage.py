@@ -186,8 +186,9 @@ def _calibrated(
         found = _camera_faults(
             hand_eye, capture, reconstruction, tracks, noise, adjusted, options, systematic
         )
-        faults = found.faults
-        if options.focus == "varies" and hand_eye.converged:
+        if found is not None:
+            faults = found.faults
+        if found is not None and options.focus == "varies" and hand_eye.converged:
             hand_eye = _refined(hand_eye, found.adjusted, gripper, camera, reconstruction)
             hand_eye.covariance[:6, :6] += found.more_covariance
             hand_eye = judged(hand_eye)
@@ -260,8 +261,11 @@ def _camera_faults(
     adjusted: Adjusted | None,
     options: CalibrateOptions,
     systematic: Float[ndarray, "r r"],
-) -> CameraFaults:
-    """What the used images say against one camera, whether or not their calibration is accepted."""
+) -> CameraFaults | None:
+    """What the used images say against one camera, whether or not their calibration is accepted.
+
+    None of an answer so wrong that the points lie behind the cameras.
+    """
     used, start = hand_eye.inliers, (hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon)
     rows, estimated = reconstruction.image_index[used], capture.intrinsics is None
 
@@ -278,14 +282,19 @@ def _camera_faults(
             _of_poses(systematic, np.flatnonzero(used)),
         )
 
-    if adjusted is None:
-        adjusted = readjust(tracks, reconstruction.intrinsics)
-    # An answer that is rejected has no uncertainty beside which a fault could be small.
-    covariance = adjusted.covariance if hand_eye.converged else np.zeros((7, 7))
-    names = [capture.images[row] for row in rows]
-    return camera_faults(
-        adjusted, tracks, readjust, covariance, not estimated, names, options.focus == "varies"
-    )
+    names, varies = [capture.images[row] for row in rows], options.focus == "varies"
+
+    def shown_by(adjusted: Adjusted) -> CameraFaults:
+        # An answer that is rejected has no uncertainty beside which a fault could be small.
+        covariance = adjusted.covariance if hand_eye.converged else np.zeros((7, 7))
+        return camera_faults(adjusted, tracks, readjust, covariance, not estimated, names, varies)
+
+    if adjusted is not None:
+        return shown_by(adjusted)
+    try:
+        return shown_by(readjust(tracks, reconstruction.intrinsics))
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _in_sequence(

@@ -75,6 +75,17 @@ def found(content: "CalibrationFile") -> list[str]:
     return lines
 
 
+def angles_in_words(ratio: float, std: float) -> list[str]:
+    """What camera angles over gripper angles say, where they are clearly not 1; which X it is does not matter."""
+    if abs(ratio - 1) <= max(SURE * std, NOTABLE_RATIO):
+        return []
+    more = "more" if ratio > 1 else "less"
+    return [
+        f"the camera turns {100 * abs(ratio - 1):.2f} ± {100 * std:.2f} % {more} than the gripper: the focal length or "
+        "the robot's joints are off"
+    ]
+
+
 def robot_in_words(content: "CalibrationFile") -> list[str]:
     """What the poses tell of the robot itself, where they tell it clearly."""
     lines = []
@@ -98,13 +109,8 @@ def robot_in_words(content: "CalibrationFile") -> list[str]:
                 f"robot: poses near each other err alike, by {errors.translation_mm:.2g} mm and "
                 f"{errors.rotation_deg:.2g}° per axis ({chance}): joint offsets or link errors"
             )
-    if (angles := content.angle_ratio) is not None and abs(angles.ratio - 1) > max(
-        SURE * angles.std, NOTABLE_RATIO
-    ):
-        lines.append(
-            f"cameras turn by {100 * (angles.ratio - 1):+.2f} ± {100 * angles.std:.2f} % of what the gripper does: "
-            "the focal length or the robot's joints are off"
-        )
+    if (angles := content.angle_ratio) is not None:
+        lines += angles_in_words(angles.ratio, angles.std)
     return lines
 
 
