@@ -21,7 +21,7 @@ from jcr.represent.map_file import load_map
 
 pytestmark = pytest.mark.slow
 
-KILLS = int(os.environ.get("JCR_TEST_KILLS", "3"))
+KILLS = int(os.environ.get("JCR_TEST_KILLS", "2"))
 WRITES = 11
 """Times that a run writes a file."""
 PROCESSES = multiprocessing.get_context("forkserver")
