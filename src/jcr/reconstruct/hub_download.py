@@ -168,7 +168,7 @@ def _append(hub_id: str, file: _File, commit: str, part: Path, report: Progress)
         request.add_unredirected_header("Authorization", f"Bearer {token}")
     if urlsplit(request.full_url).scheme not in ("http", "https"):
         raise InputError(f"HF_ENDPOINT {constants.ENDPOINT}: give an http or https address")
-    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:  # nosec B310: checked above to be http or https
+    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:  # nosec B310
         if have and answer.status != 206:
             have = 0
         with part.open("r+b" if have else "wb") as kept:
