@@ -1,13 +1,15 @@
 """What looks like nothing and moves the answer is named with its size, and counts as uncertainty."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.attack import calibrated, outcome
+from benchmarks.attack import calibrated, outcome, reconstructed
 from jcr.calibration.options import CalibrateOptions
-from jcr.geometry import step_between
+from jcr.calibration.stage import calibrate
+from jcr.geometry import retract, step_between
 from jcr.simulate.faults import LENS, Faults
 
 pytestmark = pytest.mark.slow
@@ -80,3 +82,14 @@ def test_a_focus_that_varies_is_modelled():
     assert (np.abs(step) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
     assert np.linalg.norm(step[:3]) < 4e-3
     assert hand_eye.converged and not hand_eye.warnings
+
+
+def test_one_wrong_pose_among_right_ones_is_no_slip():
+    """As on a real arm that had not come to rest at one of its images."""
+    found, _ = calibrated(Faults(), 0, 15)
+    gripper = found.base_from_gripper.copy()
+    gripper[5] = retract(gripper[5], np.array([0.02, 0.01, -0.01, 0.03, 0.04, -0.02]))
+    capture, reconstruction = reconstructed(replace(found, base_from_gripper=gripper), estimated=False)
+    hand_eye = calibrate(capture, reconstruction)
+    assert hand_eye.converged and np.flatnonzero(~hand_eye.inliers).tolist() == [5]
+    assert not any("moved on the gripper" in text for text in hand_eye.warnings)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
@@ -26,6 +26,11 @@ LOG_P = float(np.log(1e-4))
 """Chance of any one alarm where there is nothing."""
 MATERIAL = 0.5
 """Standard deviations that the answer would move by on an axis, or nobody need know."""
+BY_CHANCE = 0.02
+"""Share of groupings in any other order that may explain as much: the errors of real arms have heavy tails."""
+GROUPINGS = 200
+LARGE_SLIP = 3e-3, float(np.radians(0.5))
+"""m, rad: a larger one no answer with its uncertainty can hold; robots whose joints have play show smaller ones."""
 LEAST_PART = 3
 """Images on either side of a change."""
 MIN_IMAGES = 7
@@ -68,33 +73,31 @@ def sequence_fault(
     )
     robot = hand_eye.robot_noise
     white = np.diag(np.tile(np.repeat((robot.translation, robot.rotation), 3), m) ** 2)
-    factor = np.linalg.cholesky(white + robot.systematic**2 * systematic)
-
-    def whitened(columns: Float[ndarray, "m 6 p"]) -> Float[ndarray, "r p"]:
-        return solve_triangular(factor, columns.reshape(6 * m, -1), lower=True)
-
-    flat, design = whitened(residual[..., None])[:, 0], whitened(by)
-    of_x = by[:, :, [*range(*TRANSLATION.indices(13)), *range(*ROTATION.indices(13))]]
+    problem = _Problem(residual, by, white + robot.systematic**2 * systematic)
+    # An image that is rejected between others that agree is wrong by itself; after a slip several in a row are.
+    rejected = np.pad(~hand_eye.inliers, 1)
+    in_order = problem.of(np.flatnonzero(hand_eye.inliers | rejected[:-2] | rejected[2:]))
     std = np.sqrt(np.diag(hand_eye.covariance)[:6])
 
     places = np.unique(
         np.linspace(LEAST_PART, m - LEAST_PART, min(m - 2 * LEAST_PART + 1, MANY_PLACES)).astype(int)
     )
-    slips = []
-    for k in places.tolist():
-        after = (np.arange(m) >= k).astype(float)
-        slips.append((_tested(flat, design, whitened(of_x * after[:, None, None])), k))
-    slip, k = min(slips, key=lambda one: one[0].log_p)
-    evenly = np.linspace(-0.5, 0.5, m)
-    drift = _tested(flat, design, whitened(of_x * evenly[:, None, None]))
+    slip, k = min(
+        ((in_order.moved_by(_after(k, m)), k) for k in places.tolist()), key=lambda one: one[0].log_p
+    )
+    drift = in_order.moved_by(np.linspace(-0.5, 0.5, m))
     found = [(slip.log_p + np.log(len(places)), slip, "slip"), (drift.log_p, drift, "drift")]
     if not still:
         ordered = time_s is not None and (np.diff(time_s) > 0).all()
         moment = time_s if time_s is not None and ordered else np.arange(m, dtype=float)
-        delay = _tested(flat, design, whitened(_velocity(base_from_gripper, moment)[..., None]))
+        delay = problem.of(np.arange(m)).tested(_velocity(base_from_gripper, moment)[..., None])
         found.append((delay.log_p, delay, "delay"))
     log_p, best, kind = min(found, key=lambda one: one[0])
     if log_p > LOG_P:
+        return None
+    if kind != "delay" and not in_order.is_of_the_order(
+        _after(k, m) if kind == "slip" else np.arange(m) / m, best
+    ):
         return None
     p = f"p = {np.exp(max(log_p, -700)):.0e}"
     if kind == "delay":
@@ -129,9 +132,60 @@ def sequence_fault(
     return Fault(
         f"the camera seems to have moved on the gripper by {size} after {images[k - 1]} ({p}): calibrate "
         f"{part} alone, and those of the other part only where the camera still sits as it did then",
-        np.r_[best.value * (m - more) / m, 0.0],
-        rejects=True,
+        np.r_[best.value, 0.0],
+        rejects=bool(metres > LARGE_SLIP[0] or radians > LARGE_SLIP[1]),
     )
+
+
+def _after(place: int, images: int) -> Float[ndarray, " m"]:
+    return (np.arange(images) >= place).astype(float)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The linearised equations of all images."""
+
+    residual: Float[ndarray, "m 6"]
+    by: Float[ndarray, "m 6 13"]
+    covariance: Float[ndarray, "r r"]
+
+    def of(self, images: Int[ndarray, " k"]) -> "_Equations":
+        """Those of some images, in units of their noise."""
+        rows = (6 * images[:, None] + np.arange(6)).ravel()
+        factor = np.linalg.cholesky(self.covariance[np.ix_(rows, rows)])
+        return _Equations(images, self.residual[images], self.by[images], factor)
+
+
+@dataclass(frozen=True)
+class _Equations:
+    images: Int[ndarray, " k"]
+    residual: Float[ndarray, "k 6"]
+    by: Float[ndarray, "k 6 13"]
+    factor: Float[ndarray, "r r"]
+
+    def tested(self, columns: Float[ndarray, "m 6 p"]) -> _Found:
+        """What columns, given for all images, explain."""
+        flat = self._whitened(self.residual[..., None])[:, 0]
+        return _tested(flat, self._whitened(self.by), self._whitened(columns[self.images]))
+
+    def moved_by(self, share: Float[ndarray, " m"]) -> _Found:
+        """An X that moves by a share at each image."""
+        of_x = self.by[:, :, [*range(*TRANSLATION.indices(13)), *range(*ROTATION.indices(13))]]
+        columns = np.zeros((len(share), 6, 6))
+        columns[self.images] = of_x * share[self.images][:, None, None]
+        return self.tested(columns)
+
+    def is_of_the_order(self, share: Float[ndarray, " m"], found: _Found) -> bool:
+        """Whether the same shares in other orders explain less: a permutation test."""
+        rng, shuffled = np.random.default_rng(0), share.copy()
+        as_much = 0
+        for _ in range(GROUPINGS):
+            shuffled[self.images] = rng.permutation(share[self.images])
+            as_much += self.moved_by(shuffled).log_p <= found.log_p + 1e-9
+        return as_much <= BY_CHANCE * GROUPINGS
+
+    def _whitened(self, columns: Float[ndarray, "k 6 p"]) -> Float[ndarray, "r p"]:
+        return solve_triangular(self.factor, columns.reshape(len(self.factor), -1), lower=True)
 
 
 def _tested(
