@@ -272,6 +272,19 @@ def restricted_log_likelihood(equations: Equations, log_sizes: LogSizes) -> floa
     return float(solve(equations, log_sizes).log_posterior - _log_prior(equations, log_sizes))
 
 
+def log_evidence(equations: Equations, solution: Solution, information: Float[ndarray, "c c"]) -> float:
+    """Log density of the residuals, averaged over unknowns and sizes: of s residuals but for (2π)^(−s/2), and up to a
+    constant that all sets of residuals share.
+
+    By Laplace's method about the mode of the sizes, at which `solution` and `information` are.
+    """
+    against_prior = (
+        equations.prior_gradient
+        @ np.linalg.lstsq(equations.prior_information, equations.prior_gradient, rcond=None)[0]
+    )
+    return float(solution.log_posterior - against_prior / 2 - np.linalg.slogdet(information)[1] / 2)
+
+
 def over_sizes(
     equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"]
 ) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]:

@@ -20,18 +20,13 @@ from numpy import ndarray
 from scipy.linalg import cho_solve
 
 from jcr.geometry import retract
-from jcr.handeye.components import Equations, Solution, most_likely, posterior, solve
+from jcr.handeye.components import Equations, Solution, log_evidence, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals, residuals_by_camera
 from jcr.handeye.systematic import Region, smooth_errors
 from jcr.records import Budget
 
-MOST_FREEDOM = 1e6
 SHOWN = 1.1
 """Times the noise that was given: so much more is the residuals' doing."""
-TOLD_TOGETHER = 0.5
-"""Of the residuals' degrees of freedom, how many the size of the errors has at least: those of a bent arm are no
-independent draws. Of 88 answers of simulated low-cost arms from 30 images 3 are beyond 3 sigma with none of them, 6 with
-half, 7 with all; a real capture has a wrong pose that only half of them tell (doosan_bench with its board)."""
 LARGEST_TURN = 0.5
 """rad, and of the logarithm of scale: a poor start on nearly unobservable motions must not throw rotations around the
 circle."""
@@ -69,8 +64,8 @@ class PoseFit:
     """σ_s (rad) of the systematic errors."""
     systematic_left: tuple[float, float]
     """m, rad per axis: what of them is left in the used poses."""
-    degrees_of_freedom: tuple[float, float]
-    """Of the two estimates of the noise."""
+    log_evidence: float
+    """Log density of the used poses' residuals, averaged over unknowns and sizes of errors, times (2π)^(3m)."""
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER."""
     budget: Budget | None
@@ -130,12 +125,6 @@ def fit_poses(
         budget = None
     sigma_t, sigma_r, sigma_s = (float(x) for x in np.sqrt(linear.equations.variances(log_sizes)))
     missed, missed_covariance = _missed(problem, linear, solution, (sigma_t, sigma_r), sigma_s)
-    # Of log σ²; a given part of it is known.
-    estimated = np.exp(2 * log_sizes[:2]) / np.square((sigma_t, sigma_r))
-    uncertain = 4 * estimated**2 * np.diag(np.linalg.inv(information))[:2]
-    # How large the errors are together is told by all residuals, even where they leave open how much of it is random.
-    together = max(TOLD_TOGETHER * (3 * int(used.sum()) - 6.5), 1.0)
-    freedom = np.clip(2 / uncertain, together, MOST_FREEDOM)
     residual = residuals(*unknowns, base_from_gripper, recon_from_camera)[0]
     return PoseFit(
         *unknowns,
@@ -146,7 +135,7 @@ def fit_poses(
         noise,
         sigma_s,
         linear.equations.systematic_left(log_sizes),
-        (float(freedom[0]), float(freedom[1])),
+        log_evidence(linear.equations, solution, information),
         covariance[:7, :7],
         budget,
         missed,
