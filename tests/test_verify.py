@@ -16,12 +16,16 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
+from jcr.handeye.arms import arm_named
+from jcr.handeye.closed_form import initial_estimate
 from jcr.handeye.fit import fit_poses
+from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.simulate.capture import with_robot_noise
+from jcr.simulate.robots import bent_problem
 
 pytestmark = pytest.mark.slow
 
@@ -117,7 +121,31 @@ def drifts(
     )
     fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD, bool))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
-    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), 1e-3)
+    systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
+    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic, 1e-3)
+
+
+def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
+    arm, of_old = arm_named("ur5e"), slice(0, OLD)
+    shown = []
+    for seed in range(4):
+        made = bent_problem(arm, "poor", OLD + 3, seed)
+        gripper, camera = made.base_from_gripper, made.recon_from_camera
+        covariances = arm_errors(*posed(arm, made.joints, gripper)), smooth_errors(gripper)
+        start = initial_estimate(gripper[of_old], camera[of_old], np.ones(OLD))
+        bumped = camera.copy()
+        bumped[OLD:, :3, 3] += 1e-3 / made.scale * camera[OLD:, :3, 0]
+        for systematic in covariances:
+            of_used = systematic[: 6 * OLD, : 6 * OLD]
+            fit = fit_poses(
+                gripper[of_old], camera[of_old], start, np.ones(OLD, bool), systematic=of_used, averaged=False
+            )
+            for cameras in (camera, bumped):
+                new = gripper[OLD:], cameras[OLD:], np.broadcast_to(1e-10 * np.eye(6), (3, 6, 6))
+                shown.append(drift(fit, (gripper[of_old], camera[of_old]), new, systematic, 1e-3).p_value)
+    known_still, known_bumped, poses_still, poses_bumped = np.array(shown).reshape(4, 4).T
+    assert min(known_still.min(), poses_still.min()) > 1e-3
+    assert known_bumped.max() < 1e-3 < np.median(poses_bumped)
 
 
 def test_false_alarms_come_at_their_rate(capture: Capture, x: np.ndarray):

@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.stats import chi2
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.drift import Cause, Drift, detectable, drift
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
@@ -126,16 +127,22 @@ def verify(
             for name, place in zip(new.images, located, strict=True) if not isinstance(place, Located)]  # fmt: skip
     if shared:
         places = [place for place in located if isinstance(place, Located)]
+        used = reconstruction.image_index[_used(calibration, reconstruction)]
+        errors, _, unused = robot_errors(capture, options_then.calibrate, new)
+        systematic = of_poses(errors, np.r_[used, len(capture) + np.array(shared)])
+        old = of_poses(errors, used)
         found = drift(
-            *fitted(calibration, capture, reconstruction, options_then.calibrate),
+            *fitted(calibration, capture, reconstruction, options_then.calibrate, old),
             (
                 new.base_from_gripper[shared],
                 np.stack([place.recon_from_camera for place in places]),
                 np.stack([place.covariance for place in places]),
             ),
+            systematic,
             options.alpha,
         )
-        return _judged(found, options, tuple(new.images[k] for k in shared), tuple(lost), "in the old scene")
+        notes = (*lost, *([] if unused is None else [unused]))
+        return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
     if len(new) < MIN_TO_RECALIBRATE:
         raise NotTrustedError(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
@@ -145,13 +152,18 @@ def verify(
 
 
 def fitted(
-    calibration: CalibrationFile, capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions
+    calibration: CalibrationFile,
+    capture: Capture,
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    systematic: Float[ndarray, "s s"],
 ) -> tuple[PoseFit, tuple[Poses, Poses]]:
     """The calibration's poses fitted again, for the joint covariance that its file does not keep; and the poses.
 
-    Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame.
+    Robot and cameras alone, without bundle adjustment: new images are located in the same cameras' frame. `systematic`
+    is the covariance of the systematic errors of the poses used, at 1 rad.
     """
-    row_used = np.array([calibration.images[row].used for row in reconstruction.image_index])
+    row_used = _used(calibration, reconstruction)
     noise = options.robot_noise
     poses = (
         capture.base_from_gripper[reconstruction.image_index][row_used],
@@ -166,9 +178,14 @@ def fitted(
         ),
         np.ones(int(row_used.sum()), bool),
         None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+        systematic=systematic,
         averaged=False,
     )
     return fit, poses
+
+
+def _used(calibration: CalibrationFile, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:
+    return np.array([calibration.images[row].used for row in reconstruction.image_index])
 
 
 def _judged(

@@ -30,7 +30,7 @@ from jcr.handeye.equation import (
     residuals_by_camera,
 )
 from jcr.handeye.fit import PoseFit
-from jcr.handeye.systematic import Region, smooth_errors
+from jcr.handeye.systematic import Region
 
 CLEAR = 10.0
 """Difference of −2 log likelihoods by which one explanation is preferred to the other (odds of 150 to 1)."""
@@ -62,15 +62,17 @@ def drift(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
+    systematic: Float[ndarray, "s s"],
     alpha: float,
 ) -> Drift:
     """The drift that new images show.
 
     `old` holds the gripper poses and cameras of the calibration, `new` those of the new images and the covariance of
-    steps of these cameras (geometry.retract, recon axes).
+    steps of these cameras (geometry.retract, recon axes); `systematic` is the covariance of the systematic errors of old
+    and new gripper poses at 1 rad.
     """
-    camera = _moved_by(calibrated, old, new, slice(0, 6))
-    scene = _moved_by(calibrated, old, new, slice(7, 13))
+    camera = _moved_by(calibrated, old, new, systematic, slice(0, 6))
+    scene = _moved_by(calibrated, old, new, systematic, slice(7, 13))
     difference = camera.misfit - scene.misfit
     return Drift(
         camera.offset,
@@ -109,6 +111,7 @@ def _moved_by(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
+    systematic: Float[ndarray, "s s"],
     columns: slice,
 ) -> _Moved:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
@@ -119,7 +122,6 @@ def _moved_by(
     stacked = jacobian.reshape(m, 13)
     region = Region.of_poses(stacked)
     prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
-    systematic = smooth_errors(np.concatenate([old[0], new[0]]))
     alone = Equations(
         residual.ravel(),
         stacked,

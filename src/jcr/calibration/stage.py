@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
@@ -14,23 +14,21 @@ from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined
 from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
 from jcr.capture.checks import how_turned
-from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.fit import Cues, exceeds
-from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import excitation
-from jcr.handeye.residuals import angle_ratio, paper_residuals
-from jcr.handeye.robots import Arm, Joints
+from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import judged, solve_hand_eye
-from jcr.handeye.systematic import arm_errors, posed, systematic_errors
+from jcr.handeye.systematic import systematic_errors
 from jcr.records import (
     Capture,
     HandEye,
@@ -49,8 +47,6 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
-MIN_EXAMINED = 4
-"""Images from which something may be said of the robot's own errors."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
@@ -67,13 +63,13 @@ def calibrate(
     its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
-    systematic, posed_arm, unused = _systematic(capture, options := options or CalibrateOptions())
-    systematic = _of_poses(systematic, reconstruction.image_index)
+    systematic, posed_arm, unused = robot_errors(capture, options := options or CalibrateOptions())
+    systematic = of_poses(systematic, reconstruction.image_index)
     hand_eye = _calibrated(capture, reconstruction, options, systematic)
     if posed_arm is not None:
         arm, joints = posed_arm
         posed_arm = arm, joints[reconstruction.image_index]
-    hand_eye = _robot_examined(
+    hand_eye = robot_examined(
         hand_eye,
         capture.base_from_gripper[reconstruction.image_index],
         reconstruction.recon_from_camera,
@@ -176,7 +172,7 @@ def _calibrated(
             tracks,
             noise,
             _intrinsics_prior(capture, reconstruction.intrinsics),
-            _of_poses(systematic, np.flatnonzero(used)),
+            of_poses(systematic, np.flatnonzero(used)),
         )
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
@@ -203,7 +199,7 @@ def _calibrated(
         and not tracks.from_pointmaps
     ):
         prior = _intrinsics_prior(capture, reconstruction.intrinsics)
-        of_used = _of_poses(systematic, np.flatnonzero(used))
+        of_used = of_poses(systematic, np.flatnonzero(used))
         considered = with_intrinsics_considered(
             hand_eye, gripper[used], camera[used], tracks, reconstruction.intrinsics, prior, cues, of_used
         )
@@ -225,7 +221,7 @@ def _calibrated(
         reconstruction.intrinsics,
         tracks,
         noise,
-        _of_poses(systematic, np.flatnonzero(used)),
+        of_poses(systematic, np.flatnonzero(used)),
         adjusted,
     )
     if doubt is None:
@@ -279,7 +275,7 @@ def _camera_faults(
             observations,
             noise,
             _intrinsics_prior(capture, intrinsics),
-            _of_poses(systematic, np.flatnonzero(used)),
+            of_poses(systematic, np.flatnonzero(used)),
         )
 
     names, varies = [capture.images[row] for row in rows], options.focus == "varies"
@@ -376,67 +372,6 @@ def is_one(hand_eye: HandEye) -> bool:
     """Whether the scale is 1 within what is known of it."""
     off = abs(float(np.log(hand_eye.scale)))
     return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)
-
-
-def _robot_examined(
-    hand_eye: HandEye,
-    gripper: Float[ndarray, "m 4 4"],
-    camera: Float[ndarray, "m 4 4"],
-    systematic: Float[ndarray, "r r"],
-    posed_arm: tuple[Arm, Joints] | None,
-) -> HandEye:
-    """With what the used poses tell of the robot itself."""
-    used = np.flatnonzero(hand_eye.inliers)
-    if len(used) < MIN_EXAMINED or not hand_eye.observability.observable:
-        return hand_eye
-    before = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
-    of_used = before, gripper[used], camera[used], _of_poses(systematic, used)
-    hand_eye = replace(
-        hand_eye,
-        systematic_p=systematic_p_value(*of_used),
-        angle_ratio=angle_ratio(gripper[used], camera[used]),
-    )
-    if posed_arm is None:
-        return hand_eye
-    arm, joints = posed_arm
-    return replace(hand_eye, joint_offsets=joint_offsets(*of_used, arm, joints[used]))
-
-
-def _systematic(
-    capture: Capture, options: CalibrateOptions
-) -> tuple[Float[ndarray, "r r"], tuple[Arm, Joints] | None, str | None]:
-    """Covariance of the systematic errors of the capture's gripper poses, the arm with its tool and joint angles, and
-    why an arm is not used.
-
-    InputError where the poses are not those of the arm that the user named; what a capture says of itself is only
-    doubted.
-    """
-    gripper = capture.base_from_gripper
-    try:
-        arm = _arm(capture, options)
-        if arm is None:
-            return systematic_errors(gripper), None, None
-        posed_arm = posed(arm, capture.joints, gripper)
-        return arm_errors(*posed_arm), posed_arm, None
-    except InputError as error:
-        if options.robot is not None:
-            raise InputError(f"--robot {options.robot}: {error}") from None
-        return systematic_errors(gripper), None, f"the capture's robot is not used: {error}"
-
-
-def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:
-    name = options.robot or capture.robot
-    if name is not None:
-        return arm_named(name)
-    if capture.urdf is None or capture.joints is None:
-        return None
-    return read_chain(capture.urdf, capture.joints.shape[1])
-
-
-def _of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Float[ndarray, "s s"]:
-    """The covariance of some of the poses."""
-    rows = (6 * poses[:, None] + np.arange(6)).ravel()
-    return covariance[np.ix_(rows, rows)]
 
 
 def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
