@@ -17,6 +17,8 @@ from numpy import ndarray
 
 from jcr.records import COEFFICIENTS, Intrinsics, coefficients_of
 
+HALF_PIXEL = 0.5
+"""Pixels of COLMAP and nerfstudio are ours plus this: theirs are counted from the corner of the image."""
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)

@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle
+from jcr.handeye.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
-from jcr.match.gate import Gate, Pair
+from jcr.match.gate import Gate, Key, Pair
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
 from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
@@ -28,7 +29,6 @@ from jcr.match.still import in_words as still_in_words
 from jcr.match.verify import View, pair_of
 from jcr.records import Intrinsics
 
-Key = tuple[int, int]
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 WORTH_SAYING = 0.1
@@ -236,7 +236,7 @@ def match_with_robot(
     convention, or too few pairs match.
     """
     n = len(base_from_gripper)
-    motion = robot.gripper_motions(base_from_gripper)
+    motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)

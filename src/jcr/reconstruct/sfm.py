@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import fold_distance_px, resized
+from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
@@ -29,7 +29,7 @@ from jcr.match.guided import guided
 from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
 from jcr.match.pairs import all_pairs
 from jcr.match.stage import Matched, Matcher, match_with_robot
-from jcr.match.verify import HALF_PIXEL, View, read_geometries, verification, write_geometries
+from jcr.match.verify import View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
 from jcr.reconstruct.depth.dense import SparseModel
@@ -43,13 +43,6 @@ from jcr.reconstruct.placed import (
     shared_points,
 )
 from jcr.records import Intrinsics, Tracks
-
-if (
-    threading.current_thread() is threading.main_thread()
-    and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-):
-    # pycolmap's logger answers it with a page of C++ frames.
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 BYTES_OF_FEATURES = 330
 """Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
@@ -481,7 +474,15 @@ def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
 
 @contextmanager
 def log_level(verbose: bool) -> Iterator[None]:
-    """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`."""
+    """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`.
+
+    Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
+    know of it: what Python has for the signal is set again, and glog's handler is gone for good.
+    """
+    on_termination = signal.getsignal(signal.SIGTERM)
+    # Python sets signals in its main thread alone, and none that a host program in C handled before it.
+    if on_termination is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_termination)
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = (pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL).value
     try:
