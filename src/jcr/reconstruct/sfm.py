@@ -89,8 +89,7 @@ def structure_from_motion(
         matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
         model = _map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
-            model, placed = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
-            matched = replace(matched, notes=(*matched.notes, *placed))
+            model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise NotTrustedError(_why_not_registered(database, len(images), model))
         _adjust_robustly(model, hold_lens=known)
@@ -105,7 +104,9 @@ def structure_from_motion(
     motions = [model.image(row + 1).cam_from_world() for row in rows]
     camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
     tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
-    return SparseModel(np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes))
+    return SparseModel(
+        np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes), matched.warnings
+    )
 
 
 def extract(
@@ -259,11 +260,11 @@ def _placed(
     known: bool,
     seed: int,
     names: Sequence[str],
-) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model with images that the mapper left out and the robot helps to place, and notes that name them."""
+) -> tuple[pycolmap.Reconstruction, Matched]:
+    """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
     predicted = predicted_cameras(model, base_from_gripper)
     if predicted is None:
-        return model, ()
+        return model, matched
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
@@ -280,17 +281,17 @@ def _placed(
             poses[row] = pose
     resected = poses.keys() - set(rows)
     if not resected and not together:
-        return model, ()
+        return model, matched
     larger = retriangulated(database, camera, poses | together, lambda made: _adjust_robustly(made, True))
-    notes = []
+    notes, warnings = list(matched.notes), list(matched.warnings)
     if together and shared_points(larger, set(together)) < LEAST_SHARED:
         listed = ", ".join(names[row] for row in sorted(together))
-        notes.append(
+        warnings.append(
             f"{listed} make a model of their own that nothing in the images ties to the rest: left out; add images "
             "between them"
         )
         if not resected:
-            return model, tuple(notes)
+            return model, replace(matched, warnings=tuple(warnings))
         larger = retriangulated(database, camera, poses, lambda made: _adjust_robustly(made, True))
     elif together:
         listed = ", ".join(names[row] for row in sorted(together))
@@ -298,7 +299,7 @@ def _placed(
     if resected:
         listed = ", ".join(names[row] for row in sorted(resected))
         notes.append(f"{listed} were placed near the pose that the robot predicts")
-    return larger, tuple(notes)
+    return larger, replace(matched, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _match_guided(
