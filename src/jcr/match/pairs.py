@@ -46,7 +46,8 @@ def seen_in_common(
     first_from_camera = motion[0] @ x.gripper_from_camera
     camera_from_first = inverse(first_from_camera)
     inside = np.stack([_in_image(view.lens, apply(pose, points)) for pose in camera_from_first])
-    common = inside.astype(float) @ inside.T.astype(float)
+    counted = inside.astype(np.float32)  # of 200 images 10⁷ numbers
+    common = counted @ counted.T
     share = common / np.maximum(inside.sum(1), 1)[:, None]
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))
