@@ -107,7 +107,7 @@ class Arguments:
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
-    """For real: CAPTURE=BOARD for those that show a board, as jcr run --board has it."""
+    """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
     resume: bool = False

@@ -1,7 +1,7 @@
 """`jcr bench matching DIR`: SIFT, XFeat and ALIKED on real captures, with the robot's gate and without."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_between_deg, rotation_log
 from jcr.match.matchers import FeatureName
+from jcr.reconstruct import marker
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import HandEye
 
@@ -42,23 +43,66 @@ class Row:
     std_mm: float | None = None
     std_deg: float | None = None
     sigmas: float | None = None
+    joint: float | None = None
     trusted: bool = False
     says: str = ""
 
 
 def run(captures: Path, boards: Sequence[str] = ()) -> str:
-    """Markdown: every capture below `captures` that has a reference.json, matched in every way; boards are not used.
+    """Markdown: every capture below `captures` that has a reference.json, matched in every way.
 
-    Raises InputError where no capture has a reference.
+    `boards` are CAPTURE=BOARD for those whose reference is the marker back end's with that board, where it accepts it,
+    for one that is stored may be of a wrong size. Raises InputError where no capture has a reference, and for a board
+    of none.
     """
     folders = sorted(path.parent for path in captures.glob("*/reference.json"))
     if not folders:
         raise InputError(f"{captures}: no folder below it holds a reference.json beside its capture.json")
-    return table([row_of(folder, features, gate) for folder in folders for features, gate in WAYS])
+    board_of = {name: board for name, _, board in (text.partition("=") for text in boards)}
+    if unknown := board_of.keys() - {folder.name for folder in folders}:
+        raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
+    rows, remade = [], {}
+    for folder in folders:
+        reference = stored = reference_of(folder)
+        if (board := board_of.get(folder.name)) is not None and (made := by_board(folder, board)) is not None:
+            reference, remade[folder.name] = made, f"`{board}`, {apart(made, stored)} from that stored"
+        rows += [row_of(folder, features, gate, reference) for features, gate in WAYS]
+    return table(rows, remade)
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown of the rows."""
+@dataclass(frozen=True)
+class Reference:
+    """The hand-eye transform of a capture by other means."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "6 6"] | None
+    """None: not stated."""
+
+
+def reference_of(folder: Path) -> Reference:
+    """That stored with a capture."""
+    stored = read_hand_eye(folder / "reference.json")
+    covariance = stored.covariance
+    return Reference(stored.gripper_from_camera, None if covariance is None else covariance[:6, :6])
+
+
+def by_board(folder: Path, board: str) -> Reference | None:
+    """The marker back end's from a board in the images; None where it rejects it."""
+    capture = read_capture(folder)
+    hand_eye = calibrate(capture, marker.reconstruct(capture, marker.MarkerOptions(board, dense=False)))
+    return (
+        Reference(hand_eye.gripper_from_camera, hand_eye.covariance[:6, :6]) if hand_eye.converged else None
+    )
+
+
+def apart(one: Reference, other: Reference) -> str:
+    """Distance of two references in words."""
+    mm, deg = off(one.gripper_from_camera, other.gripper_from_camera)
+    return f"{mm:.1f} mm and {deg:.2f}°"
+
+
+def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
+    """Markdown of the rows; `remade` says of captures with which board their references were made."""
     told = []
     for features, gate in WAYS:
         some = [row for row in rows if (row.features, row.gate) == (features, gate)]
@@ -69,11 +113,15 @@ def table(rows: Sequence[Row]) -> str:
         f"{', '.join(told)}.",
         "",
         "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
-        "axis in reported standard deviations. ±σ: the largest reported one. Seconds: reconstruction without dense "
-        "depth and calibration.",
+        "axis in reported standard deviations; joint: in those and the reference's, where it states them. ±σ: the "
+        "largest reported one. Seconds: reconstruction without dense depth and calibration.",
+        *(
+            f"The reference of {name} is the marker back end's with {board}."
+            for name, board in remade.items()
+        ),
         "",
-        "| capture | features | gate | images registered | off: mm | ° | in σ | ±σ: mm | ° | trusted | s |",
-        "|---" * 11 + "|",
+        "| capture | features | gate | images registered | off: mm | ° | in σ | joint | ±σ: mm | ° | trusted | s |",
+        "|---" * 12 + "|",
         *map(line, rows),
         "",
         *(
@@ -85,10 +133,9 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def row_of(folder: Path, features: FeatureName, gate: bool) -> Row:
+def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference) -> Row:
     """One capture reconstructed and calibrated."""
     capture = read_capture(folder)
-    reference = read_hand_eye(folder / "reference.json").gripper_from_camera
     begun = time.perf_counter()
     made = None
     try:
@@ -99,7 +146,7 @@ def row_of(folder: Path, features: FeatureName, gate: bool) -> Row:
         seconds = time.perf_counter() - begun
         return Row(folder.name, features, gate, f"{count} of {len(capture)}", seconds, says=str(refusal))
     seconds = time.perf_counter() - begun
-    mm, deg = off(hand_eye.gripper_from_camera, reference)
+    mm, deg = off(hand_eye.gripper_from_camera, reference.gripper_from_camera)
     std = np.sqrt(np.diag(hand_eye.covariance))
     return Row(
         folder.name,
@@ -111,9 +158,12 @@ def row_of(folder: Path, features: FeatureName, gate: bool) -> Row:
         deg,
         1e3 * float(std[:3].max()),
         float(np.degrees(std[3:6].max())),
-        sigmas(hand_eye, reference),
+        sigmas(hand_eye, reference.gripper_from_camera),
+        None
+        if reference.covariance is None
+        else sigmas(hand_eye, reference.gripper_from_camera, reference.covariance),
         hand_eye.converged,
-        "; ".join(made.notes),
+        "; ".join((*hand_eye.warnings, *made.warnings, *made.notes)),
     )
 
 
@@ -123,22 +173,26 @@ def off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[flo
     return mm, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
 
 
-def sigmas(hand_eye: HandEye, reference: Float[ndarray, "4 4"]) -> float:
-    """Largest distance on any axis in reported standard deviations."""
+def sigmas(
+    hand_eye: HandEye, reference: Float[ndarray, "4 4"], its_covariance: Float[ndarray, "6 6"] | None = None
+) -> float:
+    """Largest distance on any axis in reported standard deviations, with the reference's where these are given."""
+    variance = np.diag(hand_eye.covariance)[:6] + (0 if its_covariance is None else np.diag(its_covariance))
     x = hand_eye.gripper_from_camera
     gap = np.concatenate([reference[:3, 3] - x[:3, 3], rotation_log(reference[:3, :3] @ x[:3, :3].T)])
-    return float(np.abs(gap / np.sqrt(np.diag(hand_eye.covariance)[:6])).max())
+    return float(np.abs(gap / np.sqrt(variance)).max())
 
 
 def line(row: Row) -> str:
     """A row of the table."""
     numbers = (
-        ["–"] * 5
+        ["–"] * 6
         if row.off_mm is None
         else [
             f"{row.off_mm:.1f}",
             f"{row.off_deg:.2f}",
             f"{row.sigmas:.1f}",
+            "" if row.joint is None else f"{row.joint:.1f}",
             f"{row.std_mm:.1f}",
             f"{row.std_deg:.2f}",
         ]

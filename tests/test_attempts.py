@@ -322,7 +322,8 @@ def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_
         command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
         assert dispatch(command) == 3
         licence = f"weights {garbage_weights}: licence unknown, ask who made the file"
-        assert licence in " ".join(json.loads((out / "calibration.json").read_text())["warnings"])
+        written = json.loads((out / "calibration.json").read_text())
+        assert licence in " ".join([*written["warnings"], *written["notes"]])
         assert licence in (out / "log.txt").read_text() and licence in (out / "report.html").read_text()
         assert licence in capsys.readouterr().err
 
@@ -344,14 +345,14 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says
     assert dispatch(["calibrate", *arguments]) == 0
     found = json.loads((out / "calibration.json").read_text())
     assert found["backend"] == "colmap" and found["converged"]
-    why = next(text for text in found["warnings"] if text.startswith("back end dust3r"))
+    why = next(text for text in found["notes"] if text.startswith("back end dust3r"))
     assert "colmap" in why and ("not to be trusted" in why or "gave nothing" in why)
     assert why in (out / "log.txt").read_text()
     # Its own answer, asked for by name, is not trusted.
     assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3
     found = json.loads((out / "calibration.json").read_text())
     assert found["backend"] == "dust3r" and not found["converged"]
-    licence = next(text for text in found["warnings"] if "licence" in text)
+    licence = next(text for text in found["notes"] if "licence" in text)
     assert str(garbage_weights) in licence and licence in (out / "log.txt").read_text()
 
 

@@ -28,7 +28,7 @@ def test_within_reach_of_the_marker_reference(real_captures: Path, name: str, ma
     assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
     assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
     assert solved.held_out is not None and solved.held_out.translation_mm < 6.0
-    assert any("folds over" in note for note in found.notes) == (name == "doosan_bench")
+    assert any("folds over" in text for text in found.warnings) == (name == "doosan_bench")
 
 
 def test_a_plain_background_is_not_trusted(real_captures: Path):

@@ -17,6 +17,8 @@ from numpy import ndarray
 
 from jcr.records import COEFFICIENTS, Intrinsics, coefficients_of
 
+HALF_PIXEL = 0.5
+"""Pixels of COLMAP and nerfstudio are ours plus this: theirs are counted from the corner of the image."""
 WITHIN_FOLD = 0.9
 """Share of the distance at which a distortion folds over, up to which its inverse is used."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -226,18 +228,18 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
 
 
 def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
-    """Given intrinsics, without a distortion that has no inverse, and a note that says so.
+    """Given intrinsics, without a distortion that has no inverse, and a warning that says so.
 
     With such a distortion images do not register.
     """
     # Of a fisheye's border, beyond the widest angle, there are pixels without rays; the rest is as good as any.
     if lens is None or lens.model == "fisheye" or (fold := fold_distance_px(lens)) is None:
         return lens, ()
-    note = (
+    warning = (
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
         "calibrate the lens again with points out to the corners, or give zero distortion"
     )
-    return without_distortion(lens), (note,)
+    return without_distortion(lens), (warning,)
 
 
 def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:

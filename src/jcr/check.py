@@ -83,7 +83,7 @@ def check(
     if look and isinstance(capture, Capture):
         try:
             found = reconstruct(capture, ColmapOptions(seed=seed, dense=False), progress)
-            remarks += found.notes
+            remarks += [*found.warnings, *found.notes]
         except NotTrustedError as error:
             remarks.append(str(error))
             if (

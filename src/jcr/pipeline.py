@@ -223,9 +223,9 @@ def _told(options: RunOptions) -> dict[str, Mapping[str, Any]]:
 
 
 def _timed(content: CalibrationFile, stage: str, start: float, notes: Sequence[str] = ()) -> CalibrationFile:
-    """With the seconds of one more stage, and what it found worth a warning."""
+    """With the seconds and the notes of one more stage."""
     timings = content.timings_s | {stage: _seconds_since(start)}
-    return content.model_copy(update={"timings_s": timings, "warnings": [*content.warnings, *notes]})
+    return content.model_copy(update={"timings_s": timings, "notes": [*content.notes, *notes]})
 
 
 def _seconds_since(start: float) -> float:

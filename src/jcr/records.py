@@ -161,7 +161,9 @@ class Reconstruction:
     metric_std: float | None = None
     """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
     notes: tuple[str, ...] = ()
-    """What the user should know: images not registered, distortion dropped."""
+    """What was done: images not registered, matches left out."""
+    warnings: tuple[str, ...] = ()
+    """What the user must act on: intrinsics that cannot be used, a gripper pose that the images contradict."""
     reason: UInt8[ndarray, "m h w"] | None = None
     """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
     depth_std: Float[ndarray, "m h w"] | None = None

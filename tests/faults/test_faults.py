@@ -460,7 +460,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/4": {
+    "jcr.reconstruction/5": {
         "about", "colors", "confidence", "depth_std", "image_index", "points_in_recon", "reason", "recon_from_camera",
         "track_image", "track_point", "track_points_in_recon", "track_x_px", "tracks_from_pointmaps",
     }
@@ -476,7 +476,7 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     about = json.loads(str(arrays["about"]))
     assert ARRAYS[about["format"]] == set(arrays)
     assert set(about) == {
-        "format", "backend", "is_metric", "metric_std", "notes", "intrinsics", "pointmap_intrinsics"
+        "format", "backend", "is_metric", "metric_std", "notes", "warnings", "intrinsics", "pointmap_intrinsics"
     }  # fmt: skip
     out = tmp_path / "out"
     shutil.copytree(done, out)
@@ -485,7 +485,7 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/4'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/5'; delete it and run again" in said
 
 
 def in_degrees(pose: np.ndarray) -> np.ndarray:

@@ -70,7 +70,7 @@ def _reprojection_errors(result: Reconstruction) -> Float[ndarray, "k 2"]:
 def test_cameras_are_where_they_were(capture: Capture, found: Reconstruction) -> None:
     assert found.image_index.tolist() == list(range(7))
     assert found.intrinsics == capture.intrinsics
-    assert found.notes == ()
+    assert found.notes == found.warnings == ()
     assert np.sqrt((_center_errors(capture, found) ** 2).mean()) < 2e-4
     true = _true_base_from_camera(capture, found)[:, :3, :3]
     relative = np.swapaxes(true[:1], -1, -2) @ true
@@ -130,7 +130,8 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
     assert capture.intrinsics is not None
     folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
     result = reconstruct(replace(_first(capture, 4), intrinsics=folding), SMALL)
-    assert len(result.notes) == 1 and "folds over at" in result.notes[0] and "not used" in result.notes[0]
+    (warning,) = result.warnings
+    assert "folds over at" in warning and "not used" in warning and not result.notes
     assert result.intrinsics == capture.intrinsics
     np.testing.assert_array_equal(result.recon_from_camera, four.recon_from_camera)
 
@@ -192,7 +193,7 @@ def test_real_cameras_follow_the_gripper(real_captures: Path, name: str, count: 
     capture = read_capture(real_captures / name)
     result = reconstruct(capture, SMALL)
     assert len(result.image_index) == count
-    assert any("folds over" in note for note in result.notes) == (name == "doosan_bench")
+    assert any("folds over" in text for text in result.warnings) == (name == "doosan_bench")
     error = _center_errors(capture, result)
     assert np.median(error) < 3e-3
     assert error.max() < 0.01

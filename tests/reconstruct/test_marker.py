@@ -241,6 +241,14 @@ def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg,
     assert hand_eye.converged == trusted
 
 
+@pytest.mark.skipif(not DATA.is_dir(), reason="the real captures are not beside this checkout")
+def test_a_sheet_of_paper_tells_the_size_that_the_robot_asks_for():
+    """The sheet of franka_plain_background has sides of 11.388 and 8.056 squares: A4, with squares of 26.07 mm."""
+    capture = read_capture(DATA / "franka_plain_background")
+    hand_eye = calibrate(capture, reconstruct(capture, MarkerOptions("chessboard:9x6:0.02607", dense=False)))
+    assert hand_eye.converged and hand_eye.warnings == ()
+
+
 def test_the_table_of_real_captures_holds_each_against_its_reference(tmp_path):
     _, gripper_from_camera = capture_of(tmp_path / "bench", charuco(), count=5)
     off = gripper_from_camera.copy()

@@ -164,7 +164,7 @@ def test_a_distorted_lens_is_used_with_intrinsics_and_given_up_without(
     arrays = pointmap_arrays(truth)
     assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == lens
     result = reconstructed(distorted, arrays)
-    assert result.intrinsics.distortion == (0.0,) * 5 and "distorted images" in result.notes[0]
+    assert result.intrinsics.distortion == (0.0,) * 5 and "distorted images" in result.warnings[0]
 
 
 def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> None:
@@ -287,12 +287,12 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     assert result.evidence is not None
     std = np.sqrt(np.diag(result.evidence.covariance)).reshape(-1, 6)
     assert (std[0] == 0).all() and np.degrees(std[1:, 3:]).min() > 1
-    assert not any("check its pose" in note for note in result.notes)
+    assert not any("check its pose" in text for text in result.warnings)
 
     turned = capture.base_from_gripper.copy()
     turned[1, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ turned[1, :3, :3]
     off = Capture(capture.folder, capture.images, turned, capture.image_size, capture.intrinsics)
-    denied = reconstruct(off, options, predict=partial(mapanything.predict, model)).notes
+    denied = reconstruct(off, options, predict=partial(mapanything.predict, model)).warnings
     named = [note for note in denied if "check its pose" in note]
     assert len(named) == 1 and named[0].startswith("1.png: its angles to the other views differ")
 

@@ -16,9 +16,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
-from jcr.calibration.calibration_json import calibration_file, failed_file, worst_direction
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file, worst_direction
 from jcr.calibration.stage import calibrate
+from jcr.calibration.words import log
 from jcr.capture.images import read_image
+from jcr.cli.output import Output
+from jcr.cli.result import show
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
@@ -137,6 +140,7 @@ def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
         ),
         backend="cast",
         notes=("a <note> & more",),
+        warnings=("a <pose> is off",),
     )
     return reconstruction, label
 
@@ -215,6 +219,26 @@ def test_text_from_files_stays_text(page: str):
     assert scene["views"][1]["name"] == Path(EVIL).name and Path(EVIL).name in elements.text
     assert EVIL in [a.get("title") for _, a in elements.found]
     assert "a & <b>" in elements.text and "a <note> & more" in elements.text
+
+
+def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(
+    run: RunResult, page: str, capsys: pytest.CaptureFixture[str]
+):
+    content = run.calibration
+    assert content.notes == ["a <note> & more"] and content.warnings[-1] == "a <pose> is off"
+    page = page.partition('<section class="warnings">')[2]
+    warned, _, noted = page.partition('<section class="notes">')
+    assert "a &lt;pose&gt; is off" in warned and "a &lt;note&gt;" not in warned
+    assert "a &lt;note&gt; &amp; more" in noted.partition("</section>")[0]
+    written = log(content)
+    assert "warning: a <pose> is off\n" in written and "note: a <note> & more\n" in written
+    assert show(run, Output(json=True)) == 0
+    told = capsys.readouterr()
+    assert "warning: a <pose> is off\n" in told.err and "note: a <note> & more\n" in told.err
+    as_json = json.loads(told.out)
+    assert as_json["notes"] == content.notes and as_json["warnings"] == content.warnings
+    del as_json["notes"]  # as before there were any
+    assert CalibrationFile.model_validate(as_json, strict=True).notes == []
 
 
 def test_page_is_one_small_file(page: str):

@@ -207,6 +207,7 @@ class CalibrationFile(_Part):
     robot_noise: Noise | None
     intrinsics: Lens | None
     warnings: list[str]
+    """What speaks against it first, where it is not to be trusted; then what the user must act on."""
     timings_s: dict[str, float]
     version: str
     next_poses: list[Proposal] = []
@@ -215,6 +216,8 @@ class CalibrationFile(_Part):
     angle_ratio: AngleRatio | None = None
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
+    notes: list[str] = []
+    """What the stages did of their own accord, and nobody need act on."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> "CalibrationFile":
@@ -236,7 +239,7 @@ class CalibrationFile(_Part):
 
     @property
     def remarks(self) -> list[str]:
-        """What else the user should know."""
+        """What else the user must act on."""
         return self.warnings[0 if self.converged else 1 :]
 
     @property
@@ -257,6 +260,7 @@ def calibration_file(
     std = np.sqrt(np.diag(hand_eye.covariance))
     held_out, check = hand_eye.held_out, hand_eye.scale_check
     offsets, ratio = hand_eye.joint_offsets, hand_eye.angle_ratio
+    told = reconstruction.warnings if isinstance(reconstruction, Reconstruction) else ()
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     return CalibrationFile(
         gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
@@ -290,7 +294,8 @@ def calibration_file(
             estimated=hand_eye.robot_noise.estimated,
         ),
         intrinsics=_lens(hand_eye.intrinsics, hand_eye.intrinsics_covariance),
-        warnings=[*hand_eye.warnings, *reconstruction.notes],
+        warnings=[*hand_eye.warnings, *told],
+        notes=list(reconstruction.notes),
         timings_s=timings_s,
         version=version,
         next_poses=[

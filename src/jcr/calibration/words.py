@@ -157,6 +157,7 @@ def log(content: "CalibrationFile") -> str:
         *found(content),
         *(f"{image.image}: {image.reason or 'used'}" for image in content.images),
         *(f"warning: {warning}" for warning in content.warnings),
+        *(f"note: {note}" for note in content.notes),
     ]
     return "\n".join(lines) + "\n"
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.camera import HALF_PIXEL
 from jcr.capture.checks import checked_capture, checked_lens
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
@@ -23,7 +24,6 @@ from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 if TYPE_CHECKING:
     import pycolmap
 
-HALF_PIXEL = 0.5
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
 _COEFFICIENTS = {
     "SIMPLE_PINHOLE": (),

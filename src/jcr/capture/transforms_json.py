@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.camera import HALF_PIXEL
 from jcr.capture.checks import checked_capture, checked_lens, read_rigid
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
@@ -20,7 +21,6 @@ from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
 FILE = "transforms.json"
-HALF_PIXEL = 0.5
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x")
 

@@ -56,6 +56,8 @@ def main(arguments: Arguments) -> int:
             pair_scale=alignment.pair_scale,
             pair_residual=alignment.pair_residual,
         )
+    for warning in alignment.warnings:
+        sys.stderr.write(f"warning: {warning}\n")
     for note in alignment.notes:
         sys.stderr.write(f"note: {note}\n")
     residual = float(np.median(alignment.pair_residual))
@@ -69,6 +71,7 @@ def main(arguments: Arguments) -> int:
             "images": len(alignment.depth),
             "pairs": len(alignment.pair_scale),
             "pair_residual": residual,
+            "warnings": list(alignment.warnings),
             "notes": list(alignment.notes),
         },
     )

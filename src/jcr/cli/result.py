@@ -11,16 +11,20 @@ if TYPE_CHECKING:
 
 
 def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> int:
-    """Print the calibration, its doubts on stderr, and for people what comes after it.
+    """Print the calibration, its doubts and notes on stderr, and for people what comes after it.
 
     Returns exit status 0, or raises NotTrustedError.
     """
     from jcr.calibration.words import summary
+    from jcr.results import RunResult
 
     content = result.calibration
     output.result(summary(content) + after, content.model_dump())
     for remark in content.remarks:
         sys.stderr.write(f"warning: {remark}\n")
+    # Notes on poses that were given are the reader's, which has printed them.
+    for note in content.notes if isinstance(result, RunResult) else ():
+        sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
         raise NotTrustedError(f"not to be trusted: {content.doubt}")
     return 0

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle
+from jcr.match.gate import Key
 from jcr.match.verify import View, matrices
 from jcr.records import Intrinsics
 
@@ -25,7 +26,7 @@ MATCHES = 200
 def focal_by_robot(
     x_px: list[Float[ndarray, "_ 2"]],
     size: tuple[int, int],
-    geometries: Iterable[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
+    geometries: Iterable[tuple[Key, pycolmap.TwoViewGeometry]],
     motion: Float[ndarray, "n n 4 4"],
 ) -> Intrinsics | None:
     """An undistorted lens with square pixels and its centre in the middle; None where too few pairs agree on one."""
@@ -48,7 +49,7 @@ def focal_by_robot(
 def _angles(
     x_px: list[Float[ndarray, "_ 2"]],
     lens: Intrinsics,
-    key: tuple[int, int],
+    key: Key,
     geometry: pycolmap.TwoViewGeometry,
 ) -> list[float]:
     """Angles of rotation that a geometry may mean."""

@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.closed_form import motions
 from jcr.match.rotation import RotationOfX, rotation_of_x
 from jcr.match.two_view import Reading
 
@@ -35,6 +34,10 @@ LEAST_PAIRS = 4
 """That must agree about it: three wrong ones can agree by chance."""
 
 
+Key = tuple[int, int]
+"""Rows of two images, the smaller first."""
+
+
 @dataclass(frozen=True)
 class Pair:
     """Matched keypoints of two images that one two-view geometry explains."""
@@ -47,7 +50,7 @@ class Pair:
     """Best first; empty where none could be found."""
 
     @property
-    def key(self) -> tuple[int, int]:
+    def key(self) -> Key:
         """Rows of the images."""
         return self.i, self.j
 
@@ -63,11 +66,6 @@ class Gate:
     contradicted: tuple[Pair, ...]
     of_x: RotationOfX | None
     """None while too few pairs agree."""
-
-
-def gripper_motions(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n n 4 4"]:
-    """gripper_i_from_gripper_j of all pairs."""
-    return motions(base_from_gripper)
 
 
 def angle_tolerance(angle: float, std: float, systematic: float = SYSTEMATIC) -> float:

@@ -11,7 +11,8 @@ import pycolmap
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.match.stage import Geometries, Key
+from jcr.match.gate import Key
+from jcr.match.stage import Geometries
 from jcr.match.verify import (
     matched,
     read_geometries,

@@ -9,10 +9,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.match.epipolar import RoughX, distance_px
-from jcr.match.gate import Pair
+from jcr.match.gate import Key, Pair
 from jcr.match.verify import View
-
-Key = tuple[int, int]
 
 LEAST_MATCHES = 12
 """Of a thing in two images."""

@@ -3,26 +3,24 @@
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_angle
+from jcr.camera import project
+from jcr.geometry import apply, inverse, motion_length
 from jcr.match.epipolar import scene_points, translation_of_x
-from jcr.match.gate import Gate
+from jcr.match.gate import Gate, Key
 from jcr.match.verify import View
+from jcr.records import Intrinsics
 
 NEIGHBOURS = 8
 """Of an image, by the way between grippers, before X is known."""
 PARTNERS = 10
 """Of an image, by what both see, once X is known."""
-ARM_M = 0.45
-"""A rotation of one rad counts as a way of this; views of a table that is so far away differ alike by either."""
 WIDEST = math.radians(60)
 """Between two viewing directions: nothing matches beyond."""
 LEAST_COMMON = 0.25
 """Share of the scene in an image that the other must see, too."""
-
-Key = tuple[int, int]
 
 
 def all_pairs(n: int) -> list[Key]:
@@ -32,9 +30,7 @@ def all_pairs(n: int) -> list[Key]:
 
 def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int = NEIGHBOURS) -> list[Key]:
     """The nearest neighbours of every image by the gripper's way; in proportion to n."""
-    angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    way = np.hypot(ARM_M * angle, np.linalg.norm(motion[..., :3, 3], axis=-1))
-    return _best(-way, neighbours)
+    return _best(-np.asarray(motion_length(motion)), neighbours)
 
 
 def seen_in_common(
@@ -49,21 +45,22 @@ def seen_in_common(
         return []
     first_from_camera = motion[0] @ x.gripper_from_camera
     camera_from_first = inverse(first_from_camera)
-    in_camera = (
-        np.einsum("nij,pj->npi", camera_from_first[:, :3, :3], points) + camera_from_first[:, None, :3, 3]
-    )
-    depth = in_camera[..., 2]
-    lens = view.lens
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = lens.fx * in_camera[..., 0] / depth + lens.cx
-        v = lens.fy * in_camera[..., 1] / depth + lens.cy
-    inside = (depth > 0) & (u > 0) & (u < lens.width - 1) & (v > 0) & (v < lens.height - 1)
-    common = inside.astype(float) @ inside.T.astype(float)
+    inside = np.stack([_in_image(view.lens, apply(pose, points)) for pose in camera_from_first])
+    counted = inside.astype(np.float32)  # of 200 images 10⁷ numbers
+    common = counted @ counted.T
     share = common / np.maximum(inside.sum(1), 1)[:, None]
     toward = first_from_camera[:, :3, 2]
     between = np.arccos(np.clip(toward @ toward.T, -1, 1))
     score = np.where((between < WIDEST) & (share > LEAST_COMMON), share * np.cos(between), -np.inf)
     return _best(score, PARTNERS)
+
+
+def _in_image(lens: Intrinsics, x_in_camera: Float[ndarray, "p 3"]) -> Bool[ndarray, " p"]:
+    """Which points an image shows."""
+    inside = x_in_camera[:, 2] > 0
+    x_px = project(lens, x_in_camera[inside])
+    inside[inside] = ((x_px > -0.5) & (x_px < [lens.width - 0.5, lens.height - 0.5])).all(1)
+    return inside
 
 
 def _best(score: Float[ndarray, "n n"], count: int) -> list[Key]:

@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle
+from jcr.handeye.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
-from jcr.match.gate import Gate, Pair
+from jcr.match.gate import Gate, Key, Pair
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
 from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
@@ -28,7 +29,6 @@ from jcr.match.still import in_words as still_in_words
 from jcr.match.verify import View, pair_of
 from jcr.records import Intrinsics
 
-Key = tuple[int, int]
 Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 WORTH_SAYING = 0.1
@@ -93,6 +93,8 @@ class Matched:
     upright: Float[ndarray, " n"] | None = None
     """Angles (rad) by which the images were turned, once X's rotation was known."""
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """As those of records.Reconstruction."""
 
 
 @dataclass
@@ -236,7 +238,7 @@ def match_with_robot(
     convention, or too few pairs match.
     """
     n = len(base_from_gripper)
-    motion = robot.gripper_motions(base_from_gripper)
+    motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)
@@ -271,8 +273,9 @@ def match_with_robot(
         believed -= {pair.key for pair in found.undecided}
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
-    notes = (*_notes(found, stale, names), *_beside(search, found, names, original))
-    return Matched(kept, found, search.view.lens, len(search.tried), upright, notes)
+    notes = (*_left_out(found), *_beside(search, found, names, original))
+    warnings = _wrong_poses(stale, names)
+    return Matched(kept, found, search.view.lens, len(search.tried), upright, notes, warnings)
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
@@ -326,21 +329,25 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
     return stale
 
 
-def _notes(found: Gate, stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
-    """What the robot changed, in one line each."""
-    notes = []
+def _left_out(found: Gate) -> tuple[str, ...]:
+    """How many pairs the robot contradicts, where these are many."""
     count = len(found.contradicted)
     total = count + len(found.confirmed)
-    if count > WORTH_SAYING * total:
-        notes.append(
-            f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out"
-        )
-    if stale:
-        listed = ", ".join(names[row] for row in sorted(stale))
-        notes.append(
-            f"the matches of {listed} agree with each other and contradict the reported gripper rotation"
-        )
-    return tuple(notes)
+    if count <= WORTH_SAYING * total:
+        return ()
+    return (
+        f"the robot contradicts {count} of {total} matched pairs of images by their relative rotation: left out",
+    )
+
+
+def _wrong_poses(stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
+    """Which reported gripper rotations the matches contradict."""
+    if not stale:
+        return ()
+    listed = ", ".join(names[row] for row in sorted(stale))
+    return (
+        f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check its pose",
+    )
 
 
 def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:

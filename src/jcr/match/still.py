@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import binary_dilation, find_objects, label
 
-Key = tuple[int, int]
+from jcr.match.gate import Key
 
 CELL_PX = 16
 NEAR_PX = 2.5

@@ -10,13 +10,11 @@ import pycolmap
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.camera import unproject
-from jcr.match.gate import Pair
+from jcr.camera import HALF_PIXEL, unproject
+from jcr.match.gate import Key, Pair
 from jcr.match.two_view import readings
 from jcr.records import Intrinsics
 
-HALF_PIXEL = 0.5
-"""COLMAP has the centre of the top-left pixel at (0.5, 0.5)."""
 MIN_INLIERS = 25
 """With COLMAP's 15, a view of a board was registered by the wrong squares, 30 cm from its place."""
 STATIONARY_PX = 4.0
@@ -134,7 +132,7 @@ def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]]) -> No
             write(row + 1, (x + HALF_PIXEL).astype(np.float32))
 
 
-def read_geometries(database: Path) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+def read_geometries(database: Path) -> dict[Key, pycolmap.TwoViewGeometry]:
     """Of all pairs of images in a database that were verified, by rows."""
     with closing(pycolmap.Database.open(database)) as db:
         ids, geometries = db.read_two_view_geometries()
@@ -146,7 +144,7 @@ def read_geometries(database: Path) -> dict[tuple[int, int], pycolmap.TwoViewGeo
     return found
 
 
-def write_geometries(database: Path, geometries: dict[tuple[int, int], pycolmap.TwoViewGeometry]) -> None:
+def write_geometries(database: Path, geometries: dict[Key, pycolmap.TwoViewGeometry]) -> None:
     """These and no others."""
     with closing(pycolmap.Database.open(database)) as db:
         db.clear_two_view_geometries()

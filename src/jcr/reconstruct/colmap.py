@@ -52,7 +52,7 @@ def reconstruct(
     working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
     plan_memory(len(capture), (width, height), options, working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, notes = usable_lens(capture.intrinsics)
+    given, warnings = usable_lens(capture.intrinsics)
     lenses = [given] if given else _guessed_lenses(capture)
     try:
         sparse = structure_from_motion(
@@ -69,12 +69,12 @@ def reconstruct(
             capture.images,
         )
     except NotTrustedError as error:
-        raise NotTrustedError("; ".join([str(error), *notes])) from None
-    notes += sparse.notes
+        raise NotTrustedError("; ".join([str(error), *warnings])) from None
+    notes = sparse.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in sparse.rows]:
         notes += (f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return with_pointmaps(
-        replace(sparse, notes=notes),
+        replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings)),
         [images[row] for row in sparse.rows],
         options,
         report,

@@ -60,6 +60,7 @@ def reconstruction_from_pairs(
         tracks=tracks,
         backend=backend,
         is_metric=predictions.is_metric,
-        notes=(*images.notes, *notes, *alignment.notes),
+        notes=(*notes, *alignment.notes),
+        warnings=(*images.warnings, *alignment.warnings),
         evidence=aligned.evidence,
     )

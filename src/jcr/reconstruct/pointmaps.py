@@ -25,6 +25,7 @@ def reconstruction_from_pointmaps(
     backend: str,
     is_metric: bool,
     notes: tuple[str, ...] = (),
+    warnings: tuple[str, ...] = (),
 ) -> Reconstruction:
     """The record, with tracks from the pointmaps and, where they are not known, intrinsics from them too.
 
@@ -52,7 +53,8 @@ def reconstruction_from_pointmaps(
         tracks=tracks_from_pointmaps(recon_from_camera, points_in_recon, confidence, images.original_px),
         backend=backend,
         is_metric=is_metric,
-        notes=(*images.notes, *notes),
+        notes=notes,
+        warnings=(*images.warnings, *warnings),
     )
 
 

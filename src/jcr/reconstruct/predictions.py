@@ -135,14 +135,14 @@ def _images(
     them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
-    lens, notes = usable_lens(capture.intrinsics)
+    lens, warnings = usable_lens(capture.intrinsics)
     grid = grid or _plain_grid(capture.image_size, size, source)
     if seen is not None:
         pinhole = grid.original_intrinsics(seen)
         lens = lens or pinhole
     elif lens is not None and is_distorted(lens):
         lens = pinhole = None
-        notes += (
+        warnings += (
             f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
             "lens is estimated as a pinhole",
         )
@@ -166,7 +166,7 @@ def _images(
             base_from_gripper=capture.base_from_gripper[ordered],
         )
         colors = read_colors(part, grid, lens, pinhole)
-    return PreparedImages(colors, grid, lens, pinhole, notes)
+    return PreparedImages(colors, grid, lens, pinhole, warnings)
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:

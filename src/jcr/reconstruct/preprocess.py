@@ -102,7 +102,7 @@ class PreparedImages:
     """Of the capture's images; None: unknown."""
     pinhole: Intrinsics | None
     """Of the undistorted images that `grid` resizes; None: unknown."""
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def intrinsics(self) -> Intrinsics | None:
@@ -124,12 +124,12 @@ def prepare_images(
 
     `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
     """
-    lens, notes = usable_lens(capture.intrinsics)
+    lens, warnings = usable_lens(capture.intrinsics)
     pinhole = lens
     if lens is not None and is_distorted(lens):
         pinhole = pinhole_inside(lens, max(lens.width, lens.height))
     grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
-    return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, notes)
+    return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, warnings)
 
 
 def read_colors(

@@ -15,10 +15,10 @@ from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import CameraEvidence, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/4"
+FORMAT = "jcr.reconstruction/5"
 """Changes with what the file holds."""
-OLD = "jcr.reconstruction/3"
-"""Without reasons and sigmas of depths, which were all matched; else the same."""
+OLD = ("jcr.reconstruction/3", "jcr.reconstruction/4")
+"""Without warnings, which were among the notes; 3 without reasons and sigmas of depths, which were all matched, too."""
 
 
 class About(BaseModel):
@@ -30,6 +30,7 @@ class About(BaseModel):
     is_metric: bool
     metric_std: Positive | None
     notes: list[str]
+    warnings: list[str] = []
     intrinsics: IntrinsicsJson
     pointmap_intrinsics: IntrinsicsJson
 
@@ -42,6 +43,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "is_metric": reconstruction.is_metric,
         "metric_std": reconstruction.metric_std,
         "notes": list(reconstruction.notes),
+        "warnings": list(reconstruction.warnings),
         "intrinsics": asdict(reconstruction.intrinsics),
         "pointmap_intrinsics": asdict(reconstruction.pointmap_intrinsics),
     }
@@ -77,7 +79,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             text = str(file["about"])
             kind = json.loads(text)["format"]
-            if kind not in (FORMAT, OLD):
+            if kind not in (FORMAT, *OLD):
                 raise InputError(f"{path}: format {shown(kind)}, not {FORMAT!r}; delete it and run again")
             about = About.model_validate_json(text, strict=True)
             found = Reconstruction(
@@ -99,6 +101,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 is_metric=about.is_metric,
                 metric_std=about.metric_std,
                 notes=tuple(about.notes),
+                warnings=tuple(about.warnings),
                 reason=file.get("reason"),
                 depth_std=file.get("depth_std"),
                 evidence=_evidence(file),

@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from jcr.camera import fold_distance_px, resized
+from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
@@ -29,7 +29,7 @@ from jcr.match.guided import guided
 from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
 from jcr.match.pairs import all_pairs
 from jcr.match.stage import Matched, Matcher, match_with_robot
-from jcr.match.verify import HALF_PIXEL, View, read_geometries, verification, write_geometries
+from jcr.match.verify import View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
 from jcr.reconstruct.depth.dense import SparseModel
@@ -43,13 +43,6 @@ from jcr.reconstruct.placed import (
     shared_points,
 )
 from jcr.records import Intrinsics, Tracks
-
-if (
-    threading.current_thread() is threading.main_thread()
-    and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-):
-    # pycolmap's logger answers it with a page of C++ frames.
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 BYTES_OF_FEATURES = 330
 """Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
@@ -96,8 +89,7 @@ def structure_from_motion(
         matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
         model = _map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
-            model, placed = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
-            matched = replace(matched, notes=(*matched.notes, *placed))
+            model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise NotTrustedError(_why_not_registered(database, len(images), model))
         _adjust_robustly(model, hold_lens=known)
@@ -112,7 +104,9 @@ def structure_from_motion(
     motions = [model.image(row + 1).cam_from_world() for row in rows]
     camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
     tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
-    return SparseModel(np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes))
+    return SparseModel(
+        np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes), matched.warnings
+    )
 
 
 def extract(
@@ -266,11 +260,11 @@ def _placed(
     known: bool,
     seed: int,
     names: Sequence[str],
-) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model with images that the mapper left out and the robot helps to place, and notes that name them."""
+) -> tuple[pycolmap.Reconstruction, Matched]:
+    """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
     predicted = predicted_cameras(model, base_from_gripper)
     if predicted is None:
-        return model, ()
+        return model, matched
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
@@ -287,17 +281,17 @@ def _placed(
             poses[row] = pose
     resected = poses.keys() - set(rows)
     if not resected and not together:
-        return model, ()
+        return model, matched
     larger = retriangulated(database, camera, poses | together, lambda made: _adjust_robustly(made, True))
-    notes = []
+    notes, warnings = list(matched.notes), list(matched.warnings)
     if together and shared_points(larger, set(together)) < LEAST_SHARED:
         listed = ", ".join(names[row] for row in sorted(together))
-        notes.append(
+        warnings.append(
             f"{listed} make a model of their own that nothing in the images ties to the rest: left out; add images "
             "between them"
         )
         if not resected:
-            return model, tuple(notes)
+            return model, replace(matched, warnings=tuple(warnings))
         larger = retriangulated(database, camera, poses, lambda made: _adjust_robustly(made, True))
     elif together:
         listed = ", ".join(names[row] for row in sorted(together))
@@ -305,7 +299,7 @@ def _placed(
     if resected:
         listed = ", ".join(names[row] for row in sorted(resected))
         notes.append(f"{listed} were placed near the pose that the robot predicts")
-    return larger, tuple(notes)
+    return larger, replace(matched, notes=tuple(notes), warnings=tuple(warnings))
 
 
 def _match_guided(
@@ -481,7 +475,15 @@ def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
 
 @contextmanager
 def log_level(verbose: bool) -> Iterator[None]:
-    """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`."""
+    """COLMAP writes its log to stderr through glog; only fatal errors unless `verbose`.
+
+    Importing pycolmap replaces what SIGTERM does by glog's handler, which prints a page of C++ frames. Python does not
+    know of it: what Python has for the signal is set again, and glog's handler is gone for good.
+    """
+    on_termination = signal.getsignal(signal.SIGTERM)
+    # Python sets signals in its main thread alone, and none that a host program in C handled before it.
+    if on_termination is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_termination)
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = (pycolmap.logging.INFO if verbose else pycolmap.logging.FATAL).value
     try:

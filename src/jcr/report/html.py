@@ -45,7 +45,8 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     sections = [
         _verdict(calibration),
         _tiles(calibration),
-        _warnings(calibration),
+        _remarks("warnings", "Warnings", calibration.remarks),
+        _remarks("notes", "Notes", calibration.notes),
         transform_section(hand_eye),
         scene_section(result, base_from_camera, surface),
         images_section(result),
@@ -153,12 +154,11 @@ def _tiles(calibration: CalibrationFile) -> str:
     return f'<div class="tiles">{"".join(cells)}</div>'
 
 
-def _warnings(calibration: CalibrationFile) -> str:
-    # What the verdict already says is not said twice.
-    if not calibration.remarks:
+def _remarks(kind: str, title: str, remarks: Sequence[str]) -> str:
+    if not remarks:
         return ""
-    items = "".join(f"<li>{escape(remark)}</li>" for remark in calibration.remarks)
-    return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
+    items = "".join(f"<li>{escape(remark)}</li>" for remark in remarks)
+    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>'
 
 
 def _before_after(result: RunResult, base_from_camera: Transforms) -> str:

@@ -229,10 +229,10 @@ def test_senseless_options_are_refused():
 def test_predictions_that_are_noise_are_called_useless():
     predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
     try:
-        notes = align(predictions).notes
+        said = align(predictions).warnings
     except NotTrustedError as refusal:
-        notes = (str(refusal),)
-    assert any("nothing can be built on them" in note or "came to nothing" in note for note in notes)
+        said = (str(refusal),)
+    assert any("nothing can be built on them" in note or "came to nothing" in note for note in said)
 
 
 def test_same_input_same_output():

@@ -127,8 +127,8 @@ def test_a_wrong_gripper_pose_is_named():
     poses = truth.base_from_gripper.copy()
     poses[2, :3, 3] += [0.02, 0.0, 0.0]
     found = align_kinematic(truth.predictions, poses, KinematicOptions((0.0005, 0.0017), FEW_PIXELS))
-    assert len(found.alignment.notes) == 1
-    assert "#2" in found.alignment.notes[0]
+    assert len(found.alignment.warnings) == 1
+    assert "#2" in found.alignment.warnings[0]
 
 
 def test_motions_without_rotation_leave_the_translation_open_and_say_so():

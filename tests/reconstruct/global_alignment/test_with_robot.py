@@ -101,7 +101,7 @@ def test_a_wrong_gripper_pose_leaves_the_cameras_free_and_is_named():
     poses[2, :3, 3] += [0.02, 0.0, 0.0]
     aligned = align_with_robot(made.predictions, poses, FEW_PIXELS)
     assert aligned.alignment.method == "fast"
-    assert "contradict the gripper poses of 02.png" in aligned.alignment.notes[-1]
+    assert "contradict the gripper poses of 02.png" in aligned.alignment.warnings[-1]
     np.testing.assert_array_equal(
         aligned.alignment.recon_from_camera, align(made.predictions, FEW_PIXELS).recon_from_camera
     )

@@ -194,7 +194,7 @@ def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
         (shifted, "3.png: its matches lie"),
     ):
         found = reconstruct(replace(capture, base_from_gripper=gripper), options(), predict=Fake())
-        named = [note for note in found.notes if "check its pose" in note]
+        named = [text for text in found.warnings if "check its pose" in text]
         assert len(named) == 1 and named[0].startswith(said), named
 
 

@@ -46,6 +46,8 @@ class SparseModel:
     """Of the images given: the one given, or estimated."""
     tracks: Tracks
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """As those of records.Reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,7 @@ def with_pointmaps(
         tracks=sparse.tracks,
         backend=backend,
         notes=sparse.notes,
+        warnings=sparse.warnings,
     )
 
 

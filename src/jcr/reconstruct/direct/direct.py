@@ -79,7 +79,8 @@ def reconstruct(
     options, report = options or DirectOptions(), progress or silent
     plan_memory(len(capture), capture.image_size, options)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, notes = usable_lens(capture.intrinsics)
+    given, warnings = usable_lens(capture.intrinsics)
+    notes: tuple[str, ...] = ()
     lens = given or _guessed_lens(capture.image_size)
     levels = pyramid(images, lens)
     held = given is not None
@@ -89,7 +90,7 @@ def reconstruct(
     rows, cameras = fitting_images(levels[FREED[0].height], found.cameras, held)
     if len(rows) < len(capture):
         names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
-        notes = (*notes, f"direct alignment: left out, for they fit nowhere near their poses: {names}")
+        notes = (f"direct alignment: left out, for they fit nowhere near their poses: {names}",)
         levels = {height: level.rows(rows) for height, level in levels.items()}
         images = [images[k] for k in rows]
     for k, stage in enumerate(FREED):
@@ -108,7 +109,7 @@ def reconstruct(
     lens = zoomed(lens, cameras.zoom)
     tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
     recon_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
-    sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes)
+    sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes, warnings)
     reconstruction = with_pointmaps(sparse, images, options, report, backend="direct")
     return replace(reconstruction, evidence=CameraEvidence(recon_from_camera, covariance))
 

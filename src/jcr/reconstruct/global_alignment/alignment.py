@@ -72,7 +72,9 @@ class Alignment:
     seconds: float
     method: str
     notes: tuple[str, ...] = ()
-    """What the user should know: pairs that contradict the others."""
+    """What was done: pairs that contradict the others count little."""
+    warnings: tuple[str, ...] = ()
+    """What the user must act on: pairs that agree on nothing, gripper poses that they contradict."""
 
     def points_in_recon(self) -> Float[ndarray, "n h w 3"]:
         """The pointmaps, float32."""

@@ -293,7 +293,8 @@ def dense_alignment(
         pair_residual=residual,
         seconds=time.perf_counter() - begin,
         method="fast",
-        notes=_notes(predictions, residual, solution.settled),
+        notes=_notes(predictions, residual),
+        warnings=_warnings(residual, solution.settled),
     )
 
 
@@ -305,25 +306,27 @@ def _pair_residuals(predictions: PairPredictions, solution: Solution) -> Float[n
     return residual
 
 
-def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
-    """What the user should know of an alignment."""
-    notes = []
-    middle = float(np.median(residual))
+def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
+    """What speaks against an alignment."""
+    warnings, middle = [], float(np.median(residual))
     if not settled:
-        notes.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
+        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
     if middle > USELESS:
-        notes.append(
+        warnings.append(
             f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"
         )
-    bad = np.flatnonzero(residual > CONTRADICTION * middle)
-    if len(bad):
-        names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
-        pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
-        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-        notes.append(
-            f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}"
-        )
-    return tuple(notes)
+    return tuple(warnings)
+
+
+def _notes(predictions: PairPredictions, residual: Float[ndarray, " e"]) -> tuple[str, ...]:
+    """Which pairs count little."""
+    bad = np.flatnonzero(residual > CONTRADICTION * float(np.median(residual)))
+    if not len(bad):
+        return ()
+    names = predictions.images or tuple(f"#{k}" for k in range(predictions.image_count))
+    pairs = ", ".join(f"{names[n]}-{names[m]}" for n, m in predictions.edges[bad[:5]])
+    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+    return (f"{len(bad)} of {len(residual)} pairs contradict the others and count little: {pairs}{more}",)
 
 
 def _selection(o: ImageObservations, layout: Layout, to_twist: Float[ndarray, "n 6 6"]) -> csr_array:

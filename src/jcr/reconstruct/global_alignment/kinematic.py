@@ -195,13 +195,13 @@ def align_kinematic(
     free = solve_free(problem, options.align)
     solution, cameras = solve_kinematic(problem, free, base_from_gripper, options, gripper_from_camera)
     alignment = dense_alignment(problem, solution, begin, progress)
-    notes = (*alignment.notes, *contradictions(cameras, predictions))
+    warnings = (*alignment.warnings, *contradictions(cameras, predictions))
     return KinematicAlignment(
         gripper_from_camera=cameras.gripper_from_camera,
         scale=float(np.exp(solution.state.log_pair_scale.mean())),
         base_from_gripper=cameras.base_from_gripper,
         covariance=cameras.hand_eye_covariance(len(predictions.edges)),
-        alignment=replace(alignment, method="kinematic", notes=notes),
+        alignment=replace(alignment, method="kinematic", warnings=warnings),
     )
 
 
@@ -235,7 +235,7 @@ def rescaled(state: State, factor: float) -> State:
 
 
 def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
-    """A note that names the images whose gripper pose had to move further than the robot's noise explains.
+    """A warning that names the images whose gripper pose had to move further than the robot's noise explains.
 
     Where that noise is estimated, four images or fewer cannot tell a wrong pose from a bad robot.
     """

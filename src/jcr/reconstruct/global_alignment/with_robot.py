@@ -63,30 +63,36 @@ def align_with_robot(
     problem = Problem(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
     free = solve_free(problem, options)
     evidence = CameraEvidence(free.state.recon_from_camera, free.cameras.covariance())
-    kinematic, note = _kinematic_if_better(problem, free, base_from_gripper, options)
+    kinematic, note, warnings = _kinematic_if_better(problem, free, base_from_gripper, options)
     alignment = dense_alignment(problem, kinematic or free, begin, progress)
     method = "fast" if kinematic is None else "kinematic"
-    return RobotAlignment(replace(alignment, method=method, notes=(*alignment.notes, note)), evidence)
+    alignment = replace(
+        alignment,
+        method=method,
+        notes=(*alignment.notes, note),
+        warnings=(*alignment.warnings, *warnings),
+    )
+    return RobotAlignment(alignment, evidence)
 
 
 def _kinematic_if_better(
     problem: Problem, free: Solution, base_from_gripper: Float[ndarray, "n 4 4"], options: AlignOptions
-) -> tuple[Solution | None, str]:
-    """Kinematic alignment in the frame and unit of the free one, or None, and what speaks for the choice."""
+) -> tuple[Solution | None, str, tuple[str, ...]]:
+    """Kinematic alignment in the frame and unit of the free one, or None; what speaks for the choice; and warnings."""
     count = problem.predictions.image_count
     if count < 3:
-        return None, f"cameras aligned freely: {count} images are too few to tie them to the robot"
+        return None, f"cameras aligned freely: {count} images are too few to tie them to the robot", ()
     try:
         kinematic, cameras = solve_kinematic(
             problem, free, base_from_gripper, KinematicOptions(align=options)
         )
     except (NotTrustedError, np.linalg.LinAlgError):
-        return None, "cameras aligned freely: tied to the robot's poses they came to nothing"
+        return None, "cameras aligned freely: tied to the robot's poses they came to nothing", ()
     contradicted = contradictions(cameras, problem.predictions)
     if contradicted:
-        return None, f"cameras aligned freely: {contradicted[0]}"
+        return None, "cameras aligned freely: the pictures contradict the robot's poses", contradicted
     if not kinematic.settled:
-        return None, "cameras aligned freely: tied to the robot's poses they did not settle"
+        return None, "cameras aligned freely: tied to the robot's poses they did not settle", ()
     metres = float(np.exp(kinematic.state.log_pair_scale.mean()))
     errors_mm = [
         1e3 * predicted_error(solution.state.recon_from_camera, solution.cameras.covariance()) * unit
@@ -94,8 +100,8 @@ def _kinematic_if_better(
     ]
     promise = "expected error {:.2g} mm freely, {:.2g} mm tied to the robot's poses".format(*errors_mm)
     if errors_mm[0] <= errors_mm[1]:
-        return None, f"cameras aligned freely: {promise}"
-    return _in_first_camera(kinematic, metres), f"cameras aligned kinematically: {promise}"
+        return None, f"cameras aligned freely: {promise}", ()
+    return _in_first_camera(kinematic, metres), f"cameras aligned kinematically: {promise}", ()
 
 
 def predicted_error(recon_from_camera: Float[ndarray, "n 4 4"], covariance: Float[ndarray, "r r"]) -> float:

@@ -115,12 +115,12 @@ def reconstruct(
             f"--backend {options.backend} sees one view at a time and gives no cameras; choose another"
         )
     pinhole = images.pinhole or _own_pinhole(predicted, options.backend)
-    chosen, notes = _refined(capture, images, predicted, pinhole, options)
+    chosen, notes, warnings = _refined(capture, images, predicted, pinhole, options)
     if options.takes_poses and chosen.hand_eye.converged:
         chosen, note = _second_pass(capture, images, chosen, pinhole, predict)
         notes = (*notes, note)
     report("reconstruct", 1.0)
-    return _record(capture, images, chosen, options, notes)
+    return _record(capture, images, chosen, options, notes, warnings)
 
 
 def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> Predict:
@@ -171,16 +171,16 @@ def _own_pinhole(predicted: Predicted, backend: str) -> Intrinsics:
 
 def _refined(
     capture: Capture, images: PreparedImages, predicted: Predicted, pinhole: Intrinsics, options: ViewsOptions
-) -> tuple[_Candidate, tuple[str, ...]]:
-    """The prediction or its refinement, whichever predicts images left out better, and what there is to say."""
+) -> tuple[_Candidate, tuple[str, ...], tuple[str, ...]]:
+    """The prediction or its refinement, whichever predicts images left out better; notes; and warnings."""
     gripper = capture.base_from_gripper
     as_predicted = _candidate("as predicted", gripper, predicted, None)
     refined = refine(predicted, images, pinhole) if options.refined else None
     if refined is None:
         note = "too few matches by colour: the cameras are as the model has them"
-        return as_predicted, (
-            (note, *_contradicted(capture, as_predicted, pinhole)) if options.refined else ()
-        )
+        if not options.refined:
+            return as_predicted, (), ()
+        return as_predicted, (note,), _contradicted(capture, as_predicted, pinhole)
     adjusted = _candidate("refined", gripper, predicted, refined)
     kept, left = (
         (adjusted, as_predicted) if adjusted.missed_m < as_predicted.missed_m else (as_predicted, adjusted)
@@ -189,7 +189,7 @@ def _refined(
         f"leave-one-out error of the cameras {kept.told()} ({left.told()}): the former were kept; "
         f"{len(refined.tracks.image)} matches by colour, {refined.error_px:.2f} px"
     )
-    return kept, (note, *_contradicted(capture, kept, pinhole))
+    return kept, (note,), _contradicted(capture, kept, pinhole)
 
 
 def _candidate(
@@ -351,6 +351,7 @@ def _record(
     chosen: _Candidate,
     options: ViewsOptions,
     notes: tuple[str, ...],
+    warnings: tuple[str, ...],
 ) -> Reconstruction:
     """As a reconstruction, with the evidence of the images alone."""
     predicted, refined = chosen.predicted, chosen.refined
@@ -365,7 +366,7 @@ def _record(
         grid,
         images.lens,
         pinhole,
-        images.notes,
+        images.warnings,
     )
     poses = chosen.poses
     in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)]).astype(
@@ -385,6 +386,7 @@ def _record(
             backend=options.backend,
             is_metric=predicted.is_metric,
             notes=notes,
+            warnings=warnings,
         )
         return replace(made, evidence=predicted_evidence(predicted))
     return Reconstruction(
@@ -398,7 +400,8 @@ def _record(
         tracks=refined.tracks,
         backend=options.backend,
         is_metric=predicted.is_metric,
-        notes=(*images.notes, *notes),
+        notes=notes,
+        warnings=(*images.warnings, *warnings),
         evidence=refined.evidence,
     )
 
