@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import shape_checks
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
@@ -70,6 +71,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
             patch.setattr(subprocess.Popen, "__init__", refuse)
             patch.setattr(BaseProcess, "start", refuse)
         return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup() -> Iterator[None]:
+    shape_checks.begin()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    shape_checks.begin()
+    return (yield)
 
 
 @pytest.fixture(scope="session")
