@@ -16,13 +16,14 @@ from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.export.volume import write_octomap
 from jcr.geometry import apply, inverse
-from jcr.pipeline import calibrate
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import PointCloud
 from jcr.represent.build import build_scene
 from jcr.represent.cloud import point_cloud
@@ -102,7 +103,7 @@ def run() -> str:
         truth = read_truth(simulate(folder / "capture", SimulateOptions(images=VIEWS)))
         clouds = {
             "true poses and depth": true_cloud(truth),
-            "calibrated, COLMAP": calibrated_cloud(truth, folder / "run"),
+            "calibrated, COLMAP": calibrated_cloud(truth),
         }
         places, rows, scenes = places_to_ask(truth), {}, {}
         for source, cloud in clouds.items():
@@ -312,19 +313,19 @@ def true_cloud(truth: Truth, points: int = 200_000, noise: float = 0.0, seed: in
     )
 
 
-def calibrated_cloud(truth: Truth, out: Path) -> PointCloud:
+def calibrated_cloud(truth: Truth) -> PointCloud:
     """The cloud that COLMAP and the calibration of the capture give, labelled by the true masks."""
     capture = read_capture(truth.folder)
-    result = calibrate(capture, out, backend="colmap")
-    size = result.reconstruction.confidence.shape[:0:-1]
+    reconstruction = reconstruct(capture, ReconstructOptions("colmap"))
+    size = reconstruction.confidence.shape[:0:-1]
     labels = [
         cv2.resize(true_labels(truth, row), size, interpolation=cv2.INTER_NEAREST)
-        for row in result.reconstruction.image_index
+        for row in reconstruction.image_index
     ]
     return point_cloud(
         capture,
-        result.reconstruction,
-        result.hand_eye,
+        reconstruction,
+        calibrate(capture, reconstruction),
         np.stack(labels).astype(int),
         label_names=truth.labels,
     )

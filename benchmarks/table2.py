@@ -10,8 +10,9 @@ from jaxtyping import Int
 from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
+from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.pipeline import calibrate
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
 from jcr.segment.measure import ObjectSize, measure
@@ -121,12 +122,13 @@ def _scene(folder: Path, seed: int, images: int) -> Scene:
     capture = replace(
         capture, images=capture.images[:images], base_from_gripper=capture.base_from_gripper[:images]
     )
-    result = calibrate(capture, folder / f"run{seed}_{images}", backend="colmap")
-    given = read_labels(capture, result.reconstruction)
+    reconstruction = reconstruct(capture, ReconstructOptions("colmap"))
+    hand_eye = calibrate(capture, reconstruction)
+    given = read_labels(capture, reconstruction)
     assert given is not None  # copied above
-    masked = point_cloud(capture, result.reconstruction, result.hand_eye, given.labels)
+    masked = point_cloud(capture, reconstruction, hand_eye, given.labels)
     cloud = label_tabletop(masked)
-    measured = measure(cloud, float(np.sqrt(result.hand_eye.covariance[6, 6])))
+    measured = measure(cloud, float(np.sqrt(hand_eye.covariance[6, 6])))
     overlap, iou = matched(cloud.label, masked.label, len(truth.labels))
     sizes = {size.label: size for size in measured.objects}
     of_truth = {true: sizes[found] for found, true in overlap.items() if found in sizes}

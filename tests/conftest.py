@@ -1,4 +1,7 @@
+import fcntl
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import shape_checks
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
@@ -69,6 +73,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         return (yield)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup() -> Iterator[None]:
+    shape_checks.begin()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    shape_checks.begin()
+    return (yield)
+
+
 @pytest.fixture(scope="session")
 def tabletop() -> Path:
     """The bundled capture."""
@@ -77,19 +93,24 @@ def tabletop() -> Path:
 
 @pytest.fixture(scope="session")
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """Four pictures of the bundled capture, 200 pixels wide: a whole run takes seconds."""
-    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 4, 200)
+    """Five pictures of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
+    return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 5, 200)
 
 
 @pytest.fixture(scope="session")
 def done(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """The run folder of the bundled capture, made once by the command line."""
-    out = tmp_path_factory.mktemp("run") / "tabletop"
-    command = [sys.executable, "-m", "jcr", "run", str(tabletop), str(out), "--quiet"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert finished.returncode == 0, finished.stderr
-    assert "report:" in finished.stdout
-    return out
+    """The run folder of the bundled capture, made once by the command line; each worker of pytest-xdist has a copy."""
+    base = tmp_path_factory.getbasetemp()
+    together = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    made = together / "made" / "tabletop"
+    with (together / "made.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            command = [sys.executable, "-m", "jcr", "run", str(tabletop), str(made), "--quiet"]
+            finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+            assert finished.returncode == 0, finished.stderr
+            assert "report:" in finished.stdout
+    return shutil.copytree(made, tmp_path_factory.mktemp("run") / "tabletop")
 
 
 @pytest.fixture(scope="session")

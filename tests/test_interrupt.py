@@ -39,4 +39,4 @@ def test_an_interrupted_run_says_so_in_one_line_and_resumes(small_capture: Path,
         assert not (tmp_path / "out").exists(), "nothing came of it"
     finished = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert finished.returncode in (0, 3), finished.stderr
-    assert len(json.loads(finished.stdout)["images"]) == 4
+    assert len(json.loads(finished.stdout)["images"]) == 5

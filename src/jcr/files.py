@@ -1,10 +1,12 @@
-"""Files are written whole or not at all: a temporary name beside the target, fsync, rename."""
+"""Files are written whole or not at all: a temporary name beside the target, fsync, rename; and only files are read."""
 
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from jcr.errors import InputError
 
 
 @contextmanager
@@ -25,6 +27,22 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a file holds; raises as `require_file`, and OSError where there is nothing that can be read."""
+    require_file(path)
+    return path.read_bytes()
+
+
+def require_file(path: Path) -> None:
+    """Raise InputError where a pipe or a device is in place of a file: to read it could take for ever.
+
+    What the command itself was given on an open descriptor, as a shell's `<(…)`, is read.
+    """
+    given = path.parent in (Path("/dev/fd"), Path("/proc/self/fd")) or path == Path("/dev/stdin")
+    if not given and path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError(f"{path}: a pipe or a device; name a file")
 
 
 def remove_unfinished(folder: Path) -> None:

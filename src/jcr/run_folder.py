@@ -26,7 +26,7 @@ from jcr.capture.capture_json import kept
 from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
-from jcr.files import remove_unfinished, write_text
+from jcr.files import read_bytes, remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
 from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
@@ -83,7 +83,7 @@ class RunFolder:
         """run.json; InputError where there is no run, or its file was damaged."""
         file = self.path / STATE
         try:
-            return State.model_validate_json(file.read_bytes(), strict=True)
+            return State.model_validate_json(read_bytes(file), strict=True)
         except ValidationError as error:
             raise InputError(
                 f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"

@@ -123,6 +123,11 @@ def posed(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -
     return written(lambda case: case.poses(change, only))
 
 
+def by_colmap(plant: Plant) -> Plant:
+    """One back end tries, and not each in turn: they read the same pictures."""
+    return lambda case: [*plant(case), "--backend", "colmap"]
+
+
 def bomb(path: Path) -> None:
     """A PNG whose header promises 60000 x 60000 pixels, with little behind it."""
     data = path.read_bytes()
@@ -260,7 +265,7 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         "registered 0 of 6",  # read as it should be: the other pictures are noise
     ),
     "CMYK picture": (
-        picture(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF")),
+        by_colmap(picture(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),
         3,
         "registered 0 of 6",
     ),
@@ -281,7 +286,11 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         2,
         "same picture",
     ),
-    "one black picture": (picture(lambda p: Image.new("RGB", SIZE).save(p)), 3, "registered 0 of 6"),
+    "one black picture": (
+        by_colmap(picture(lambda p: Image.new("RGB", SIZE).save(p))),
+        3,
+        "registered 0 of 6",
+    ),
     "one picture of another size": (
         picture(lambda p: Image.new("RGB", (48, 36)).save(p)),
         2,
@@ -420,7 +429,7 @@ def test_the_evil_file_would_be_written_where_it_is_looked_for(tmp_path: Path):
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(done, out)
-    assert dispatch(["calibrate", str(sound), str(out), "--quiet"]) == 3
+    assert dispatch(["calibrate", str(sound), str(out), "--backend", "colmap", "--quiet"]) == 3
     assert read_calibration(out).gripper_from_camera is None
     assert {path.name for path in out.iterdir()} == {".lock", "calibration.json", "log.txt", "report.html"}
     capsys.readouterr()

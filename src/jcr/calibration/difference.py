@@ -27,7 +27,7 @@ class Difference:
     """Squared Mahalanobis distance, of 6 degrees of freedom where errors of the two are independent."""
     p_value: float | None
     explained_by: dict[str, float]
-    """Shares of it, by cause, largest first; their sum is 1."""
+    """Shares of it, by cause, largest first; their sum is 1. Empty where there is no difference."""
 
 
 def difference(ours: Known, other: Known) -> Difference:
@@ -48,12 +48,12 @@ def difference(ours: Known, other: Known) -> Difference:
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
-    shares = {name: float(weighed @ part @ weighed) / squared for name, part in parts.items()}
+    explained = {name: float(weighed @ part @ weighed) for name, part in parts.items()} if squared else {}
     return Difference(
         step[:3],
         step[3:],
         np.abs(step) / std,
         squared,
         float(chi2.sf(squared, 6)),
-        dict(sorted(shares.items(), key=lambda item: -item[1])),
+        {name: part / squared for name, part in sorted(explained.items(), key=lambda item: -item[1])},
     )

@@ -14,6 +14,7 @@ from PIL import Image, ImageOps
 
 from jcr import deflate
 from jcr.errors import InputError
+from jcr.files import require_file
 
 MAX_PIXELS = 64_000_000
 """Larger than any wrist camera; a decompression bomb is refused before it is unpacked."""
@@ -39,6 +40,7 @@ DARK, BRIGHT = 12, 243
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
     """RGB (h,w,3) uint8, turned upright by its EXIF tag; InputError when the file is no readable image."""
+    require_file(path)
     try:
         with warnings.catch_warnings():
             # Pillow's own bomb warning would end a run that treats warnings as errors; our limit is lower.

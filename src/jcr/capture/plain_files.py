@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray
 
 from jcr.errors import InputError
+from jcr.files import read_bytes, require_file
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -22,7 +23,7 @@ LONGEST_SHOWN = 80
 def read_text(file: Path) -> str:
     """The text of a file; InputError when it is missing, binary, compressed or not UTF-8."""
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); name a file that is there") from None
     if data[:2] == b"\x1f\x8b":
@@ -94,8 +95,11 @@ def first_fault(error: "ValidationError") -> str:
 def read_npy(file: Path) -> ndarray:
     """The array that numpy.save wrote, never objects; InputError for any other file."""
     try:
+        require_file(file)
         with file.open("rb") as stream:
             return np.lib.format.read_array(stream, allow_pickle=False)
+    except InputError:
+        raise
     except Exception as error:  # NumPy reads a header with Python's own parser, which has errors of its own
         raise InputError(f"{file}: not a NumPy array of numbers ({error}); save it with numpy.save") from None
 
@@ -111,7 +115,11 @@ def contained(folder: Path, name: str, where: str) -> Path:
             f"{where}: {shown(name)} is no path inside the capture; use one relative to {folder}"
         )
     target = folder / name
-    if not target.resolve().is_relative_to(folder.resolve()):
+    try:
+        inside = target.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):
+        raise InputError(f"{where}: {name!r} is a link that leads back to itself; put a file there") from None
+    if not inside:
         raise InputError(f"{where}: {name!r} leads out of {folder}; copy the image into the capture")
     if target.exists() and not target.is_file():  # to open a pipe would be to wait for ever
         raise InputError(f"{where}: {name!r} is a folder, a pipe or a device; name the image's file")

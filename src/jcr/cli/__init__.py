@@ -66,6 +66,10 @@ _DISK = {
     errno.EACCES: "choose a folder that you may write, or files that you may read",
     errno.EPERM: "choose a folder that you may write, or files that you may read",
     errno.EIO: "the disk fails; copy what is on it and choose another",
+    errno.EISDIR: "a folder is where a file belongs; move it away",
+    errno.ENOTDIR: "a file is where a folder belongs; move it away",
+    errno.ELOOP: "a link leads back to itself; put a file or a folder there",
+    errno.ENAMETOOLONG: "choose a shorter name",
 }
 """What the machine, not the program, has wrong, and the cure."""
 
@@ -138,7 +142,10 @@ def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str])
             raise
         if error.filename is None:
             _write_no_more()
-        return _fail(2, f"{error.filename or 'the output'}: {error.strerror}; {_DISK[error.errno]}")
+        named = (
+            error.filename2 or error.filename or "the output"
+        )  # of a renaming, what it would have replaced
+        return _fail(2, f"{named}: {error.strerror}; {_DISK[error.errno]}")
     except BaseException as error:
         if not _interrupted(error):
             raise

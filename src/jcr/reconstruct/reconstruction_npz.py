@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jcr.capture.plain_files import first_fault, shown
 from jcr.errors import InputError
-from jcr.files import written_whole
+from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import CameraEvidence, Reconstruction, Tracks
@@ -74,6 +74,7 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
+    require_file(path)
     try:
         # NumPy leaves a file open that it cannot read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jcr.errors import InputError
-from jcr.files import write_bytes
+from jcr.files import read_bytes, write_bytes
 from jcr.records import PointCloud
 
 _VERTEX = np.dtype(
@@ -54,7 +54,7 @@ def write_cloud(path: Path, cloud: PointCloud, notes: Mapping[str, str] | None =
 def read_cloud(path: Path) -> PointCloud:
     """The cloud that `write_cloud` wrote; raises InputError for any other file."""
     try:
-        header, separator, body = path.read_bytes().partition(b"end_header\n")
+        header, separator, body = read_bytes(path).partition(b"end_header\n")
         lines = header.decode().splitlines()
     except OSError as error:
         raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None

@@ -15,7 +15,7 @@ from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
-from jcr.files import write_bytes, write_text
+from jcr.files import read_bytes, write_bytes, write_text
 from jcr.geometry import apply
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
@@ -96,7 +96,7 @@ def read_truth(folder: Path) -> Truth:
         raise InputError(f"{path}: not found; only captures made by jcr simulate have the truth")
     read_json(path)  # says what is no JSON
     try:
-        content = _Content.model_validate_json(path.read_bytes(), strict=True)
+        content = _Content.model_validate_json(read_bytes(path), strict=True)
     except ValidationError as error:
         raise InputError(f"{path}: {first_fault(error)}; simulate the capture again") from None
     parts = {name: value for name, value in vars(content).items() if name not in ("format", "depth_unit_m")}
