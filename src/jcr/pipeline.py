@@ -75,7 +75,9 @@ def calibrate(
 def calibrate_poses(
     pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
 ) -> PosesResult:
-    """calibration.json in the folder `out` from camera poses that were given, without images."""
+    """calibration.json and report in the folder `out` from camera poses that were given, without images."""
+    from jcr.report.html import poses_report_html
+
     with held(Path(out)) as folder:
         start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
@@ -83,7 +85,10 @@ def calibrate_poses(
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
         folder.forget_reconstruction()
         folder.keep_calibration(content)
-        return PosesResult(folder.path, content, hand_eye, hand_eye.converged and is_one(hand_eye))
+        is_metric = hand_eye.converged and is_one(hand_eye)
+        result = PosesResult(folder.path, pairs, content, hand_eye, is_metric)
+        folder.keep_report(poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())}))
+        return result
 
 
 def build_map(

@@ -287,6 +287,27 @@ class ScaleCheck:
 
 
 @dataclass(frozen=True)
+class Requirement:
+    """How exact the camera on the gripper must be known, and how exact it is; 95 % of errors are smaller."""
+
+    translation_mm: float
+    rotation_deg: float
+    asked: bool
+    """By the user; else the default, for grasping."""
+    distance_mm: float
+    """Of the point that the translation is of, ahead of the camera; 0: the camera itself."""
+    reached_mm: float
+    reached_deg: float
+    more_images: int | None = None
+    """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the errors are within what is required."""
+        return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
+
+
+@dataclass(frozen=True)
 class HandEye:
     """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
 
@@ -338,6 +359,8 @@ class HandEye:
     """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
     next_poses: tuple[NextPose, ...] = ()
     """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
+    requirement: Requirement | None = None
+    """None where the solver was asked and not the calibration stage."""
 
 
 @dataclass(frozen=True)

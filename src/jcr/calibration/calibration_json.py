@@ -25,6 +25,7 @@ from jcr.records import (
     Intrinsics,
     PosePairs,
     Reconstruction,
+    Requirement,
 )
 from jcr.rounding import significant
 
@@ -213,6 +214,8 @@ class CalibrationFile(_Part):
     scale_check: NetworkScale | None = None
     robot_errors: RobotErrors | None = None
     angle_ratio: AngleRatio | None = None
+    requirement: Requirement | None = None
+    """None of files of earlier versions, and where nothing was found."""
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
 
@@ -317,6 +320,7 @@ def calibration_file(
             ],
         ),
         angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
+        requirement=hand_eye.requirement,
         attempts=list(attempts),
     )
 

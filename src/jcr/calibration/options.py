@@ -1,15 +1,22 @@
 """How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
 class CalibrateOptions:
     """How the hand-eye calibration is found."""
 
-    robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
+    require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """How exact the camera on the gripper must be known: 95 % of errors smaller than this, else exit status 3. Unset:
+    5 mm and 1°, enough to grasp with, and a calibration that is less exact gives a warning."""
+    require_at: Literal["camera", "scene"] = "camera"
+    """Where the millimetres of --require count: scene is what the camera looks at, where rotation moves it too."""
+    robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """One-sigma noise of the gripper poses per axis, at least; the data may say more."""
     scale: float | None = None
     """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
     robot: str | None = None

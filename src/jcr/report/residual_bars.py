@@ -11,11 +11,11 @@ from jcr.calibration.words import missed
 from jcr.records import HandEye
 from jcr.report.markup import filled
 from jcr.report.pictures import shown_names
-from jcr.results import RunResult
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 
-def residuals_section(result: RunResult) -> str:
+def residuals_section(result: RunResult | PosesResult) -> str:
     """Residuals image by image and of the whole, before and after the images' features refined the fit."""
     now, refinement = result.hand_eye, result.hand_eye.refinement
     rows, used = [], now.inliers
@@ -25,7 +25,7 @@ def residuals_section(result: RunResult) -> str:
         for residual in (_residual_mm, _residual_deg)
     )
     names = shown_names(result.calibration.images)
-    for k, row in enumerate(result.reconstruction.image_index):
+    for k, row in enumerate(result.image_index):
         position = _bar([_residual_mm(fit)[k] for fit in fits], longest_mm, " mm")
         orientation = _bar([_residual_deg(fit)[k] for fit in fits], longest_deg, "°")
         rows.append(
@@ -74,7 +74,7 @@ def _bar(values: Sequence[float], longest: float, unit: str) -> str:
 def _whole(fits: Sequence[HandEye]) -> str:
     held_out = [missed(fit.held_out) if fit.held_out else "–" for fit in fits]
     rows = {
-        "held-out error": held_out,
+        "leave-one-out error": held_out,
         "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residual_translation)} mm" for fit in fits],
         "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residual_rotation) for fit in fits],
     }

@@ -70,9 +70,13 @@ class Viewer:
         lines = []
         if not calibration.converged:
             lines.append(f"**Do not trust this calibration:** {calibration.warnings[0]}")
-        elif held_out is not None:
+        elif (short := shortfall(calibration)) is not None:
+            lines.append(f"**{short}**")
+        elif calibration.requirement is not None:
+            lines.append(f"**Trusted:** {reached_in_words(calibration.requirement)}")
+        if calibration.converged and held_out is not None:
             lines.append(
-                f"Held-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
+                f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
                 f"{len(self.run.image)} cameras."
             )
         return "\n\n".join([*lines, *self.run.notes])
