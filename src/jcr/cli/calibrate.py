@@ -31,8 +31,8 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     output: Output = field(default_factory=Output)
 
 
