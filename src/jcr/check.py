@@ -126,7 +126,9 @@ class _Held:
 def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
     joints = None if capture.joints is None else capture.joints[rows]
     names = tuple(capture.images[row] for row in rows)
-    return replace(capture, images=names, base_from_gripper=capture.base_from_gripper[rows], joints=joints)
+    return replace(
+        capture, images=names, base_from_gripper=capture.base_from_gripper[rows], joints=joints, depths=None
+    )
 
 
 def _registered(

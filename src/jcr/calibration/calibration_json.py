@@ -20,6 +20,7 @@ from jcr.records import (
     COVARIANCE_ORDER,
     Attempt,
     Capture,
+    DepthCheck,
     HandEye,
     ImageVerdict,
     Intrinsics,
@@ -214,6 +215,7 @@ class CalibrationFile(_Part):
     scale_check: NetworkScale | None = None
     robot_errors: RobotErrors | None = None
     angle_ratio: AngleRatio | None = None
+    depth_check: DepthCheck | None = None
     requirement: Requirement | None = None
     """None of files of earlier versions, and where nothing was found."""
     attempts: list[Attempt] = []
@@ -320,6 +322,7 @@ def calibration_file(
             ],
         ),
         angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
+        depth_check=hand_eye.depth_check,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
     )

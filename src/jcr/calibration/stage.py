@@ -11,6 +11,7 @@ from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
@@ -83,6 +84,8 @@ def calibrate(
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
+    if hand_eye.converged:
+        hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
     return advised(hand_eye, capture.base_from_gripper[reconstruction.image_index], options)
 
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.records import Attempt, HeldOut, Requirement, ScaleCheck
+from jcr.records import Attempt, DepthCheck, HeldOut, Requirement, ScaleCheck
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
@@ -73,6 +73,8 @@ def found(content: "CalibrationFile") -> list[str]:
         lines.insert(-1, f"  of which: {parts}")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
+    if content.depth_check is not None:
+        lines.append(depth_in_words(content.depth_check))
     lines += robot_in_words(content)
     if (held_out := content.held_out) is not None:
         lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
@@ -218,6 +220,19 @@ def missed(held_out: "HeldOut | HeldOutError") -> str:
 def pixels(held_out: "HeldOut | HeldOutError") -> str:
     """The same in their pictures, to follow it; empty where no picture tells."""
     return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
+
+
+def depth_in_words(check: DepthCheck) -> str:
+    """What the robot says of a depth camera: its scale, and its noise near and far."""
+    off, std = check.off_percent, check.std_percent
+    size = f"{abs(off):.2g} ± {std:.1g} % too {'long' if off > 0 else 'short'} by the robot"
+    if abs(off) < 2 * std:
+        size = f"right by the robot ({off:+.2g} ± {std:.1g} %)"
+    noise = " and ".join(
+        f"{significant(1e3 * float(np.hypot(check.noise_m, check.noise_per_m * z**2)))} mm at {z:.2f} m"
+        for z in check.distances_m
+    )
+    return f"depth camera: its lengths are {size}; noise {noise} (1 σ); the map has them corrected"
 
 
 def scale_in_words(check: "ScaleCheck | NetworkScale") -> str:

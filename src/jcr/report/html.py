@@ -7,6 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
@@ -239,6 +240,15 @@ def _details(
         }
     if (uncertainty := calibration.uncertainty) is not None and uncertainty.budget is not None:
         blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)
+    if (check := calibration.depth_check) is not None:
+        blocks["Depth camera"] = {
+            "its lengths, by the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
+            **{
+                f"noise at {z:.2f} m, 1 σ": f"{significant(1e3 * float(check.std_m(np.array(z))))} mm"
+                for z in check.distances_m
+            },
+            "looked at": f"{check.features} features of {check.images} images",
+        }
     if robot := _robot(calibration):
         blocks["Robot"] = robot
     if map_history:
