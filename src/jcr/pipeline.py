@@ -15,6 +15,7 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
+from jcr.calibration.words import shortfall
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
 from jcr.mapping import mapped, measured, require_map
@@ -163,6 +164,9 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
     content = calibration_file(
         capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
     )
+    if not options.reconstruct.board and (not content.converged or shortfall(content) is not None):
+        board = proposed([read_image(capture.folder / name) for name in capture.images])
+        content = content.model_copy(update={"warnings": [*content.warnings, *filter(None, [board])]})
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
 

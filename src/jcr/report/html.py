@@ -1,6 +1,7 @@
 """report.html: one file that says whether to trust a calibration, hands it over, and shows what was found."""
 
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import metadata
@@ -24,6 +25,7 @@ from jcr.calibration.words import (
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics
+from jcr.report.features import features_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.map_pictures import map_section
 from jcr.report.map_samples import sample_surface
@@ -45,6 +47,8 @@ MAIN = ("Translation, 1 σ", "Rotation, 1 σ")
 
 ANY_LENS = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
 """Of the cameras that are drawn where nobody says what they saw."""
+BOARD = r"a calibration board is in view[^;]*"
+"""As reconstruct/board_in_view.py proposes one."""
 Options = Mapping[str, Mapping[str, Any]]
 """A stage's name, and its options by name."""
 
@@ -68,6 +72,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         transform_section(hand_eye),
         scene_section(result, base_from_camera, surface),
         images_section(result),
+        features_section(result),
         residuals_section(result),
         motion_section(result),
         _before_after(
@@ -104,20 +109,37 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
     """The report of a run that found no camera poses: why, with the cure, and the images."""
-    reason = escape(calibration.doubt or "")
-    verdict = f"<h2><b>No calibration:</b> {reason}.</h2><p>Nothing was calibrated and nothing mapped.</p>"
     cards = "".join(
-        f'<figure><img src="{url}" alt="{escape(name)}"><figcaption><span class="file">{escape(name)}</span>'
-        "</figcaption></figure>"
+        f'<figure><div class="shot"><img src="{url}" alt="{escape(name)}"></div>'
+        f'<figcaption><span class="file">{escape(name)}</span></figcaption></figure>'
         for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
     )
     say = "What the camera saw. Without texture, overlap or light no features are found in them."
     sections = [
-        f'<section class="verdict bad">{verdict}</section>',
+        _failure(calibration),
         filled("images.html", say=say, about="", cards=cards),
         _details(calibration, options or {}),
     ]
     return _page(capture.folder, calibration, sections)
+
+
+def _failure(calibration: CalibrationFile) -> str:
+    """What is wrong in one sentence, what to do, and below it what each back end that was tried said."""
+    last = calibration.attempts[-1].why_not if calibration.attempts else calibration.doubt
+    fault, *remedies = (last or calibration.doubt or "").split("; ")
+    if board := re.search(BOARD, calibration.doubt or ""):
+        remedies.insert(0, board[0])
+    items = "".join(
+        f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
+        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: {escape(attempt.why_not or '')}</li>"
+        for attempt in calibration.attempts
+    )
+    tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
+    remedy = f'<p class="remedy">{escape("; ".join(remedies))}.</p>' if remedies else ""
+    return (
+        f'<section class="verdict bad" id="verdict"><h2><b>No calibration: {escape(fault)}.</b></h2>{remedy}'
+        f"<p>Nothing was calibrated and nothing mapped.</p>{tried}</section>"
+    )
 
 
 def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -> str:
@@ -127,9 +149,19 @@ def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -
         about=f"{len(calibration.images)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
         style=(PAGE / "page.css").read_text(),
         sections="\n".join(sections),
+        links=_links(sections),
         scene3d=(PAGE / "scene3d.js").read_text(),
         copy=(PAGE / "copy.js").read_text(),
+        large=(PAGE / "large.js").read_text(),
     )
+
+
+def _links(sections: Sequence[str]) -> str:
+    """To each section that has a heading."""
+    found = [
+        re.search(r'<section[^>]* id="([^"]+)"[^>]*>\s*<h2>([^<]+)</h2>', section) for section in sections
+    ]
+    return "".join(f'<a href="#{part[1]}">{part[2]}</a>' for part in found if part)
 
 
 def _verdict(calibration: CalibrationFile) -> str:
@@ -204,7 +236,7 @@ def _warnings(calibration: CalibrationFile) -> str:
     if not calibration.remarks:
         return ""
     items = "".join(f"<li>{escape(remark)}</li>" for remark in calibration.remarks)
-    return f'<section class="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
+    return f'<section class="warnings" id="warnings"><h2>Good to know</h2><ul>{items}</ul></section>'
 
 
 def _before_after(

@@ -45,6 +45,7 @@ def residuals_section(result: RunResult | PosesResult) -> str:
         )
     return filled(
         "residuals.html",
+        noise=_why_noise_is_larger(now),
         tick=tick,
         rows="".join(rows),
         heads="".join(f"<th>{head}</th>" for head in heads),
@@ -59,6 +60,20 @@ def _residual_mm(fit: HandEye) -> Float[ndarray, " n"]:
 
 def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
     return np.degrees(fit.rotation_residual_rad)
+
+
+def _why_noise_is_larger(fit: HandEye) -> str:
+    """Why the robot's noise per axis is not the size of the residuals."""
+    count = 6 * int(fit.inliers.sum())
+    taken = np.sqrt(count / max(count - 13, 1))
+    noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
+    return (
+        f"The robot's noise ({significant(1e3 * noise)} mm per axis"
+        + (f", {significant(1e3 * together)} mm with systematic errors" if together > 1.05 * noise else "")
+        + f") may be more than what these bars suggest: 13 unknowns were fitted to {count} numbers and took part of it "
+        f"away (a factor of {taken:.2f}), features pull the poses towards them, and of few images its size is itself "
+        "uncertain, which is counted. A bar is the length of three axes together."
+    )
 
 
 def _bar(values: Sequence[float], longest: float, unit: str) -> str:

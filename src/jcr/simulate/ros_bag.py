@@ -47,7 +47,7 @@ def write_bag(
 ) -> Path:
     """A bag in which the arm stops at every view of a capture and moves smoothly between them.
 
-    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Other topics:
+    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
     /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
     /tf_static (world to base_link).
     """
