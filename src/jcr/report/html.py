@@ -47,6 +47,20 @@ MAIN = ("Translation, 1 σ", "Rotation, 1 σ")
 
 ANY_LENS = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
 """Of the cameras that are drawn where nobody says what they saw."""
+LINKS = {
+    "warnings": "Good to know",
+    "transform": "Transform",
+    "view": "3D",
+    "images": "Images",
+    "features": "Features",
+    "residuals": "Residuals",
+    "uncertainty": "Uncertainty",
+    "before-after": "Before and after",
+    "map": "Map",
+    "objects": "Objects",
+    "details": "Details",
+}
+"""To the sections, by their names in the page."""
 BOARD = r"a calibration board is in view[^;]*"
 """As reconstruct/board_in_view.py proposes one."""
 Options = Mapping[str, Mapping[str, Any]]
@@ -131,14 +145,15 @@ def _failure(calibration: CalibrationFile) -> str:
         remedies.insert(0, board[0])
     items = "".join(
         f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
-        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: {escape(attempt.why_not or '')}</li>"
+        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: {escape((attempt.why_not or '').split('; ')[0])}</li>"
         for attempt in calibration.attempts
     )
     tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
-    remedy = f'<p class="remedy">{escape("; ".join(remedies))}.</p>' if remedies else ""
+    cures = "".join(f"<li>{escape(words[0].upper() + words[1:])}.</li>" for words in remedies)
+    remedy = f'<h3>What helps</h3><ul class="attempts">{cures}</ul>' if cures else ""
     return (
         f'<section class="verdict bad" id="verdict"><h2><b>No calibration: {escape(fault)}.</b></h2>{remedy}'
-        f"<p>Nothing was calibrated and nothing mapped.</p>{tried}</section>"
+        f"{tried}</section>"
     )
 
 
@@ -158,10 +173,8 @@ def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -
 
 def _links(sections: Sequence[str]) -> str:
     """To each section that has a heading."""
-    found = [
-        re.search(r'<section[^>]* id="([^"]+)"[^>]*>\s*<h2>([^<]+)</h2>', section) for section in sections
-    ]
-    return "".join(f'<a href="#{part[1]}">{part[2]}</a>' for part in found if part)
+    found = [name for section in sections for name in re.findall(r'<section[^>]* id="([^"]+)"', section)]
+    return "".join(f'<a href="#{name}">{LINKS[name]}</a>' for name in found if name in LINKS)
 
 
 def _verdict(calibration: CalibrationFile) -> str:
@@ -261,7 +274,8 @@ def _details(
     timings = calibration.timings_s
     blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
     blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
-    for k, attempt in enumerate(calibration.attempts, start=1):
+    found = calibration.gripper_from_camera is not None  # else the failure has told of them
+    for k, attempt in enumerate(calibration.attempts if found else [], start=1):
         blocks["Time"][f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
     if (lens := calibration.intrinsics) is not None:
         blocks["Lens"] = {
