@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.records import PointCloud
+from jcr.camera import rays
+from jcr.records import Intrinsics, PointCloud
 
 TABLE_HALF = np.array([0.4, 0.35, 0.02])
 """Its top is z = 0."""
@@ -77,6 +78,27 @@ def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int
         camera_centers_in_base=centers,
         label_names=LABELS,
     )
+
+
+def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:
+    """base_from_camera of the ring, at different distances and turned about their axes."""
+    poses = np.tile(np.eye(4), (cameras, 1, 1))
+    for k, center in enumerate(camera_centers(cameras)):
+        z = -center / np.linalg.norm(center)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        x = np.cos(0.5 * k) * x + np.sin(0.5 * k) * np.cross(z, x)
+        poses[k, :3, :3] = np.stack([x, np.cross(z, x), z], 1)
+        poses[k, :3, 3] = center * (0.7 + 0.05 * (k % 5)) / 0.7
+    return poses
+
+
+def cast_depth(base_from_camera: Float[ndarray, "4 4"], lens: Intrinsics) -> Float[ndarray, "h w"]:
+    """Depth along the optical axis (m) at every pixel; 0 where nothing is hit."""
+    ray = rays(lens).reshape(-1, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    reach, _ = _cast(base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T)
+    return np.where(np.isfinite(reach), reach * ray[:, 2], 0.0).reshape(lens.height, lens.width)
 
 
 def _cast(origin: ndarray, ray: ndarray) -> tuple[ndarray, ndarray]:

@@ -1,9 +1,9 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.words import angles_in_words
@@ -21,6 +21,9 @@ from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs, Reconstruction
+
+QUICK, QUICK_SIZE_PX = 8, 800
+"""Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,13 @@ def check(
     reach: Float[ndarray, "2 3"] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    thorough: bool = False,
 ) -> Examination:
     """Examine a capture; with `look` its pictures are registered sparsely to hold the poses against them.
 
-    Where the cameras' poses were given instead, the gripper's are held against those.
+    A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
+    `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
+    held against those.
 
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis.
     """
@@ -78,30 +84,25 @@ def check(
             f"the gripper moves by at most {1e3 * move:.2g} mm while it turns by {np.degrees(turn):.0f}°: "
             "positions that were divided by 1000 look so"
         )
-    hand_eye, ratio, faults = None, None, []
-    found: Reconstruction | PosePairs | None = capture if isinstance(capture, PosePairs) else None
-    if look and isinstance(capture, Capture):
-        try:
-            found = reconstruct(capture, ColmapOptions(seed=seed, dense=False), progress)
-            remarks += [*found.warnings, *found.notes]
-        except NotTrustedError as error:
-            remarks.append(str(error))
-            if (
-                board := proposed([read_image(capture.folder / name) for name in capture.images])
-            ) is not None:
-                remarks.append(board)
-    if found is not None:
-        used = gripper[found.image_index]
-        hand_eye = solve_hand_eye(used, found.recon_from_camera, robot_noise=robot_noise)
-        if (reading := better_reading(used, found.recon_from_camera)) is not None:
-            faults.append(explained(reading))
-        faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
-        if hand_eye.converged and hand_eye.inliers.sum() >= 3:
-            ratio = angle_ratio(used[hand_eye.inliers], found.recon_from_camera[hand_eye.inliers])
-            remarks += angles_in_words(*ratio)
+    held, quick = None, False
+    if isinstance(capture, PosePairs):
+        held = _held_against(gripper, capture, robot_noise)
+    elif look and not thorough and len(capture) > QUICK:
+        rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
+        held, _ = _registered(_of_rows(capture, rows), robot_noise, seed, progress, QUICK_SIZE_PX)
+        if held is not None and (held.faults or not held.hand_eye.inliers.all()):
+            held = None
+        quick = held is not None
+    if held is None and look and isinstance(capture, Capture):
+        held, notes = _registered(capture, robot_noise, seed, progress)
+        remarks += notes
+    hand_eye, ratio = (None, None) if held is None else (held.hand_eye, held.ratio)
+    faults = [] if held is None else [*held.faults]
+    if ratio is not None:
+        remarks += angles_in_words(*ratio)
     trusted = hand_eye is not None and hand_eye.converged
     x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
-    seen = hand_eye.observability if hand_eye is not None else observability(gripper)
+    seen = observability(gripper, x) if hand_eye is None or quick else hand_eye.observability
     if hand_eye is None:
         faults += [f"{name}; {cure}" for name, cure in zip(seen.unobservable, seen.advice, strict=False)]
     noise = robot_noise or ASSUMED_NOISE
@@ -111,6 +112,59 @@ def check(
     return Examination(
         sharp, move, turn, seen, expected, tuple(suggestions), hand_eye, ratio, tuple(faults), tuple(remarks)
     )
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Gripper poses held against cameras."""
+
+    hand_eye: HandEye
+    ratio: tuple[float, float] | None
+    faults: tuple[str, ...]
+
+
+def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
+    joints = None if capture.joints is None else capture.joints[rows]
+    names = tuple(capture.images[row] for row in rows)
+    return replace(
+        capture, images=names, base_from_gripper=capture.base_from_gripper[rows], joints=joints, depths=None
+    )
+
+
+def _registered(
+    capture: Capture,
+    robot_noise: tuple[float, float] | None,
+    seed: int,
+    progress: Progress | None,
+    size_px: int | None = None,
+) -> tuple[_Held | None, list[str]]:
+    """The gripper poses held against cameras that features find, and what else that shows; None where none are found."""
+    options = ColmapOptions(seed=seed, dense=False)
+    if size_px is not None:
+        options = replace(options, working_size_px=size_px)
+    try:
+        found = reconstruct(capture, options, progress)
+    except NotTrustedError as error:
+        if size_px is not None:
+            return None, []
+        board = proposed([read_image(capture.folder / name) for name in capture.images])
+        return None, [str(error)] if board is None else [str(error), board]
+    return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise), [*found.warnings, *found.notes]
+
+
+def _held_against(
+    used: Float[ndarray, "m 4 4"],
+    found: Reconstruction | PosePairs,
+    robot_noise: tuple[float, float] | None,
+) -> _Held:
+    camera = found.recon_from_camera
+    hand_eye, ratio = solve_hand_eye(used, camera, robot_noise=robot_noise), None
+    reading = better_reading(used, camera)
+    faults = [] if reading is None else [explained(reading)]
+    faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
+    if hand_eye.converged and hand_eye.inliers.sum() >= 3:
+        ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])
+    return _Held(hand_eye, ratio, tuple(faults))
 
 
 def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:

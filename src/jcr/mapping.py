@@ -11,6 +11,7 @@ from jcr.reconstruct.backends import ReconstructOptions, device_of
 from jcr.records import Capture, PointCloud
 from jcr.represent.cloud import point_cloud
 from jcr.represent.map_file import require_packages
+from jcr.represent.measured_depth import with_measured_depth
 from jcr.results import RunOptions, RunResult
 from jcr.segment.measure import Measured, measure
 from jcr.segment.segments import image_labels, label_cloud
@@ -47,14 +48,16 @@ def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Pro
 
     assert options.map is not None  # or this stage is left out
     device = device_of(options.reconstruct)
-    cloud, notes = _cloud(_extended(result, added, options, progress), options, progress)
+    result = _extended(result, added, options, progress)
+    reconstruction, remarks = with_measured_depth(result.capture, result.reconstruction, result.hand_eye)
+    cloud, notes = _cloud(replace(result, reconstruction=reconstruction), options, progress)
     give_back()
     scene = build_scene(cloud, options.map, progress, device=device)
     try:
         sizes = measured(cloud, result.calibration)
     except InputError:
         sizes = None
-    return Mapped(cloud, scene, sizes, notes)
+    return Mapped(cloud, scene, sizes, (*remarks, *notes))
 
 
 def measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:

@@ -15,6 +15,7 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
+from jcr.calibration.words import shortfall
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
 from jcr.mapping import mapped, measured, require_map
@@ -75,7 +76,9 @@ def calibrate(
 def calibrate_poses(
     pairs: PosePairs, out: str | Path, options: CalibrateOptions | None = None
 ) -> PosesResult:
-    """calibration.json in the folder `out` from camera poses that were given, without images."""
+    """calibration.json and report in the folder `out` from camera poses that were given, without images."""
+    from jcr.report.html import poses_report_html
+
     with held(Path(out)) as folder:
         start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
@@ -83,7 +86,10 @@ def calibrate_poses(
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
         folder.forget_reconstruction()
         folder.keep_calibration(content)
-        return PosesResult(folder.path, content, hand_eye, hand_eye.converged and is_one(hand_eye))
+        is_metric = hand_eye.converged and is_one(hand_eye)
+        result = PosesResult(folder.path, pairs, content, hand_eye, is_metric)
+        folder.keep_report(poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())}))
+        return result
 
 
 def build_map(
@@ -158,6 +164,9 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
     content = calibration_file(
         capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
     )
+    if not options.reconstruct.board and (not content.converged or shortfall(content) is not None):
+        board = proposed([read_image(capture.folder / name) for name in capture.images])
+        content = content.model_copy(update={"warnings": [*content.warnings, *filter(None, [board])]})
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
 

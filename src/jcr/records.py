@@ -80,6 +80,8 @@ class Capture:
     """Of the arm, where it was given."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were turned upright, and the camera frame is theirs."""
+    depths: tuple[str | None, ...] | None = None
+    """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -289,6 +291,49 @@ class ScaleCheck:
 
 
 @dataclass(frozen=True)
+class DepthCheck:
+    """A depth camera's lengths against the robot's, at features whose depth the images and the robot give."""
+
+    off_percent: float
+    """By how much its lengths are too long (negative: too short)."""
+    std_percent: float
+    """One-sigma uncertainty of that, the robot's own scale included."""
+    noise_m: float
+    noise_per_m: float
+    """One sigma of a depth z, its scale corrected, is hypot(noise_m, noise_per_m · z²)."""
+    distances_m: tuple[float, float]
+    """Nearest and farthest of the features (5 % and 95 %): beyond, the noise is extrapolated."""
+    images: int
+    features: int
+
+    def std_m(self, depth: Float[ndarray, "*any"]) -> Float[ndarray, "*any"]:
+        """One sigma (m) of corrected depths (m), what is unknown of the scale included."""
+        common = 0.01 * self.std_percent * depth
+        return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """How exact the camera on the gripper must be known, and how exact it is; 95 % of errors are smaller."""
+
+    translation_mm: float
+    rotation_deg: float
+    asked: bool
+    """By the user; else the default, for grasping."""
+    distance_mm: float
+    """Of the point that the translation is of, ahead of the camera; 0: the camera itself."""
+    reached_mm: float
+    reached_deg: float
+    more_images: int | None = None
+    """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the errors are within what is required."""
+        return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
+
+
+@dataclass(frozen=True)
 class HandEye:
     """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
 
@@ -340,6 +385,10 @@ class HandEye:
     """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
     next_poses: tuple[NextPose, ...] = ()
     """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
+    depth_check: DepthCheck | None = None
+    """None without depth images, or where too few features have a depth."""
+    requirement: Requirement | None = None
+    """None where the solver was asked and not the calibration stage."""
 
 
 @dataclass(frozen=True)

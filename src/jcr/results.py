@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics, PointCloud, Reconstruction
+from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
@@ -52,6 +52,11 @@ class RunResult:
     def converged(self) -> bool:
         """Whether the calibration may be trusted."""
         return self.hand_eye.converged
+
+    @property
+    def image_index(self) -> Int[ndarray, " m"]:
+        """Rows of the images that have a camera pose."""
+        return self.reconstruction.image_index
 
     @property
     def lens(self) -> Intrinsics:
@@ -96,6 +101,7 @@ class PosesResult:
     """What camera poses that were given say, without images."""
 
     out: Path
+    pairs: PosePairs
     calibration: CalibrationFile
     hand_eye: HandEye
     scale_is_one: bool
@@ -105,3 +111,8 @@ class PosesResult:
     def converged(self) -> bool:
         """Whether the calibration may be trusted."""
         return self.hand_eye.converged
+
+    @property
+    def image_index(self) -> Int[ndarray, " m"]:
+        """Rows of the samples that have a camera pose: all."""
+        return self.pairs.image_index

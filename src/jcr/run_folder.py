@@ -48,7 +48,7 @@ CLOUD, REPORT = "cloud.ply", "report.html"
 OF_RECONSTRUCTION = (STATE, RECONSTRUCTION)
 OF_CALIBRATION = (CLOUD, MAP, REPORT)
 """What holds of one calibration alone."""
-PASSING = {"timings_s", "warnings", "notes", "version", "attempts"}
+PASSING = {"timings_s", "warnings", "notes", "version", "attempts", "requirement", "next_poses"}
 """Of calibration.json: what may differ between two of the same calibration."""
 
 

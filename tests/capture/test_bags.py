@@ -3,7 +3,9 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,9 +14,12 @@ import pytest
 import capture_writers as writers
 import jcr
 from jcr.capture.best_frames import best_frames
+from jcr.capture.depth_images import read_depth
+from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
-from jcr.capture.ros_image import picture_of
+from jcr.capture.ros_image import depth_of, picture_of
+from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture
 from jcr.simulate.problem import hand_eye_problem
@@ -53,6 +58,49 @@ def test_the_stops_of_the_arm_are_found_in_every_storage(tmp_path: Path, capture
         # What was read is a capture folder itself.
         again = jcr.read_capture(tmp_path / f"{kind}-frames")
         assert (again.base_from_gripper == got.base_from_gripper).all() and again.images == got.images
+
+
+@pytest.mark.slow
+def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Capture):
+    width, height = capture.image_size
+    few = capture.base_from_gripper[:4]
+    for k, name in enumerate(capture.images[:4]):
+        write_bytes(tmp_path / name, (capture.folder / name).read_bytes())
+        depth = np.full((height, width), 500 + k, np.uint16)
+        depth[:, : 10 * k] = 0
+        write_bytes(tmp_path / f"depth/{k}.png", encode_png(depth))
+    names = tuple(f"depth/{k}.png" for k in range(4))
+    taken = replace(capture, folder=tmp_path, images=capture.images[:4], base_from_gripper=few, depths=names)
+    bag = write_bag(tmp_path / "scan", taken, "mcap", 4.0, fps=5.0, tf_hz=50.0)
+    got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
+    assert got.depths is not None and all(got.depths)
+    _, _, view = nearest_view(got.base_from_gripper, few)
+    for name, k in zip(got.depths, view, strict=True):
+        depth = read_depth(got.folder / str(name), got.image_size)
+        assert depth[0, -1] == pytest.approx((500 + k) / 1000) and (depth == 0).sum() == 10 * k * height
+    assert jcr.read_capture(tmp_path / "frames").depths == got.depths
+
+
+def test_depth_messages_are_read_in_every_encoding():
+    mm = np.array([[0, 700], [1200, 65535]], np.uint16)
+    metres = np.array([[np.nan, 0.7], [1.2, np.inf]], np.float32)
+
+    def message(values: np.ndarray, encoding: str, is_bigendian: int = 0) -> SimpleNamespace:
+        data = values.view(np.uint8).ravel()
+        step = values.shape[1] * values.itemsize
+        return SimpleNamespace(
+            encoding=encoding, is_bigendian=is_bigendian, height=2, width=2, step=step, data=data
+        )
+
+    assert (depth_of(message(mm, "16UC1"), "d") == mm).all()
+    assert (depth_of(message(mm.byteswap(), "16UC1", 1), "d") == mm).all()
+    assert depth_of(message(metres, "32FC1"), "d").tolist() == [[0, 700], [1200, 0]]
+    with pytest.raises(jcr.InputError, match="no depth"):
+        depth_of(message(mm, "rgb8"), "d")
+    packed = SimpleNamespace(
+        format="16UC1; compressedDepth png", data=np.frombuffer(bytes(12) + encode_png(mm), np.uint8)
+    )
+    assert (depth_of(packed, "d") == mm).all()
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
@@ -25,6 +26,7 @@ from jcr.cli.result import show
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
 from jcr.report.map_samples import CLEARANCE, sample_surface, slices
@@ -194,7 +196,11 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
 
     held_out = written["held_out"]
     said = f"{significant(held_out['translation_mm'])} mm and {significant(held_out['rotation_deg'])}°"
-    assert f"predicted to {said}" in elements.text
+    assert f"leave-one-out error: {said}" in elements.text
+    required = run.calibration.requirement
+    assert required is not None
+    within = f"95 % of errors are below {significant(required.reached_mm)} mm and {significant(required.reached_deg)}°"
+    assert f"Trusted: {within}" in elements.text
     for std in written["uncertainty"]["translation_std_mm"]:
         assert f"±{significant(std)} mm" in elements.text
     for image in written["images"]:
@@ -213,7 +219,7 @@ def test_rejected_images_say_why(run: RunResult, page: str):
 def test_text_from_files_stays_text(page: str):
     elements = Elements(page)
     assert "<script>alert" not in page
-    assert len(elements.scripts) == 3  # the scene's data, the 3D view, the copy buttons
+    assert len(elements.scripts) == 4  # the scene's data, the 3D view, the copy buttons, the large images
     assert all(f"<i>{name}" in elements.text for name in ("mug", "tape"))
     scene = json.loads(elements.scripts[0])
     assert scene["views"][1]["name"] == Path(EVIL).name and Path(EVIL).name in elements.text
@@ -245,7 +251,9 @@ def test_page_is_one_small_file(page: str):
     assert len(page.encode()) < 4e6
     elements = Elements(page)
     loads = [a[key] for _, a in elements.found for key in ("src", "href", "srcset", "data") if a.get(key)]
-    assert loads and all(url.startswith("data:image/") for url in loads)
+    ids = {f"#{a['id']}" for _, a in elements.found if a.get("id")}
+    assert loads and all(url.startswith("data:image/") or url in ids for url in loads)
+    assert {"#transform", "#view", "#features", "#map", "#details"} <= set(loads)
     assert set(re.findall(r'url\("?(.)', page)) == {"#"}  # to parts of the page itself
     assert "http:" not in page and "https:" not in page and "@import" not in page
     policy = next(a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy")
@@ -283,7 +291,7 @@ def test_untrusted_calibration_is_not_recommended(run: RunResult):
     page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
     text = Elements(page).text
     assert f"Do not trust this calibration: {content.warnings[0]}." in text
-    assert "Trusted:" not in text and "number to believe" not in text
+    assert "Trusted:" not in text and "no comfort" in text
     assert all(advice in text for advice in content.observability.advice)
 
 
@@ -318,7 +326,8 @@ def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
     reason = "only 2 of 12 images share features; lay <textured> things on the table"
     failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
-    assert f"No calibration: {reason}." in elements.text
+    fault, remedy = reason.split("; ")
+    assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
     assert names == list(capture.images)
     assert "together" in elements.text and "$" not in elements.text
@@ -369,6 +378,22 @@ def test_significant_digits():
     assert [significant(v) for v in (0.0, 1e-9, 0.0123, -0.5, 1.0, 12.34, 1234.5, np.inf)] == [
         "0", "0", "0.012", "-0.50", "1.0", "12", "1234", "unknown",
     ]  # fmt: skip
+
+
+def test_features_are_counted_over_the_frame_and_by_their_errors(run: RunResult, page: str):
+    tracks = run.reconstruction.tracks
+    count = coverage(tracks.x_px, run.lens)
+    assert count.sum() == len(tracks.image) and count.shape == (12, 16)
+    corner = coverage(np.array([[-0.5, -0.5], [639.4, 479.4], [39.4, 0.0]]), run.lens)
+    assert corner[0, 0] == 2 and corner[-1, -1] == 1
+    errors = reprojection_errors_px(run.reconstruction)
+    # Moved by 0.3 px along each axis: Rayleigh's median.
+    assert np.median(errors) == pytest.approx(0.3 * np.sqrt(2 * np.log(2)), rel=0.1)
+    numbers, edges = histogram(errors)
+    assert numbers.sum() == len(errors) and edges[-1] == pytest.approx(np.percentile(errors, 99))
+    info = yaml.safe_load(Elements(page).copied("camera_info"))
+    assert info["camera_matrix"]["data"][0] == pytest.approx(run.lens.fx)
+    assert "13 unknowns were fitted" in page
 
 
 def test_figure_places_grippers_where_they_are(run: RunResult):
@@ -479,9 +504,18 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         " { b.click(); await new Promise(done => setTimeout(done, 50)); out.push([b.dataset.copy,"
         " await navigator.clipboard.readText(), b.textContent]); } return out; })()"
     )
-    assert len(copied) == 8 + 2  # notations, and poses to add
+    assert len(copied) == 9 + 2  # notations, and poses to add
     for wanted, found, label in copied:
         assert wanted == found and label == "copied"
+    # An image opens large with its marks, and arrow keys lead to the next.
+    chromium.js("document.querySelectorAll('.images .shot')[1].click()")
+    assert chromium.js("document.getElementById('large').open")
+    width = "document.querySelector('#large img').getBoundingClientRect().width"
+    assert chromium.js(width) > 3 * chromium.js(width.replace("#large", ".images"))
+    first = chromium.js("document.querySelector('#large p').textContent")
+    key = {"key": "ArrowRight", "code": "ArrowRight", "windowsVirtualKeyCode": 39}
+    chromium.call("Input.dispatchKeyEvent", type="keyDown", **key)
+    assert chromium.js("document.querySelector('#large p').textContent") != first
     _assert_quiet(chromium)
 
 

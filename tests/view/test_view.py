@@ -13,9 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
+from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
+from jcr.camera import project
 from jcr.errors import InputError
+from jcr.geometry import apply, inverse
 from jcr.simulate.truth import Truth, read_truth
 from jcr.view.gate import Gate
 from jcr.view.robot import read_joints, read_urdf, solve_joints
@@ -126,6 +129,38 @@ def test_click_finds_the_first_point_and_says_what_is_there(viewer: "Viewer", tr
     assert "No point" in viewer.click(np.array([x, y, z + 0.4]), np.array([0.0, 0.0, 1.0]))
     viewer.shown.value = "map"
     viewer.show_points()
+
+
+def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
+    viewer.image.value, viewer.photo.value = 3, 40
+    viewer.choose_image()
+    camera, photo, lens = viewer._camera_of_image(), viewer._photo, viewer.run.lens
+    assert camera is not None and photo.visible and photo.image.shape[2] == 4
+    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.run.pictures[camera]).all()
+    half = np.array([photo.render_width, photo.render_height]) / 2
+    axes = Rotation.from_quat(np.asarray(photo.wxyz)[[1, 2, 3, 0]]).as_matrix()
+    for sign in ((-1, -1), (1, 1)):
+        corner = np.asarray(photo.position) + axes @ np.array([*(sign * half), 0])
+        seen = project(lens, apply(inverse(viewer.run.base_from_camera[camera]), corner))
+        assert seen == pytest.approx((np.array(sign) + 1) / 2 * [lens.width, lens.height] - 0.5, abs=1e-3)
+    viewer.photo.value = 0
+    viewer.choose_image()
+    assert not photo.visible and all(frustum.visible for frustum in viewer.frusta)
+
+
+def test_colours_have_their_bar(viewer: "Viewer"):
+    viewer.colored.value = "occupancy"
+    viewer.show_points()
+    assert "rgb(37, 99, 235)" in viewer._legend.content
+    viewer.colored.value = "color"
+    viewer.show_points()
+    assert not viewer._legend.content
+    viewer.slice_of.value = "distance"
+    viewer.show_slice()
+    assert "20 cm and more" in viewer._slice_legend.content
+    viewer.slice_of.value = "none"
+    viewer.show_slice()
+    assert not viewer._slice_legend.content and viewer._grid.visible
 
 
 def test_slice_has_the_base_frames_y_upwards(viewer: "Viewer", truth: Truth):

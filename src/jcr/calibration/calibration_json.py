@@ -20,11 +20,13 @@ from jcr.records import (
     COVARIANCE_ORDER,
     Attempt,
     Capture,
+    DepthCheck,
     HandEye,
     ImageVerdict,
     Intrinsics,
     PosePairs,
     Reconstruction,
+    Requirement,
 )
 from jcr.rounding import significant
 
@@ -214,6 +216,9 @@ class CalibrationFile(_Part):
     scale_check: NetworkScale | None = None
     robot_errors: RobotErrors | None = None
     angle_ratio: AngleRatio | None = None
+    depth_check: DepthCheck | None = None
+    requirement: Requirement | None = None
+    """None of files of earlier versions, and where nothing was found."""
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
@@ -322,6 +327,8 @@ def calibration_file(
             ],
         ),
         angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
+        depth_check=hand_eye.depth_check,
+        requirement=hand_eye.requirement,
         attempts=list(attempts),
     )
 

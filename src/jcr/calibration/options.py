@@ -1,25 +1,36 @@
 """How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
 class CalibrateOptions:
     """How the hand-eye calibration is found."""
 
-    robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, MM DEG, at least; the data may say more."""
-    scale: float | None = None
+    require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """How exact the camera on the gripper must be known: 95 % of errors smaller than this, else exit status 3. Unset:
+    5 mm and 1°, enough to grasp with, and a calibration that is less exact gives a warning."""
+    require_at: Literal["camera", "scene"] = "camera"
+    """Where the millimetres of --require count: scene is what the camera looks at, where rotation moves it too."""
+    robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """One-sigma noise of the gripper poses per axis, at least; the data may say more."""
+    scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
-    robot: str | None = None
+    robot: Annotated[str | None, tyro.conf.arg(metavar="ARM")] = None
     """Name of the arm (see `jcr simulate --help`), whose joint offsets and link errors then count as such; else the one
     that the capture names."""
-    known_height: float | None = None
-    """Planar or SCARA arms: the camera's height (mm) above the gripper's origin along its rotation axis."""
-    known_length: tuple[str, float, float, float, float, float] | None = None
-    """A length that cures a lost scale: IMAGE X1 Y1 X2 Y2 MM, two pixels of one image and their distance."""
+    known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
+    """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""
+    known_length: Annotated[
+        tuple[str, float, float, float, float, float] | None, tyro.conf.arg(metavar="IMAGE X1 Y1 X2 Y2 MM")
+    ] = None
+    """A length that gives a lost scale: two pixels of one image, and their distance."""
     focus: Literal["fixed", "varies"] = "fixed"
     """varies: a focal length for each image, of a camera whose focus moved while the images were taken."""
-    bundle_adjustment: bool = True
-    """Refine with the image correspondences; without, the camera poses alone decide."""
+    bundle_adjustment: Annotated[
+        bool, tyro.conf.arg(help="Use the camera poses alone; skip the refinement by image points.")
+    ] = True
+    """Refine by the points that images share."""

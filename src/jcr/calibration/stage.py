@@ -11,9 +11,11 @@ from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined
 from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
@@ -22,10 +24,7 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
-from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.fit import Cues, exceeds
-from jcr.handeye.next_poses import next_poses
-from jcr.handeye.observability import excitation
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import judged, solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
@@ -34,7 +33,6 @@ from jcr.records import (
     HandEye,
     HeldOut,
     Intrinsics,
-    NextPose,
     PosePairs,
     Reconstruction,
     Refinement,
@@ -47,8 +45,6 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
-PROPOSED = 2
-"""Gripper poses proposed after a calibration."""
 METRIC_STD = 0.005
 """Relative; a printed marker has the size that its maker says to half a percent."""
 
@@ -84,36 +80,9 @@ def calibrate(
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
-    return _with_advice(hand_eye, capture.base_from_gripper[reconstruction.image_index])
-
-
-def _with_advice(hand_eye: HandEye, gripper: Float[ndarray, "m 4 4"]) -> HandEye:
-    """With what the motions show of each direction, and the gripper poses to add."""
-    used = gripper[hand_eye.inliers]
-    return replace(
-        hand_eye,
-        excitation=excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None,
-        next_poses=tuple(_proposals(hand_eye, used)),
-    )
-
-
-def _proposals(hand_eye: HandEye, used: Float[ndarray, "k 4 4"]) -> list[NextPose]:
-    """The poses that would shrink the reported uncertainty most; an X that is not trusted is not used.
-
-    What they would leave is the reported standard deviation, less by the share by which their information shrinks
-    that expected of the poses alone: bundle adjustment, lens and correlated errors make the two differ. No views make
-    up for a given lens that is wrong, nor for a robot that is worse than assumed.
-    """
-    noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    by_lens = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
     if hand_eye.converged:
-        expected, proposed = next_poses(used, PROPOSED, hand_eye.gripper_from_camera, noise)
-        share = np.sqrt(np.diag(hand_eye.covariance) - by_lens**2) / expected
-    else:
-        at_least = max(noise[0], ASSUMED_NOISE[0]), max(noise[1], ASSUMED_NOISE[1])
-        _, proposed = next_poses(used, PROPOSED, noise=at_least)
-        share = 1.0
-    return [replace(pose, expected_std=np.hypot(pose.expected_std * share, by_lens)) for pose in proposed]
+        hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    return advised(hand_eye, capture.base_from_gripper[reconstruction.image_index], options)
 
 
 def _calibrated(
@@ -335,7 +304,8 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
     that do not show a scale are helped by taking it as 1.
     """
-    return _with_advice(_calibrated_poses(pairs, options or CalibrateOptions()), pairs.base_from_gripper)
+    options = options or CalibrateOptions()
+    return advised(_calibrated_poses(pairs, options), pairs.base_from_gripper, options)
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:

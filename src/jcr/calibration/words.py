@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.records import Attempt, HeldOut, ScaleCheck
+from jcr.records import Attempt, DepthCheck, HeldOut, Requirement, ScaleCheck
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ SURE = 2.5
 NOTABLE_RATIO = 0.003
 NOTABLE_ERRORS = 0.03, 0.003
 """mm, degrees; real arms err by more, and of less nobody need hear."""
+SHORT = "not as exact as needed"
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
 
@@ -42,9 +43,11 @@ def summary(content: "CalibrationFile") -> str:
                 "most of ± is systematic error of the robot: more images of the same region will hardly help, another "
                 "region of the workspace or its joint angles (capture.json: joints and robot) would"
             )
+        required = content.requirement
+        reach = required is not None and bool(required.more_images)
         lines.append(
             f"{len(content.next_poses)} more views, like {near} but turned (next_poses in calibration.json), "
-            f"would give ± {then} mm"
+            f"would give ± {then} mm{', within what is needed' if reach else ''}"
         )
     return "\n".join(lines) + "\n"
 
@@ -62,6 +65,7 @@ def found(content: "CalibrationFile") -> list[str]:
         f"gripper_from_camera ({content.images_used} of {len(content.images)} images, back end {content.backend})",
         *(f"  {row}" for row in matrix),
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
+        *([] if content.requirement is None else [f"  {reached_in_words(content.requirement)}"]),
         f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
     if uncertainty.budget is not None:
@@ -69,10 +73,46 @@ def found(content: "CalibrationFile") -> list[str]:
         lines.insert(-1, f"  of which: {parts}")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
+    if content.depth_check is not None:
+        lines.append(depth_in_words(content.depth_check))
     lines += robot_in_words(content)
     if (held_out := content.held_out) is not None:
-        lines.append(f"held out: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
+        lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
+
+
+def reached_in_words(required: Requirement) -> str:
+    """What 95 % of the errors stay below, and whether that is what was asked."""
+    where = f" {significant(required.distance_mm, 3)} mm ahead of the camera" if required.distance_mm else ""
+    asked = "asked for" if required.asked else "needed to grasp"
+    return (
+        f"95 % of errors are below {significant(required.reached_mm)} mm{where} and "
+        f"{significant(required.reached_deg)}°; {needed(required)} are {asked}"
+    )
+
+
+def needed(required: Requirement) -> str:
+    """The numbers that must be reached."""
+    return f"{required.translation_mm:g} mm and {required.rotation_deg:g}°"
+
+
+def shortfall(content: "CalibrationFile") -> str | None:
+    """That the calibration is not as exact as is required, and what would help; None where it is."""
+    if (required := content.requirement) is None or required.is_met:
+        return None
+    if required.more_images is not None:
+        more = (
+            f"add {required.more_images} image{'s' * (required.more_images > 1)} at the poses of next_poses"
+        )
+    elif (
+        content.uncertainty is not None
+        and content.uncertainty.budget is not None
+        and not more_images_help(content.uncertainty.budget)
+    ):
+        more = "systematic errors of the robot are most of it: name the arm (--robot) or add its joint angles"
+    else:
+        more = "a dozen more images would not do; take them nearer to the scene, or with a better camera or robot"
+    return f"{SHORT}: {reached_in_words(required)}; {more}"
 
 
 def angles_in_words(ratio: float, std: float) -> list[str]:
@@ -181,6 +221,19 @@ def missed(held_out: "HeldOut | HeldOutError") -> str:
 def pixels(held_out: "HeldOut | HeldOutError") -> str:
     """The same in their pictures, to follow it; empty where no picture tells."""
     return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
+
+
+def depth_in_words(check: DepthCheck) -> str:
+    """What the robot says of a depth camera: its scale, and its noise near and far."""
+    off, std = check.off_percent, check.std_percent
+    size = f"{abs(off):.2g} ± {std:.1g} % too {'long' if off > 0 else 'short'} by the robot"
+    if abs(off) < 2 * std:
+        size = f"right by the robot ({off:+.2g} ± {std:.1g} %)"
+    noise = " and ".join(
+        f"{significant(1e3 * float(np.hypot(check.noise_m, check.noise_per_m * z**2)))} mm at {z:.2f} m"
+        for z in check.distances_m
+    )
+    return f"depth camera: its lengths are {size}; noise {noise} (1 σ); the map has them corrected"
 
 
 def scale_in_words(check: "ScaleCheck | NetworkScale") -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, UInt16
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import lens_of_ros, read_camera_info
@@ -15,7 +15,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_fault, read_yaml
 from jcr.capture.pose_track import speed
 from jcr.capture.recording import capture_of_recording
-from jcr.capture.ros_image import picture_of
+from jcr.capture.ros_image import depth_of, picture_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -25,6 +25,10 @@ from jcr.records import Capture, Intrinsics
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
 METADATA = "metadata.yaml"
+ALIGNED = "aligned_depth"
+"""In the names of topics whose depth has the pixels of the colour image (realsense2_camera: aligned_depth_to_color)."""
+SAME_MOMENT_NS = 20_000_000
+"""Colour and depth of one exposure have stamps nearer than this."""
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -74,6 +78,19 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
                         yield row, *picture_of(message, f"{path}: {topic}")
                         break
 
+        aligned = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
+        _refuse_other_definitions(reader, aligned, path)
+
+        def depth_at(row: int) -> UInt16[np.ndarray, "h w"] | None:
+            """Of the exposure nearest to the frame's; None where it has none."""
+            at = int(logs[row])
+            found, off = None, SAME_MOMENT_NS
+            near = {"start": at - 5 * SAME_MOMENT_NS, "stop": at + 5 * SAME_MOMENT_NS}
+            for connection, recorded, message in _messages(reader, aligned, path, **near):
+                if (apart := abs(_stamp(message, recorded) - int(stamps[row]))) <= off:
+                    found, off = depth_of(message, f"{path}: {connection.topic}"), apart
+            return found
+
         def lens(size: tuple[int, int]) -> Intrinsics | None:
             if options.camera_info is not None:
                 return read_camera_info(options.camera_info, size)
@@ -82,7 +99,18 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         names = [str(stamp) for stamp in stamps]
         motion = speed(poses_at, stamps)
         return capture_of_recording(
-            path, names, poses, motion, gap_ns, pictures, lens, options, into, report, joints
+            path,
+            names,
+            poses,
+            motion,
+            gap_ns,
+            pictures,
+            lens,
+            options,
+            into,
+            report,
+            joints,
+            depth_at if aligned else None,
         )
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.checks import checked_capture, checked_lens, first_few, read_rigid, require_images
+from jcr.capture.depth_images import depth_of_frames
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
@@ -57,6 +58,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
         joints=joints,
         robot=robot,
         urdf=_urdf(content.get("urdf"), file),
+        depths=depth_of_frames(frames, folder, str(file)),
     )
 
 
@@ -116,6 +118,9 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     if capture.joints is not None:
         for frame, row in zip(frames, capture.joints.tolist(), strict=True):
             frame["joints"] = row
+    for frame, name in zip(frames, capture.depths or (), strict=False):
+        if name is not None:
+            frame["depth"] = name
     arm = {} if capture.robot is None else {"robot": capture.robot}
     if capture.urdf is not None:
         # Beside the images, whatever it was called: a capture is complete in its folder.
@@ -139,7 +144,7 @@ def kept(capture: Capture, folder: Path) -> Capture:
     """
     if capture.source is None:
         return capture
-    for name in capture.images:
+    for name in filter(None, (*capture.images, *(capture.depths or ()))):
         write_bytes(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, source=str(capture.source))
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 MIN_FRAMES = 3
 """Fewer do not calibrate."""
@@ -44,31 +46,31 @@ UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
 class ReadOptions:
     """How the capture is read; a capture.json needs none of these."""
 
-    format: FormatName = "auto"
-    """What the capture is, where looking at its files does not tell (docs/captures.md)."""
     pose_convention: ConventionName = "auto"
     """How a table writes poses of the gripper in the base; auto goes by the names of its columns."""
     pose_units: UnitsName = "auto"
     """Of a table's positions and angles, or of joint angles; auto is what the convention or a column says."""
     pose_inverted: bool = False
     """The poses are gripper_from_base, of the base in the gripper: invert them."""
-    poses: Path | None = None
+    poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Table of gripper poses; unset: poses.csv, .tsv, .txt or .npy beside the images."""
-    camera_info: Path | None = None
+    camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there."""
-    frames: int = 15
+    format: FormatName = "auto"
+    """What the capture is, where looking at its files does not tell (docs/captures.md)."""
+    frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
     """How many frames to take from a recording: still, sharp and spread so that they show most."""
-    base_frame: str | None = None
+    base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Recordings: tf frame or URDF link of the robot's base."""
-    gripper_frame: str | None = None
+    gripper_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Recordings: tf frame or URDF link that the camera is bolted to."""
-    camera_topic: str | None = None
+    camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
-    joint_topic: str | None = None
+    joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the joint states, read when --urdf is given. LeRobot: key of the state."""
-    urdf: Path | None = None
+    urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Robot description, for recordings with joint angles instead of gripper poses."""
-    max_gap_ms: float = 100.0
+    max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0
     """Recordings: a pose is interpolated between two that are at most so far apart, else it is stale."""
     episode: tuple[int, ...] = (0,)
     """LeRobot: episodes to take frames from; they must show one scene that nobody touched in between."""

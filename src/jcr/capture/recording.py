@@ -5,11 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.best_frames import best_frames
 from jcr.capture.checks import checked_capture
+from jcr.capture.depth_images import FOLDER as DEPTH
 from jcr.capture.images import encode_png, sharpness
 from jcr.capture.options import ReadOptions
 from jcr.errors import InputError
@@ -33,9 +34,11 @@ def capture_of_recording(
     into: Path,
     report: Progress,
     joints: Float[ndarray, "n j"] | None = None,
+    depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None,
 ) -> Capture:
     """The best frames of a recording in the folder `into`; `names` are those of the frames, without ending.
-    `joints` (rad) are those of the arm in `options.urdf`, where they are known.
+    `joints` (rad) are those of the arm in `options.urdf`, where they are known; `depth_at` gives the depth (mm) aligned
+    with the frame of a row.
 
     Frames whose pose is interpolated over more than `options.max_gap_ms` are stale. Raises InputError when all
     are, or when too few are still and sharp.
@@ -68,14 +71,21 @@ def capture_of_recording(
         return np.array(values)
 
     rows, remarks = best_frames(base_from_gripper, speed, fresh, sharpness_of, options.frames)
-    images = []
+    images: list[str] = []
+    depths: list[str | None] = []
     for k, (row, picture, ending) in enumerate(pictures(rows)):
         images.append(f"images/{names[row]}{ending}")
         data = picture if isinstance(picture, bytes) else encode_png(picture)
         write_bytes(into / images[-1], data)
+        depth = None if depth_at is None else depth_at(row)
+        depths.append(None if depth is None else f"{DEPTH}/{names[row]}.png")
+        if depth is not None:
+            write_bytes(into / f"{DEPTH}/{names[row]}.png", encode_png(depth))
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
     capture = checked_capture(into, images, base_from_gripper[rows], str(source))
     notes = (f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks)
     if joints is not None:
         capture = replace(capture, joints=joints[rows], urdf=options.urdf)
+    if any(depths):
+        capture = replace(capture, depths=tuple(depths))
     return replace(capture, intrinsics=lens_of_size(capture.image_size), notes=notes)

@@ -1,10 +1,10 @@
-"""sensor_msgs/Image and CompressedImage to pictures."""
+"""sensor_msgs/Image and CompressedImage to pictures, and to depth."""
 
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
 from jcr.errors import InputError
@@ -57,3 +57,30 @@ def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"
     if encoding == "rgb8":
         return pixels, ".png"
     return np.asarray(cv2.cvtColor(pixels, _TO_RGB[encoding]), dtype=np.uint8), ".png"
+
+
+def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
+    """Depth in mm, 0 where there is none; InputError for what is no depth image."""
+    if hasattr(message, "format"):
+        # compressed_depth_image_transport writes its quantisation before the PNG.
+        data = message.data.tobytes()
+        begin = data.find(b"\x89PNG\r\n")
+        depth = cv2.imdecode(np.frombuffer(data[max(begin, 0) :], np.uint8), cv2.IMREAD_UNCHANGED)
+        if begin < 0 or depth is None or depth.dtype != np.uint16 or "32FC1" in message.format:
+            raise InputError(f"{where}: depth as {message.format!r}; record 16UC1, raw or compressedDepth")
+        return np.asarray(depth)
+    kinds = {"16UC1": (np.uint16, 1.0), "mono16": (np.uint16, 1.0), "32FC1": (np.float32, 1e3)}
+    if message.encoding not in kinds:
+        raise InputError(
+            f"{where}: encoding {message.encoding!r} is no depth; ROS has 16UC1 (mm) and 32FC1 (m)"
+        )
+    kind, to_mm = kinds[message.encoding]
+    order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    used = message.width * order.itemsize
+    if message.step < used or message.data.size < message.height * message.step:
+        raise InputError(
+            f"{where}: a depth image of {message.width}x{message.height} is cut short; record again"
+        )
+    rows = message.data[: message.height * message.step].reshape(message.height, message.step)[:, :used]
+    values = np.ascontiguousarray(rows).view(order).astype(np.float64) * to_mm
+    return np.nan_to_num(values, posinf=0.0, neginf=0.0).clip(0, 65535).round().astype(np.uint16)

@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture
+from jcr.capture.depth_images import depth_beside
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.capture.pose_table import PoseTable, read_pose_table, stamp_ns
@@ -32,7 +33,8 @@ def read(path: Path, options: ReadOptions) -> Capture:
     table = read_pose_table(file, options)
     images, poses, notes = _paired(folder, file, table, options)
     capture = checked_capture(folder, images, poses, str(file))
-    return replace(with_camera_info(capture, options), source=file, notes=notes)
+    depths = depth_beside(folder, images)
+    return replace(with_camera_info(capture, options), source=file, notes=notes, depths=depths)
 
 
 def find_table(path: Path) -> Path | None:

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import TextIO
 
 from jcr.errors import InputError, NotTrustedError
 
@@ -74,6 +75,8 @@ _DISK = {
 """What the machine, not the program, has wrong, and the cure."""
 
 
+NO_DEFAULT = re.compile(r"\(default:(?:[\s│]|\x1b\[[0-9;]*m)+(?:None|True|False)\)")
+"""In help: what is said of options that have no value, and of switches."""
 LONGEST_LINE = 2000
 """Characters of a message."""
 
@@ -171,9 +174,9 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
     # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
-    complaint = io.StringIO()
+    complaint, told = io.StringIO(), _Help(sys.stdout)
     try:
-        with contextlib.redirect_stderr(complaint):
+        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(told):
             parsed = tyro.cli(
                 command.Arguments,
                 prog=program,
@@ -187,12 +190,32 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
             )
     except SystemExit as stop:
         if not stop.code:
+            sys.stdout.write(NO_DEFAULT.sub(_blank, told.getvalue()))
             return 0
         return _fail(2, f"{_flatten(complaint.getvalue())} ({program} --help)")
     with contextlib.ExitStack() as silence:
         if parsed.output.quiet:
             silence.enter_context(contextlib.redirect_stderr(silence.enter_context(open(os.devnull, "w"))))
         return command.main(parsed)
+
+
+class _Help(io.StringIO):
+    """What tyro prints, in the colours and with the boxes that a stream can show."""
+
+    encoding = "utf-8"
+
+    def __init__(self, stream: TextIO):
+        super().__init__()
+        self.encoding, self._in_colour = stream.encoding, stream.isatty()
+
+    def isatty(self) -> bool:
+        """Of the stream."""
+        return self._in_colour
+
+
+def _blank(default: re.Match[str]) -> str:
+    """As many blanks, so that the box stays one; a line break in it stays too."""
+    return re.sub(r"\x1b\[[0-9;]*m|[^│\n]", lambda c: c[0] if c[0].startswith("\x1b") else " ", default[0])
 
 
 def _flatten(box: str) -> str:

@@ -34,8 +34,8 @@ class Arguments:
     """Folders of the captures, then the folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)
     batch: BatchOptions = field(default_factory=BatchOptions)
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     output: Output = field(default_factory=Output)

@@ -1,4 +1,4 @@
-"""`jcr calibrate`: where the camera sits on the gripper, up to calibration.json."""
+"""`jcr calibrate`: where the camera sits on the gripper: calibration.json and a report."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 
 @dataclass(frozen=True)
 class Arguments:
-    """Reconstruct and calibrate a capture, without the map.
+    """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
 
     CAPTURE may also be the samples of easy_handeye2 or MoveIt Calibration: their marker's poses need no images.
 
@@ -31,8 +31,8 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     output: Output = field(default_factory=Output)
 
 
@@ -48,6 +48,6 @@ def main(arguments: Arguments) -> int:
         if isinstance(capture, PosePairs):
             found = calibrate_poses(capture, arguments.out, arguments.calibrate)
             about = "the scale is 1, as the marker's size says\n" if found.scale_is_one else ""
-            return show(found, arguments.output, about)
+            return show(found, arguments.output, f"{about}report: {found.out / 'report.html'}\n")
         result = calibrate(capture, arguments.out, options, progress=progress)
-    return show(result, arguments.output)
+    return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")

@@ -40,10 +40,10 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the capture; one that was begun is continued."""
-    camera: str = "0"
+    camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
     """V4L2 device number, realsense[:SERIAL], address of a stream (rtsp://…), or a recording (video file, .bag)."""
     optics: CameraOptions = field(default_factory=CameraOptions)
-    poses: str = "tcp"
+    poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
     """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
     hand), or tcp (a program sends them, docs/capture.md)."""
     pose_convention: ConventionName = "auto"
@@ -52,11 +52,11 @@ class Arguments:
     """Units of typed and told poses; auto: those of the convention."""
     robot: RobotName | None = None
     """The arm: the next pose is told as joint angles too, within its limits."""
-    listen: str = "127.0.0.1:7464"
+    listen: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "127.0.0.1:7464"
     """With tcp: address and port to listen on; any but this machine's own needs a token."""
     token: str | None = None
     """With tcp: what the client must send first; better given as JCR_TOKEN, which other users do not see."""
-    timeout: float = 600.0
+    timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
     """With tcp: end when no pose came for so many seconds."""
     intrinsics_from: Path | None = None
     """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else those that the camera

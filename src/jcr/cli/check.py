@@ -36,11 +36,16 @@ class Arguments:
     suggest: int = 0
     """Propose so many gripper poses that would shrink the uncertainty most."""
     poses_only: bool = False
-    """Do not register the pictures (seconds) to hold the poses against them."""
-    robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, MM DEG; left out: found, or 0.5 mm and 0.1°."""
-    reach: tuple[float, float, float, float, float, float] | None = None
-    """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
+    """Look at no features: files, units and motion alone."""
+    thorough: bool = False
+    """Register all images at full size. Else 8 of them are, which takes seconds, and all where these show a fault."""
+    robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
+    """One-sigma noise of the gripper poses per axis; unset: found, or 0.5 mm and 0.1°."""
+    reach: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
+    ] = None
+    """Box that proposed gripper positions stay in (m, base)."""
     seed: int = 0
     """Seed of the registration and of the proposals."""
     output: Output = field(default_factory=Output)
@@ -69,6 +74,7 @@ def main(arguments: Arguments) -> int:
             None if arguments.reach is None else np.array(arguments.reach).reshape(2, 3),
             arguments.seed,
             progress,
+            arguments.thorough,
         )
     arguments.output.result(_as_text(capture, found), _as_json(capture, found))
     if found.faults:
@@ -85,10 +91,11 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     ]
     if found.hand_eye is not None:
         noise = found.hand_eye.robot_noise
+        looked = len(found.hand_eye.inliers)
         agreement = f"{1e3 * noise.translation:.2f} mm and {np.degrees(noise.rotation):.3f}°"
         lines.append(
-            f"poses and pictures agree to {agreement} per axis "
-            f" ({int(found.hand_eye.inliers.sum())} of {len(capture)} images)"
+            f"poses and images agree to {agreement} per axis ({int(found.hand_eye.inliers.sum())} of "
+            f"{len(capture)} images{'' if looked == len(capture) else f', {looked} looked at'})"
         )
     lines += [f"fault: {fault}" for fault in found.faults]
     lines += [f"remark: {remark}" for remark in found.remarks]

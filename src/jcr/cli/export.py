@@ -54,22 +54,25 @@ class Arguments:
     ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None
     """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
-    parent_frame: str = "tool0"
+    parent_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "tool0"
     """The gripper frame whose poses the capture has."""
-    child_frame: str = "camera_color_optical_frame"
+    child_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "camera_color_optical_frame"
     """The camera's optical frame: x right, y down, z forward."""
-    base_frame: str = "base_link"
+    base_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "base_link"
     """The robot's base, the frame of everything mapped."""
-    to_root: str | None = None
+    to_root: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Give the transform of this link instead, from which the camera's other frames hang (e.g. camera_link)."""
-    root_from_optical: tuple[float, float, float, float, float, float, float] | None = None
+    root_from_optical: Annotated[
+        tuple[float, float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="X Y Z QX QY QZ QW"),
+    ] = None
     """Of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL` prints
     it; by default they share their origin and are turned as REP-103 has it."""
-    voxel_size: float | None = None
+    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres, for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None
     """How places count that nobody has seen: by default as occupied in esdf, as free (left out) in spheres."""
-    excess: float | None = None
+    excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres by which spheres may reach into free space; by default two cells of the map."""
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""

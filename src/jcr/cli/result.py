@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> int:
     """Print the calibration, its doubts and notes on stderr, and for people what comes after it.
 
-    Returns exit status 0, or raises NotTrustedError.
+    Returns exit status 0, or raises NotTrustedError, also of one that is less exact than the user requires.
     """
-    from jcr.calibration.words import summary
+    from jcr.calibration.words import shortfall, summary
     from jcr.results import RunResult
 
     content = result.calibration
@@ -27,4 +27,8 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
         sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
         raise NotTrustedError(f"not to be trusted: {content.doubt}")
+    if (short := shortfall(content)) is not None:
+        if content.requirement is not None and content.requirement.asked:
+            raise NotTrustedError(short)
+        sys.stderr.write(f"warning: {short}\n")
     return 0

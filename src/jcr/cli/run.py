@@ -37,8 +37,8 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)
-    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)

@@ -31,9 +31,9 @@ class Arguments:
     joints: Path | None = None
     """Its joint values (rad, m), a row an image: .csv or .npy. Left out, values are found that put TIP at each gripper
     pose: one of the ways the robot may have stood."""
-    tip: str | None = None
+    tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
     """The URDF's link whose poses the capture has."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on. Beyond 127.0.0.1 the address that is printed carries a token, without which nobody gets
     in; there is no encryption."""
     port: int = 8080

@@ -44,13 +44,8 @@ def _candidates(
 ) -> Float[ndarray, "k 4 4"]:
     """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
     camera = base_from_gripper @ x
-    axis, center = camera[:, :3, 2], camera[:, :3, 3]
-    scene = nearest_to_lines(center, axis)  # what was looked at
-    distance = np.linalg.norm(center - scene, axis=1)
-    # Parallel axes meet nowhere; the scene is then taken half a metre ahead.
-    if not 0.1 < np.median(distance) < 2.0:
-        scene = (center + 0.5 * axis).mean(0)
-        distance = np.linalg.norm(center - scene, axis=1)
+    center = camera[:, :3, 3]
+    scene, distance = looked_at(camera)
     if reach is None:
         low, high = base_from_gripper[:, :3, 3].min(0), base_from_gripper[:, :3, 3].max(0)
         slack = np.maximum(0.25 * (high - low), 0.05)
@@ -74,6 +69,18 @@ def _candidates(
         widening *= 1.05
         reach = np.stack([reach[0] - 0.002 * widening, reach[1] + 0.002 * widening])
     return kept[:CANDIDATES]
+
+
+def looked_at(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]:
+    """The point that the optical axes meet in, and how far each camera is from it (m)."""
+    axis, center = camera[:, :3, 2], camera[:, :3, 3]
+    scene = nearest_to_lines(center, axis)
+    distance = np.linalg.norm(center - scene, axis=1)
+    # Parallel axes meet nowhere; the scene is then taken half a metre ahead.
+    if not 0.1 < np.median(distance) < 2.0:
+        scene = (center + 0.5 * axis).mean(0)
+        distance = np.linalg.norm(center - scene, axis=1)
+    return scene, distance
 
 
 def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:

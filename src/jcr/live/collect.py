@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+import tyro
 
 from jcr.capture.images import brightness_and_sharpness, read_image
 from jcr.live.arm_words import ArmWords
@@ -27,10 +29,13 @@ class CollectOptions:
     """Stop with so many pictures."""
     patience: float = 5.0
     """Seconds to wait for a picture at rest."""
-    reach: tuple[float, float, float, float, float, float] | None = None
-    """Box that proposed gripper positions stay in (m, base): xmin ymin zmin xmax ymax zmax."""
-    wanted: tuple[float, float] = ENOUGH
-    """One-sigma uncertainty of the camera on the gripper that the live page aims at, MM DEG."""
+    reach: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
+    ] = None
+    """Box that proposed gripper positions stay in (m, base)."""
+    wanted: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = ENOUGH
+    """One-sigma uncertainty of the camera on the gripper that the live page aims at."""
 
 
 def collect(

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+import tyro
 from jaxtyping import Int
 from numpy import ndarray
 
@@ -351,34 +352,40 @@ class ReconstructOptions:
     backend: BackendName = "auto"
     """auto takes the first of the list that needs no input of its own and whose package and weights are on this
     machine (jcr models), and the next such one where its result is rejected."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks and the map's training run."""
-    seed: int = 0
-    """Same seed, same result on the same machine."""
-    weights: str | None = None
-    """A network's weights, a path or a hub id; unset: the published ones. Under auto they are taken for DUSt3R's or
-    MASt3R's."""
-    predictions: Path | None = None
-    """A network's output as an npz file (docs/predictions.md); selects the back end predictions."""
-    cameras: Path | None = None
-    """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
-    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
+    """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
+    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
     """What is matched between images; selects the back end colmap. SIFT, or learned features for little texture, whose
     weights come with the extra match; auto tries sift, then xfeat where it is installed and the first is rejected."""
-    board: str | None = None
-    """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
-    chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
-    dense: bool = True
-    """Estimate the dense depth that the map needs; without, a calibration alone comes sooner (networks predict it
-    anyway)."""
-    priors: bool = True
-    """Fill plain surfaces with planes that their colour and the matched depth around them speak for. The map takes these
-    for surfaces, never for a view of free space. Networks predict them anyway."""
-    memory_gb: float = 8.0
+    seed: int = 0
+    """Same seed, same result on the same machine."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where networks and the map's training run."""
+    memory_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 8.0
     """Most that the process may take of main memory (peak resident set, the program included), and a network of a
     GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
+    dense: Annotated[
+        bool, tyro.conf.arg(help="Make no dense depth, which only the map needs; networks predict it anyway.")
+    ] = True
+    """Estimate the dense depth that the map needs."""
+    priors: Annotated[
+        bool,
+        tyro.conf.arg(
+            help="Leave plain surfaces without depth, instead of the planes that their colour and the matched depth "
+            "around them speak for; the map takes these for surfaces, never for a view of free space."
+        ),
+    ] = True
+    """Fill plain surfaces with planes. Networks predict them anyway."""
+    weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
+    """A network's weights, a path or a hub id; unset: the published ones. Under auto they are taken for DUSt3R's or
+    MASt3R's."""
+    predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A network's output as an npz file (docs/predictions.md); selects the back end predictions."""
+    cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
+    pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
+    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
 
     def with_absolute_paths(self) -> "ReconstructOptions":
         """The same with paths that hold in every working folder."""

@@ -77,6 +77,43 @@ def camera_figure(
     return _svg(parts, title)
 
 
+def grid_figure(title: str, count: Int[ndarray, "rows columns"]) -> str:
+    """Cells of an image, the fuller the darker; empty ones are hatched."""
+    rows, columns = count.shape
+    side = WIDTH / columns
+    full = max(float(np.percentile(count[count > 0], 95)), 1.0) if (count > 0).any() else 1.0
+    parts = [_text(0.0, 16.0, title, "title")]
+    for (row, column), number in np.ndenumerate(count):
+        kind = (
+            f'class="cell" fill-opacity="{0.15 + 0.85 * min(number / full, 1):.2f}"'
+            if number
+            else 'class="unknown"'
+        )
+        parts.append(
+            f'<rect x="{column * side:.1f}" y="{26 + row * side:.1f}" width="{side - 1:.1f}" height="{side - 1:.1f}" '
+            f"{kind}><title>{number} features</title></rect>"
+        )
+    return _svg(parts, title, 26 + rows * side)
+
+
+def bars_figure(title: str, count: Int[ndarray, " b"], edge: Float[ndarray, " c"], what: str) -> str:
+    """A histogram, its first and last edge named."""
+    high, width = HEIGHT - 60, WIDTH / len(count)
+    parts = [_text(0.0, 16.0, title, "title")]
+    for k, number in enumerate(count.tolist()):
+        tall = high * number / max(int(count.max()), 1)
+        parts.append(
+            f'<rect class="cell" x="{k * width:.1f}" y="{30 + high - tall:.1f}" width="{width - 1.5:.1f}" '
+            f'height="{tall:.1f}"><title>{edge[k]:.2f} to {edge[k + 1]:.2f}: {number} {what}</title></rect>'
+        )
+    parts.append(_line([(0.0, 30 + high), (WIDTH, 30 + high)], "frame"))
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        kind = "small" if share == 0 else "small end" if share == 1 else "small middle"
+        more = " and more" if share == 1 else ""
+        parts.append(_text(share * WIDTH, HEIGHT - 14, f"{share * float(edge[-1]):.2g}{more}", kind))
+    return _svg(parts, title)
+
+
 def slice_figure(title: str, cut: Slice, marked: float, mark: str) -> str:
     """A slice of the map with axes in metres; `marked` is where the other slice cuts, on the second axis."""
     low, high = cut.extent

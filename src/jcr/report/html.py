@@ -1,16 +1,31 @@
 """report.html: one file that says whether to trust a calibration, hands it over, and shows what was found."""
 
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.words import attempt_in_words, budget_in_words, missed, pixels
+from jcr.calibration.words import (
+    SHORT,
+    attempt_in_words,
+    budget_in_words,
+    missed,
+    pixels,
+    reached_in_words,
+    shortfall,
+)
 from jcr.extras import is_installed
-from jcr.geometry import Transforms, scale_translation
-from jcr.records import COEFFICIENTS, Capture
+from jcr.geometry import scale_translation
+from jcr.records import COEFFICIENTS, Capture, Intrinsics
+from jcr.report.features import features_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.map_pictures import map_section
 from jcr.report.map_samples import sample_surface
@@ -21,12 +36,34 @@ from jcr.report.pictures import images_section, thumbnails
 from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.transform import transform_section
-from jcr.results import RunResult
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
 
+MAIN = ("Translation, 1 σ", "Rotation, 1 σ")
+"""The tiles with the largest numbers."""
+
+ANY_LENS = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
+"""Of the cameras that are drawn where nobody says what they saw."""
+LINKS = {
+    "warnings": "Warnings",
+    "notes": "Notes",
+    "transform": "Transform",
+    "view": "3D",
+    "images": "Images",
+    "features": "Features",
+    "residuals": "Residuals",
+    "uncertainty": "Uncertainty",
+    "before-after": "Before and after",
+    "map": "Map",
+    "objects": "Objects",
+    "details": "Details",
+}
+"""To the sections, by their names in the page."""
+BOARD = r"a calibration board is in view[^;]*"
+"""As reconstruct/board_in_view.py proposes one."""
 Options = Mapping[str, Mapping[str, Any]]
 """A stage's name, and its options by name."""
 
@@ -37,9 +74,10 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     Sections whose record a run does not have are left out. Raises InputError when an image of the capture has
     become unreadable.
     """
-    calibration, hand_eye = result.calibration, result.hand_eye
+    calibration, hand_eye, capture = result.calibration, result.hand_eye, result.capture
+    reconstruction, rows = result.reconstruction, result.image_index
     base_from_camera = hand_eye.base_from_recon @ scale_translation(
-        result.reconstruction.recon_from_camera, hand_eye.scale
+        reconstruction.recon_from_camera, hand_eye.scale
     )
     surface = None if result.scene is None else sample_surface(result.scene, SURFACE_POINTS)
     sections = [
@@ -50,9 +88,12 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         transform_section(hand_eye),
         scene_section(result, base_from_camera, surface),
         images_section(result),
+        features_section(result),
         residuals_section(result),
         motion_section(result),
-        filled("before_after.html", panels=_before_after(result, base_from_camera)),
+        _before_after(
+            capture.base_from_gripper, reconstruction.recon_from_camera, base_from_camera, rows, result.lens
+        ),
         ""
         if result.scene is None or surface is None
         else map_section(result, result.scene, surface, base_from_camera),
@@ -61,79 +102,131 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         else objects_section(result.measured, result.scene.label_names),
         _details(calibration, options or {}, {} if result.scene is None else result.scene.history),
     ]
-    return _page(result.capture, calibration, sections)
+    return _page(capture.folder, calibration, sections)
+
+
+def poses_report_html(result: PosesResult, options: Options | None = None) -> str:
+    """The report of camera poses that were given: as that of a run, without images."""
+    calibration, hand_eye, pairs = result.calibration, result.hand_eye, result.pairs
+    base_from_camera = hand_eye.base_from_recon @ scale_translation(pairs.recon_from_camera, hand_eye.scale)
+    cameras = pairs.recon_from_camera, base_from_camera
+    sections = [
+        _verdict(calibration),
+        _tiles(calibration),
+        _remarks("warnings", "Warnings", calibration.remarks),
+        _remarks("notes", "Notes", calibration.notes),
+        transform_section(hand_eye),
+        residuals_section(result),
+        motion_section(result),
+        _before_after(pairs.base_from_gripper, *cameras, result.image_index, ANY_LENS),
+        _details(calibration, options or {}),
+    ]
+    return _page(pairs.source, calibration, sections)
 
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
     """The report of a run that found no camera poses: why, with the cure, and the images."""
-    reason = escape(calibration.doubt or "")
-    verdict = f"<h2><b>No calibration:</b> {reason}.</h2><p>Nothing was calibrated and nothing mapped.</p>"
     cards = "".join(
-        f'<figure><img src="{url}" alt="{escape(name)}"><figcaption><span class="file">{escape(name)}</span>'
-        "</figcaption></figure>"
+        f'<figure><div class="shot"><img src="{url}" alt="{escape(name)}"></div>'
+        f'<figcaption><span class="file">{escape(name)}</span></figcaption></figure>'
         for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
     )
     say = "What the camera saw. Without texture, overlap or light no features are found in them."
     sections = [
-        f'<section class="verdict bad">{verdict}</section>',
+        _failure(calibration),
         filled("images.html", say=say, about="", cards=cards),
         _details(calibration, options or {}),
     ]
-    return _page(capture, calibration, sections)
+    return _page(capture.folder, calibration, sections)
 
 
-def _page(capture: Capture, calibration: CalibrationFile, sections: Sequence[str]) -> str:
-    return filled(
-        "page.html",
-        name=escape(capture.folder.resolve().name),
-        about=f"{len(capture)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
-        style=(PAGE / "page.css").read_text(),
-        sections="\n".join(sections),
-        scene3d=(PAGE / "scene3d.js").read_text(),
-        copy=(PAGE / "copy.js").read_text(),
+def _failure(calibration: CalibrationFile) -> str:
+    """What is wrong in one sentence, what to do, and below it what each back end that was tried said."""
+    last = calibration.attempts[-1].why_not if calibration.attempts else calibration.doubt
+    fault, *remedies = (last or calibration.doubt or "").split("; ")
+    if board := re.search(BOARD, calibration.doubt or ""):
+        remedies.insert(0, board[0])
+    items = "".join(
+        f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
+        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: {escape((attempt.why_not or '').split('; ')[0])}</li>"
+        for attempt in calibration.attempts
+    )
+    tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
+    cures = "".join(f"<li>{escape(words[0].upper() + words[1:])}.</li>" for words in remedies)
+    remedy = f'<h3>What helps</h3><ul class="attempts">{cures}</ul>' if cures else ""
+    return (
+        f'<section class="verdict bad" id="verdict"><h2><b>No calibration: {escape(fault)}.</b></h2>{remedy}'
+        f"{tried}</section>"
     )
 
 
+def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -> str:
+    return filled(
+        "page.html",
+        name=escape(source.resolve().name),
+        about=f"{len(calibration.images)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
+        style=(PAGE / "page.css").read_text(),
+        sections="\n".join(sections),
+        links=_links(sections),
+        scene3d=(PAGE / "scene3d.js").read_text(),
+        copy=(PAGE / "copy.js").read_text(),
+        large=(PAGE / "large.js").read_text(),
+    )
+
+
+def _links(sections: Sequence[str]) -> str:
+    """To each section that has a heading."""
+    found = [name for section in sections for name in re.findall(r'<section[^>]* id="([^"]+)"', section)]
+    return "".join(f'<a href="#{name}">{LINKS[name]}</a>' for name in found if name in LINKS)
+
+
 def _verdict(calibration: CalibrationFile) -> str:
-    held_out, uncertainty = calibration.held_out, calibration.uncertainty
+    held_out, required = calibration.held_out, calibration.requirement
     miss = "" if held_out is None else missed(held_out)
+    short = shortfall(calibration)
     if calibration.doubt is not None:
-        headline = f"<b>Do not trust this calibration:</b> {escape(calibration.doubt)}."
-    elif miss:
-        headline = f"<b>Trusted:</b> images left out of the calibration are predicted to {miss} on average."
+        kind, headline = "bad", f"<b>Do not trust this calibration:</b> {escape(calibration.doubt)}."
+    elif short is not None:
+        say = escape(short.removeprefix(f"{SHORT}: "))
+        kind, headline = "fair", f"<b>{SHORT.capitalize()}:</b> {say}."
     else:
-        headline = "<b>Trusted</b> by its own account: nothing speaks against it, nor could a held-out image."
+        within = "nothing speaks against it" if required is None else escape(reached_in_words(required))
+        kind, headline = "good", f"<b>Trusted:</b> {within}."
     if held_out is None:
         believe = "There were too few images to leave one out and see how well the others predict it."
     elif not calibration.observability.observable:
         # An error along a direction that no motion shows changes no prediction.
-        believe = f"Its held-out error of {miss} is no comfort: what no motion shows, no image can miss."
+        believe = f"Its leave-one-out error of {miss} is no comfort: what no motion shows, no image can miss."
     elif not calibration.converged:
-        believe = f"Its held-out error of {miss} is no comfort: what is wrong with all images, none of them can miss."
+        no_comfort = "what is wrong with all images, none of them can miss"
+        believe = f"Its leave-one-out error of {miss} is no comfort: {no_comfort}."
     else:
         believe = (
-            f"Held-out error, the number to believe: {miss} ({escape(held_out.how)}). The residuals of a fit "
-            "shrink with few images even where it is wrong."
+            f"Beside it the leave-one-out error: {miss} ({escape(held_out.how)}). It is of one pose, with the robot's "
+            "own noise in it, and so mostly larger than the error of the transform, which all images have a part in."
         )
-    if uncertainty is not None:
-        believe += f" Least certain is the offset {escape(uncertainty.worst)} (one σ)."
-    kind = "good" if calibration.converged else "bad"
-    return f'<section class="verdict {kind}"><h2>{headline}</h2><p>{believe}</p></section>'
+    if calibration.uncertainty is not None:
+        believe += f" Least certain is the translation {escape(calibration.uncertainty.worst)} (one σ)."
+    return f'<section class="verdict {kind}" id="verdict"><h2>{headline}</h2><p>{believe}</p></section>'
 
 
 def _tiles(calibration: CalibrationFile) -> str:
     tiles = []
-    if (held_out := calibration.held_out) is not None:
-        degrees = f"{significant(held_out.rotation_deg)}°{pixels(held_out).replace(', ', ' · ')}"
-        tiles.append(("Held-out error", f"{significant(held_out.translation_mm)} mm", degrees))
+    required = calibration.requirement
     if (uncertainty := calibration.uncertainty) is not None:
         direction, _, size = uncertainty.worst.partition(": ")
         worst_deg = significant(max(uncertainty.rotation_std_deg))
-        tiles.append(("Offset, 1 σ", size, f"at worst, {direction}"))
-        tiles.append(("Orientation, 1 σ", f"±{worst_deg}°", "at worst, about gripper axes"))
-        if calibration.scale is not None:
-            percent = significant(uncertainty.scale_std_percent)
-            tiles.append(("Scale", significant(calibration.scale, 4), f"m per unit, ±{percent}\u00a0%"))
+        at = " ahead" if required is not None and required.distance_mm else ""
+        below_mm = "" if required is None else f"95 %{at} below {significant(required.reached_mm)} mm; "
+        below_deg = "" if required is None else f"95 % below {significant(required.reached_deg)}°; "
+        tiles.append(("Translation, 1 σ", size, f"{below_mm}worst {direction}"))
+        tiles.append(("Rotation, 1 σ", f"±{worst_deg}°", f"{below_deg}worst about an axis of the gripper"))
+    if (held_out := calibration.held_out) is not None:
+        degrees = f"{significant(held_out.rotation_deg)}°{pixels(held_out).replace(', ', ' · ')}"
+        tiles.append(("Leave-one-out error", f"{significant(held_out.translation_mm)} mm", degrees))
+    if uncertainty is not None and calibration.scale is not None:
+        percent = significant(uncertainty.scale_std_percent)
+        tiles.append(("Scale", significant(calibration.scale, 4), f"m per unit, ±{percent}\u00a0%"))
     used, all_images = calibration.images_used, len(calibration.images)
     tiles.append(
         (
@@ -147,8 +240,8 @@ def _tiles(calibration: CalibrationFile) -> str:
         degrees = f"{significant(noise.rotation_deg)}° per axis, {how}"
         tiles.append(("Robot's noise, 1 σ", f"{significant(noise.translation_mm)} mm", degrees))
     cells = [
-        f'<div class="tile"><div class="name">{name}</div><div class="number">{escape(number)}</div>'
-        f'<div class="more">{escape(more)}</div></div>'
+        f'<div class="{"tile first" if name in MAIN else "tile"}"><div class="name">{name}</div>'
+        f'<div class="number">{escape(number)}</div><div class="more">{escape(more)}</div></div>'
         for name, number, more in tiles
     ]
     return f'<div class="tiles">{"".join(cells)}</div>'
@@ -158,20 +251,23 @@ def _remarks(kind: str, title: str, remarks: Sequence[str]) -> str:
     if not remarks:
         return ""
     items = "".join(f"<li>{escape(remark)}</li>" for remark in remarks)
-    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>'
+    return f'<section class="{kind}" id="{kind}"><h2>{title}</h2><ul>{items}</ul></section>'
 
 
-def _before_after(result: RunResult, base_from_camera: Transforms) -> str:
-    grippers, lens = result.capture.base_from_gripper, result.lens
-    before, rows = result.reconstruction.recon_from_camera, result.reconstruction.image_index
-    return "".join(
-        [
-            camera_figure("Before: own frame and unit", grippers, before, None, lens, OBLIQUE),
-            camera_figure("After calibration and rescaling", grippers, base_from_camera, rows, lens, OBLIQUE),
-            camera_figure("Before, from above", grippers, before, None, lens, ABOVE),
-            camera_figure("After, from above", grippers, base_from_camera, rows, lens, ABOVE),
-        ]
-    )
+def _before_after(
+    grippers: Float[ndarray, "n 4 4"],
+    before: Float[ndarray, "m 4 4"],
+    after: Float[ndarray, "m 4 4"],
+    rows: Int[ndarray, " m"],
+    lens: Intrinsics,
+) -> str:
+    panels = [
+        camera_figure("Before: own frame and unit", grippers, before, None, lens, OBLIQUE),
+        camera_figure("After calibration and rescaling", grippers, after, rows, lens, OBLIQUE),
+        camera_figure("Before, from above", grippers, before, None, lens, ABOVE),
+        camera_figure("After, from above", grippers, after, rows, lens, ABOVE),
+    ]
+    return filled("before_after.html", panels="".join(panels))
 
 
 def _details(
@@ -180,7 +276,8 @@ def _details(
     timings = calibration.timings_s
     blocks = {"Time": {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}}
     blocks["Time"]["together"] = f"{sum(timings.values()):.1f} s"
-    for k, attempt in enumerate(calibration.attempts, start=1):
+    found = calibration.gripper_from_camera is not None  # else the failure has told of them
+    for k, attempt in enumerate(calibration.attempts if found else [], start=1):
         blocks["Time"][f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
     if (lens := calibration.intrinsics) is not None:
         blocks["Lens"] = {
@@ -191,6 +288,15 @@ def _details(
         }
     if (uncertainty := calibration.uncertainty) is not None and uncertainty.budget is not None:
         blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)
+    if (check := calibration.depth_check) is not None:
+        blocks["Depth camera"] = {
+            "its lengths, by the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
+            **{
+                f"noise at {z:.2f} m, 1 σ": f"{significant(1e3 * float(check.std_m(np.array(z))))} mm"
+                for z in check.distances_m
+            },
+            "looked at": f"{check.features} features of {check.images} images",
+        }
     if robot := _robot(calibration):
         blocks["Robot"] = robot
     if map_history:

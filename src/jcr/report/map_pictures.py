@@ -12,7 +12,7 @@ from jcr.geometry import apply, apply_similarity, inverse
 from jcr.report.figures import TRACK_COLOR, label_colors, picture_url, rendered_points, slice_figure
 from jcr.report.map_samples import CLEARANCE, SurfacePoints, point_size, slices
 from jcr.report.markup import filled
-from jcr.report.pictures import THUMBNAIL, shown_names
+from jcr.report.pictures import shown_names
 from jcr.results import RunResult
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ WIDE = 480
 """Pixels across of a picture that stands alone."""
 PAIRS = 4
 """Images that are shown beside the map."""
+THUMBNAIL = 320
+"""Pixels across of a rendered view."""
 
 
 def map_section(

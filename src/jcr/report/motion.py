@@ -10,7 +10,7 @@ from jcr.handeye.observability import WEAK
 from jcr.records import Excitation, NextPose
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button
-from jcr.results import RunResult
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 PARTS = ("offset x", "offset y", "offset z", "turn x", "turn y", "turn z", "scale")
@@ -21,7 +21,7 @@ GENERAL = 0.4
 """Excitation that general motions reach: the full length of a bar."""
 
 
-def motion_section(result: RunResult) -> str:
+def motion_section(result: RunResult | PosesResult) -> str:
     """Excitation of the seven directions, standard deviations of their parts, and the poses to add."""
     calibration = result.calibration
     observed, uncertainty = calibration.observability, calibration.uncertainty
@@ -77,7 +77,7 @@ def _spreads(name: str, std: Sequence[float], unit: str) -> str:
     return f'<table class="spread"><tbody>{"".join(rows)}</tbody></table>'
 
 
-def _next_poses(result: RunResult) -> str:
+def _next_poses(result: RunResult | PosesResult) -> str:
     """The proposed gripper poses, what each would leave uncertain, ready to copy."""
     poses, told = result.hand_eye.next_poses, result.calibration.next_poses
     if not poses:

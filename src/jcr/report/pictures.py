@@ -18,9 +18,8 @@ from jcr.report.markup import filled
 from jcr.results import RunResult
 from jcr.rounding import significant
 
-THUMBNAIL = 320
-"""Pixels across; half of it for more than MANY images."""
-MANY = 40
+LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
+"""Pixels across of the pictures, and of all together at most, which is about a megabyte; they open large."""
 MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
 
@@ -96,8 +95,10 @@ def _reprojections(result: RunResult) -> dict[int, str]:
 
 
 def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
-    """Every image as a small JPEG; a lens straightens it, so that it covers what the 3D view shows."""
-    width = THUMBNAIL if len(capture) <= MANY else THUMBNAIL // 2
+    """Every image as a JPEG of the size that there is room for; a lens straightens it, to what the 3D view shows."""
+    shape = capture.image_size[1] / capture.image_size[0]
+    width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
+    width = max(width, SMALLEST)
 
     def thumbnail(name: str) -> str:
         pixels = read_image(capture.folder / name)

@@ -11,11 +11,11 @@ from jcr.calibration.words import missed
 from jcr.records import HandEye
 from jcr.report.markup import filled
 from jcr.report.pictures import shown_names
-from jcr.results import RunResult
+from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
 
-def residuals_section(result: RunResult) -> str:
+def residuals_section(result: RunResult | PosesResult) -> str:
     """Residuals image by image and of the whole, before and after the images' features refined the fit."""
     now, refinement = result.hand_eye, result.hand_eye.refinement
     rows, used = [], now.inliers
@@ -25,7 +25,7 @@ def residuals_section(result: RunResult) -> str:
         for residual in (_residual_mm, _residual_deg)
     )
     names = shown_names(result.calibration.images)
-    for k, row in enumerate(result.reconstruction.image_index):
+    for k, row in enumerate(result.image_index):
         position = _bar([_residual_mm(fit)[k] for fit in fits], longest_mm, " mm")
         orientation = _bar([_residual_deg(fit)[k] for fit in fits], longest_deg, "°")
         rows.append(
@@ -45,6 +45,7 @@ def residuals_section(result: RunResult) -> str:
         )
     return filled(
         "residuals.html",
+        noise=_why_noise_is_larger(now),
         tick=tick,
         rows="".join(rows),
         heads="".join(f"<th>{head}</th>" for head in heads),
@@ -61,6 +62,20 @@ def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
     return np.degrees(fit.rotation_residual_rad)
 
 
+def _why_noise_is_larger(fit: HandEye) -> str:
+    """Why the robot's noise per axis is not the size of the residuals."""
+    count = 6 * int(fit.inliers.sum())
+    taken = np.sqrt(count / max(count - 13, 1))
+    noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
+    return (
+        f"The robot's noise ({significant(1e3 * noise)} mm per axis"
+        + (f", {significant(1e3 * together)} mm with systematic errors" if together > 1.05 * noise else "")
+        + f") may be more than what these bars suggest: 13 unknowns were fitted to {count} numbers and took part of it "
+        f"away (a factor of {taken:.2f}), features pull the poses towards them, and of few images its size is itself "
+        "uncertain, which is counted. A bar is the length of three axes together."
+    )
+
+
 def _bar(values: Sequence[float], longest: float, unit: str) -> str:
     """A bar for the first value, a tick for the second if there is one."""
     shares = [min(100 * value / longest, 100) for value in values]
@@ -74,7 +89,7 @@ def _bar(values: Sequence[float], longest: float, unit: str) -> str:
 def _whole(fits: Sequence[HandEye]) -> str:
     held_out = [missed(fit.held_out) if fit.held_out else "–" for fit in fits]
     rows = {
-        "held-out error": held_out,
+        "leave-one-out error": held_out,
         "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residual_translation)} mm" for fit in fits],
         "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residual_rotation) for fit in fits],
     }

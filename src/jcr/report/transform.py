@@ -3,7 +3,14 @@
 import json
 from html import escape
 
-from jcr.export.ros import CHILD, PARENT, static_transform_publisher, urdf_origin
+from jcr.export.ros import (
+    CHILD,
+    PARENT,
+    camera_info,
+    camera_mount,
+    static_transform_publisher,
+    urdf_origin,
+)
 from jcr.records import HandEye
 from jcr.report.markup import filled
 from jcr.report.notations import Notation, matrix_json, notations
@@ -23,9 +30,24 @@ def transform_section(hand_eye: HandEye) -> str:
         copy_ros=copy_button(ros, "the ROS 2 command"),
         urdf=escape(urdf),
         copy_urdf=copy_button(urdf, "the URDF origin"),
+        camera_info=_camera_info(hand_eye),
         parent=PARENT,
         child=CHILD,
         doubt="" if hand_eye.converged else '<p class="why">Not to be trusted: see above.</p>',
+    )
+
+
+def _camera_info(hand_eye: HandEye) -> str:
+    """The intrinsics that belong to the transform; empty where there are none."""
+    if hand_eye.intrinsics is None:
+        return ""
+    mount = camera_mount(hand_eye.gripper_from_camera, hand_eye.covariance, PARENT, CHILD)
+    text = camera_info(mount, hand_eye.intrinsics)
+    return (
+        '<div class="notation wide"><header><h3>camera_info (ROS)</h3>'
+        f"{copy_button(text, 'camera_info')}</header><details><summary>intrinsics as camera_info_manager reads them"
+        f'</summary><pre>{escape(text)}</pre></details><p class="note">The transform was found with these: use both '
+        "together.</p></div>"
     )
 
 

@@ -1,18 +1,20 @@
 """How a map is built; apart from the building, so that the command line's help need not import SciPy and torch."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
 class CloudOptions:
     """Which points of the pointmaps enter the map."""
 
-    confidence_percentile: float = 20.0
+    confidence_percentile: Annotated[float, tyro.conf.arg(metavar="PERCENT")] = 20.0
     """Drop this share (%) of the points that rest on matching or a prediction alone, the least confident first."""
     confidence_threshold: float | None = None
     """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
-    max_points: int = 200_000
+    max_points: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 200_000
     """Keep at most so many points, drawn evenly over the pixels of all images."""
     cloud_seed: int = 0
     """Seed of that draw."""
@@ -27,14 +29,17 @@ class MapOptions:
     negatives, slower and coarser."""
     joint: bool = False
     """One network for all properties instead of one for each."""
-    workspace: tuple[float, float, float, float, float, float] | None = None
-    """Box of the map in the base frame (m): xmin ymin zmin xmax ymax zmax; by default it holds the points and the
+    workspace: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
+    ] = None
+    """Box of the map in the base frame (m); unset: it holds the points and the
     cameras."""
-    cell: float = 0.01
+    cell: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
     """Side (m) of the finest feature cells; what was seen is kept at half of it."""
-    max_cells: int = 4_000_000
+    max_cells: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 4_000_000
     """Enlarge the cells until the workspace holds no more than so many."""
-    max_seconds: float = 60.0
+    max_seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0
     """Stop the training after this time at the latest; it stops by itself on a plateau."""
     map_seed: int = 0
     """Seed of the samples and of the initial weights."""

@@ -1,20 +1,22 @@
 """What divides a scene into objects, apart from the code that does it so that the command line stays quick."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
 class TabletopOptions:
     """What counts as an object on the table."""
 
-    object_lowest: float = 0.008
+    object_lowest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.008
     """Height (m) above the plane from which points found an object; lower ones may join it."""
-    object_highest: float = 0.6
+    object_highest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.6
     """Height (m) above the plane beyond which nothing belongs to an object."""
-    object_gap: float = 0.01
+    object_gap: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
     """Objects with this much room (m) between them, seen from above, are told apart."""
-    object_smallest: float = 0.015
+    object_smallest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.015
     """Objects whose points span less (m) than this are taken for noise."""
 
 
@@ -25,6 +27,6 @@ class SegmentOptions:
     segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
     """labels: labels/NAME.png beside the images' folder; tabletop: the plane that carries the scene and what stands
     on it; sam: Segment Anything 2 (pip install 'jcr-handeye[sam]'); auto: labels where there are some, else tabletop."""
-    sam_weights: str = "facebook/sam2.1-hiera-tiny"
+    sam_weights: Annotated[str, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)

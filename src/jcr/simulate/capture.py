@@ -3,11 +3,12 @@
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+import tyro
+from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.capture.images import encode_png
@@ -78,6 +79,9 @@ class SimulateOptions:
     """Sigma of the pixel noise, in grey levels of 255."""
     blur: float = 0.0
     """Sigma of the blur, in pixels."""
+    depth: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="PERCENT MM")] = None
+    """Depth images as a depth camera takes them: lengths too long by so much, and the sigma of a depth at 1 m, which
+    grows with the square of the distance; none at edges."""
     vignetting: float = 0.0
     """Share of light lost in the corners, 0 to 1."""
     jpeg_quality: int | Literal["lossless"] = 90
@@ -124,14 +128,21 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
         objects=scene.true_objects,
     )
     views = render(
-        scene, truth.intrinsics, truth.base_from_camera, options.texture, with_truth=options.truth == "full"
+        scene,
+        truth.intrinsics,
+        truth.base_from_camera,
+        options.texture,
+        with_truth=options.truth == "full" or options.depth is not None,
     )
     for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
         image = _degraded(view.image, options, np.random.default_rng([options.seed, 7, k]))
         write_bytes(out / truth.images[k], _encoded(image, options.jpeg_quality))
-        if view.depth is not None and view.label is not None:
+        if options.truth == "full" and view.depth is not None and view.label is not None:
             write_depth(truth, k, view.depth)
             write_labels(truth, k, view.label)
+        if view.depth is not None and options.depth is not None:
+            measured = _measured(view.depth, options.depth, np.random.default_rng([options.seed, 8, k]))
+            write_bytes(out / _depth_name(k), encode_png(measured))
     write_truth(truth)
     if arm is None:
         reference = {"gripper_from_camera": gripper_from_camera.tolist(), "how": "simulated, exact"}
@@ -149,12 +160,29 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
             truth.images, with_robot_noise(reported, *options.robot_noise, robot), strict=True
         )
     ]
+    if options.depth is not None:
+        for k, frame in enumerate(frames):
+            frame["depth"] = _depth_name(k)
     if arm is not None:
         for frame, row in zip(frames, arm.joints.tolist(), strict=True):
             frame["joints"] = row
     # Last: a folder with a capture.json is a complete capture.
     write_text(out / "capture.json", json.dumps(_capture_json(truth, options, frames), indent=1) + "\n")
     return out
+
+
+def _depth_name(image: int) -> str:
+    return f"depth/{image:02d}.png"
+
+
+def _measured(
+    depth: Float[ndarray, "h w"], wrong: tuple[float, float], draw: np.random.Generator
+) -> UInt16[ndarray, "h w"]:
+    """Depth (mm) as a depth camera of that scale error and noise measures it; 0 where it sees none."""
+    percent, noise_mm = wrong
+    edge = np.ptp([np.roll(depth, step, axis) for step in (-1, 1) for axis in (0, 1)], axis=0) > 0.03 * depth
+    noisy = (1 + percent / 100) * depth + 1e-3 * noise_mm * depth**2 * draw.normal(size=depth.shape)
+    return np.where(edge | (depth <= 0), 0, 1e3 * noisy).round().clip(0, 65535).astype(np.uint16)
 
 
 @dataclass(frozen=True)
@@ -198,6 +226,9 @@ def _check(out: Path, options: SimulateOptions) -> None:
     for option, size in bends.items():
         if size and options.robot is None:
             raise InputError(f"{option} {size:g}: errors of an arm; name it with --robot")
+    if options.depth is not None and (options.depth[0] <= -100 or options.depth[1] < 0):
+        percent, mm = options.depth
+        raise InputError(f"--depth {percent:g} {mm:g}: give percent over -100, and a sigma of 0 mm or more")
     if options.lens_error and options.unknown_intrinsics:
         raise InputError(
             f"--lens-error {options.lens_error:g}: no intrinsics are given; leave one of both out"

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
+from jcr.capture.depth_images import read_depth
 from jcr.capture.images import read_image
 from jcr.extras import extra
 from jcr.geometry import ARM, rotation_between_deg, transform
@@ -18,6 +19,8 @@ from jcr.simulate.problem import disturbed
 
 FPS, TF_HZ = 30.0, 100.0
 START_NS = 1_700_000_000_123_456_789
+DEPTH_LATER_NS = 5_000_000
+"""Colour and depth are not of the same instant."""
 BLUR_PX_PER_M = 30.0
 """Length of the blur (px) per m/s: 600 px of focal length, half a metre away, 25 ms of exposure."""
 
@@ -44,7 +47,8 @@ def write_bag(
 ) -> Path:
     """A bag in which the arm stops at every view of a capture and moves smoothly between them.
 
-    Topics: /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
+    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
+    /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
     /tf_static (world to base_link).
     """
     rosbag1, rosbag2 = extra("rosbags.rosbag1", "ros", "a bag"), extra("rosbags.rosbag2", "ros", "a bag")
@@ -126,6 +130,15 @@ def _messages(
             poses = disturbed(poses, (jitter, jitter / ARM), rng)
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
+        if capture.depths is not None and (name := capture.depths[round(float(rows[0]))]) is not None:
+            depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
+            fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
+            later = header(at + DEPTH_LATER_NS, "camera")
+            yield (
+                at,
+                "/camera/aligned_depth_to_color/image_raw",
+                types["sensor_msgs/msg/Image"](later, *fields),
+            )
         picture = _blurred(pictures[round(float(rows[0]))], float(speeds[0]), rng)
         if compressed:
             data = np.asarray(cv2.imencode(".jpg", picture[:, :, ::-1])[1]).ravel()

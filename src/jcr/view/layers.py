@@ -1,5 +1,6 @@
 """What the viewer draws of a map: points by occupancy, the edge of the unknown, and level slices."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -63,6 +64,28 @@ def unknown_edge(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarra
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     vertices, faces, _, _ = marching_cubes(unknown.astype(np.float32), 0.5)
     return low + pitch * (vertices + 0.5), faces
+
+
+def colour_bar(colors: Sequence[Sequence[int]], low: str, high: str) -> str:
+    """A bar of RGB colours from left to right, named at both ends, as HTML."""
+    stops = ", ".join(f"rgb({r}, {g}, {b})" for r, g, b in colors)
+    return (
+        '<div style="padding: 0 0.7em 0.4em; font-size: 0.75em">'
+        f'<div style="height: 0.8em; border-radius: 3px; background: linear-gradient(to right, {stops})"></div>'
+        f'<div style="display: flex; justify-content: space-between"><span>{low}</span><span>{high}</span></div></div>'
+    )
+
+
+SLICE_LEGENDS: dict[str, str] = {
+    "distance": colour_bar(
+        matplotlib.colormaps["plasma"](np.linspace(1, 0, 9), bytes=True)[:, :3].tolist(),
+        "surface (solid: red)",
+        f"{100 * FAR:.0f} cm and more",
+    ),
+    "occupancy": colour_bar([(255, 255, 255), (37, 99, 235)], "free", "occupied (unknown: grey)"),
+    "unknown": colour_bar([(110, 110, 110)] * 2, "grey: nobody has looked there", ""),
+}
+"""What the colours of `level_slice` mean."""
 
 
 def level_slice(scene: SceneMap, height: float, of: SliceOf, unknown: Unknown) -> UInt8[ndarray, "h w 4"]:

@@ -11,10 +11,21 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from viser.extras import ViserUrdf
 
+from jcr.calibration.words import reached_in_words, shortfall
+from jcr.geometry import apply
 from jcr.progress import Progress, silent
 from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.represent.scene import Unknown
-from jcr.view.layers import LEAST, MapPoints, SliceOf, level_slice, map_points, unknown_edge
+from jcr.view.layers import (
+    LEAST,
+    SLICE_LEGENDS,
+    MapPoints,
+    SliceOf,
+    colour_bar,
+    level_slice,
+    map_points,
+    unknown_edge,
+)
 from jcr.view.run import ViewedRun
 
 CAMERA, CHOSEN, REJECTED = (200, 110, 30), (37, 99, 235), (200, 50, 43)
@@ -22,6 +33,8 @@ FREE, COLLIDES = (40, 160, 90), (220, 40, 40)
 CLOUD, MAP = "points as measured", "map"
 REACH = 0.05
 """Metres from a drawn camera to its image plane."""
+BEFORE = 0.1
+"""Metres from a camera to the photograph that is laid over the map."""
 CLICK = 0.006
 """Radians about a click's ray within which a point is meant."""
 Value = Float[ndarray, "3"]
@@ -70,9 +83,13 @@ class Viewer:
         lines = []
         if not calibration.converged:
             lines.append(f"**Do not trust this calibration:** {calibration.warnings[0]}")
-        elif held_out is not None:
+        elif (short := shortfall(calibration)) is not None:
+            lines.append(f"**{short}**")
+        elif calibration.requirement is not None:
+            lines.append(f"**Trusted:** {reached_in_words(calibration.requirement)}")
+        if calibration.converged and held_out is not None:
             lines.append(
-                f"Held-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
+                f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
                 f"{len(self.run.image)} cameras."
             )
         return "\n\n".join([*lines, *self.run.notes])
@@ -81,6 +98,14 @@ class Viewer:
         server, run, lens = self.server, self.run, self.run.lens
         server.scene.add_frame("/base", axes_length=0.1, axes_radius=0.003)
         server.scene.add_label("/base/name", "base")
+        self._grid = server.scene.add_grid(
+            "/grid",
+            infinite_grid=True,
+            cell_size=0.1,
+            section_size=0.5,
+            fade_distance=6.0,
+            fade_from="origin",
+        )
         self.frusta, self.grippers = [], []
         fov, aspect = 2 * float(np.arctan2(lens.height / 2, lens.fy)), lens.width / lens.height
         step = max(1, lens.width // 160)
@@ -103,15 +128,18 @@ class Viewer:
             self.grippers.append(
                 server.scene.add_frame(f"/grippers/{k}", axes_length=0.03, axes_radius=0.001, **at)
             )
+        self._photo = server.scene.add_image("/photo", np.zeros((2, 2, 4), np.uint8), 0.1, 0.1, visible=False)
         with server.gui.add_folder("Capture"):
             self.image = server.gui.add_slider("image", 0, len(run.calibration.images) - 1, 1, 0)
             self._about_image = server.gui.add_markdown("")
             look = server.gui.add_button("look from this camera")
+            self.photo = server.gui.add_slider("photograph over the map (%)", 0, 100, 5, 0)
             self.show_cameras = server.gui.add_checkbox("cameras", True)
             self.show_grippers = server.gui.add_checkbox("grippers", True)
+            self.show_grid = server.gui.add_checkbox("ground grid (0.1 m, base z = 0)", True)
             self.show_robot = server.gui.add_checkbox("robot", True, visible=self.joint_values is not None)
         self.image.on_update(lambda _: self.choose_image())
-        for switch in (self.show_cameras, self.show_grippers, self.show_robot):
+        for switch in (self.show_cameras, self.show_grippers, self.show_robot, self.show_grid, self.photo):
             switch.on_update(lambda _: self.choose_image())
         look.on_click(lambda event: self.look_from(self._camera_of_image(), event.client))
 
@@ -137,6 +165,7 @@ class Viewer:
             self.show_unknown = gui.add_checkbox("edge of the unknown", False)
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
+            self._slice_legend = gui.add_html("")
             bottom, top = float(low[2].round(3)), float(high[2].round(3))
             self.slice_at = gui.add_slider(
                 "slice at z (m)", bottom, top, 0.005, round(self._support() + 0.02, 3)
@@ -204,11 +233,30 @@ class Viewer:
                 frustum.visible = self.show_cameras.value
             for gripper in self.grippers:
                 gripper.visible = self.show_grippers.value
+            self._grid.visible = self.show_grid.value
+            self._show_photo(camera)
             if self.robot is not None and self.joint_values is not None:
                 self.robot.show_visual = self.show_robot.value
                 pose = np.flatnonzero(self.run.gripper_image == row)
                 if len(pose):
                     self.robot.update_cfg(self.joint_values[pose[0]])
+
+    def _show_photo(self, camera: int | None) -> None:
+        """The chosen camera's photograph before it, so that from there it lies over what the map says."""
+        share = self.photo.value / 100
+        self._photo.visible = camera is not None and share > 0
+        if camera is None or share == 0:
+            return
+        lens, pose = self.run.lens, self.run.base_from_camera[camera]
+        for frustum in self.frusta:  # theirs would lie before it
+            frustum.visible = False
+        opaque = np.full((*self.run.pictures.shape[1:3], 1), round(255 * share), np.uint8)
+        self._photo.image = np.concatenate([self.run.pictures[camera], opaque], axis=-1)
+        size, focal = np.array([lens.width, lens.height]), np.array([lens.fx, lens.fy])
+        middle = ((size - 1) / 2 - [lens.cx, lens.cy]) / focal
+        self._photo.render_width, self._photo.render_height = (BEFORE * size / focal).tolist()
+        self._photo.wxyz = _wxyz(pose)
+        self._photo.position = apply(pose, BEFORE * np.array([*middle, 1.0]))
 
     def look_from(self, camera: int | None, client: viser.ClientHandle | None) -> None:
         """Bring a reader's eye to a registered camera and choose its image; None does nothing."""
@@ -249,13 +297,16 @@ class Viewer:
         if self.colored.value == "label":
             return self._palette[points.label]
         if self.colored.value == "occupancy":
-            share = points.occupancy[:, None]
-            return (share * [37, 99, 235] + (1 - share) * [215, 220, 230]).astype(np.uint8)
+            return _by_occupancy(points.occupancy[:, None])
         return points.color
 
     def _labels(self) -> str:
-        if self.scene is None or self.colored.value != "label":
+        if self.scene is None or self.colored.value == "color":
             return ""
+        if self.colored.value == "occupancy":
+            return colour_bar(
+                [_by_occupancy(np.array([share])).tolist() for share in (0.0, 0.5, 1.0)], "occupancy 0", "1"
+            )
         return " ".join(
             f'<span style="color:rgb({r},{g},{b})">&#9632;</span> {escape(name)}'
             for name, (r, g, b) in zip(self.scene.label_names, self._palette.tolist(), strict=True)
@@ -269,6 +320,7 @@ class Viewer:
                 self._unknown.visible = self.show_unknown.value
             of, height = self.slice_of.value, self.slice_at.value
             self._slice.visible = of != "none"
+            self._slice_legend.content = SLICE_LEGENDS.get(of, "")
             if of == "none":
                 return
             self._slice.image = level_slice(self.scene, height, of, self.unknown.value)
@@ -355,6 +407,10 @@ class Viewer:
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
         eye = target + 1.9 * reach * np.array([0.62, -0.62, 0.6])
         self.server.initial_camera.position, self.server.initial_camera.look_at = eye, target
+
+
+def _by_occupancy(share: Float[ndarray, "*n 1"]) -> UInt8[ndarray, "*n 3"]:
+    return (share * np.array([37, 99, 235]) + (1 - share) * np.array([215, 220, 230])).astype(np.uint8)
 
 
 def _wxyz(a_from_b: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:

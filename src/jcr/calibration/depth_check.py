@@ -1,0 +1,95 @@
+"""A depth camera against the robot: its scale error, and its noise by distance, at the features of the images.
+
+Depth cameras are off by a few percent in scale, differently from one to the next, and their noise grows with the square
+of the distance (Khoshelham and Elberink, Sensors 2012). The robot's metre is the better one, so depth has no part in the
+calibration; it is measured by it.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.optimize import nnls
+
+from jcr.capture.depth_images import read_depth
+from jcr.geometry import apply, inverse
+from jcr.records import Capture, DepthCheck, HandEye, Reconstruction
+
+MIN_IMAGES, MIN_FEATURES = 3, 60
+"""Fewer do not tell."""
+OUTSIDE = 0.3
+"""Relative difference beyond which a depth is of another thing than its feature, once the common one is taken off."""
+BINS = 8
+"""Of distance, in which noise is measured."""
+NORMAL = 1.4826
+"""Standard deviations of a normal error in its median absolute deviation."""
+
+
+def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> DepthCheck | None:
+    """What the robot says of the depth images; None without any, or where too few features have a depth.
+
+    Raises InputError where a depth image cannot be read.
+    """
+    if capture.depths is None:
+        return None
+    measured, predicted, image = _pairs(capture, reconstruction, hand_eye.scale, capture.depths)
+    off = np.log(measured / predicted)
+    rows, count = np.unique(image, return_counts=True)
+    rows = rows[count >= MIN_FEATURES // 6]
+    if len(rows) < MIN_IMAGES or len(off) < MIN_FEATURES:
+        return None
+    # An image's features share what its pose is off by, so images are counted and not features.
+    medians = np.array([np.median(off[image == row]) for row in rows])
+    common = float(np.median(medians))
+    spread = NORMAL * float(np.median(np.abs(medians - common)))
+    std = np.hypot(1.2533 * spread / np.sqrt(len(rows)), np.sqrt(hand_eye.covariance[6, 6]))
+    same = np.abs(off - common) < OUTSIDE
+    depth = predicted[same]
+    noise_m, noise_per_m = _noise(depth, measured[same] / np.exp(common) - depth)
+    near, far = np.percentile(depth, [5, 95])
+    return DepthCheck(
+        off_percent=100 * float(np.expm1(common)),
+        std_percent=100 * float(std),
+        noise_m=noise_m,
+        noise_per_m=noise_per_m,
+        distances_m=(float(near), float(far)),
+        images=len(rows),
+        features=int(same.sum()),
+    )
+
+
+def _pairs(
+    capture: Capture, reconstruction: Reconstruction, scale: float, depths: tuple[str | None, ...]
+) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"], Int[ndarray, " k"]]:
+    """Measured depths (m) and those by the robot of all features that have both, and their images."""
+    tracks = reconstruction.tracks
+    parts = []
+    for k, row in enumerate(reconstruction.image_index):
+        if row >= len(depths) or (name := depths[row]) is None:
+            continue
+        depth = read_depth(capture.folder / name, capture.image_size)
+        seen = np.flatnonzero(tracks.image == k)
+        u, v = np.rint(tracks.x_px[seen]).astype(int).T
+        inside = (u >= 1) & (v >= 1) & (u < depth.shape[1] - 1) & (v < depth.shape[0] - 1)
+        seen, u, v = seen[inside], u[inside], v[inside]
+        around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+        x_in_camera = apply(
+            inverse(reconstruction.recon_from_camera[k]), tracks.points_in_recon[tracks.point[seen]]
+        )
+        # At the edge of a thing, colour and depth are of different ones.
+        whole = (around > 0).all(0) & (np.ptp(around, axis=0) < 0.03 * around[4]) & (x_in_camera[:, 2] > 0)
+        parts.append((around[4][whole].astype(float), scale * x_in_camera[whole, 2], np.full(whole.sum(), k)))
+    if not parts:
+        return np.zeros(0), np.zeros(0), np.zeros(0, int)
+    measured, predicted, image = map(np.concatenate, zip(*parts, strict=True))
+    return measured, predicted, image
+
+
+def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
+    """a (m) and b (1/m) of sigma² = a² + (b z²)², by the spread of the residuals in bins of distance."""
+    bins = np.array_split(np.argsort(depth), BINS)
+    z = np.array([np.median(depth[rows]) for rows in bins])
+    variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])
+    # Relative, for a variance that is estimated is as uncertain as it is large.
+    design = np.stack([np.ones(BINS), z**4], 1) / variance[:, None].clip(1e-12)
+    (constant, growing), _ = nnls(design, np.ones(BINS))
+    return float(np.sqrt(constant)), float(np.sqrt(growing))

@@ -1,0 +1,68 @@
+"""Depth of a camera that measures it: 16-bit PNG in mm, aligned with the colour images, 0 where there is none."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+from PIL import Image
+
+from jcr.capture.plain_files import contained, shown
+from jcr.errors import InputError
+
+FOLDER = "depth"
+"""Beside the images of a table."""
+Names = tuple[str | None, ...]
+
+
+def read_depth(path: Path, size: tuple[int, int]) -> Float32[ndarray, "h w"]:
+    """Depth along the optical axis (m) at the pixels of images of `size`; 0 where the camera measured none.
+
+    Raises InputError where the file is no 16-bit grey image of that size.
+    """
+    try:
+        with Image.open(path) as opened:
+            mode, found = opened.mode, opened.size
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such depth image; correct its name in the capture or add it") from None
+    except Exception as error:  # decoders raise whatever a damaged file makes them
+        raise InputError(f"{path}: not a readable image ({error}); save it again as 16-bit PNG") from None
+    if not mode.startswith("I"):
+        raise InputError(f"{path}: a depth image has 16 bits and one channel (mm), this is {mode}")
+    if found != size:
+        raise InputError(
+            f"{path}: {found[0]}x{found[1]} beside images of {size[0]}x{size[1]}; align depth with colour (ROS: "
+            "align_depth.enable, librealsense: rs.align)"
+        )
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+        raise InputError(f"{path}: not a readable 16-bit image; save it again as 16-bit PNG")
+    return depth.astype(np.float32) / 1000
+
+
+def depth_of_frames(frames: Sequence[dict[str, object]], folder: Path, where: str) -> Names | None:
+    """Paths of depth images from the frames of a capture.json; None where no frame names one."""
+    names = [frame.get("depth") for frame in frames]
+    if all(name is None for name in names):
+        return None
+    kept: list[str | None] = []
+    for i, name in enumerate(names):
+        if name is not None and not isinstance(name, str):
+            raise InputError(f"{where}: depth of frame {i} is {shown(name)}; give the image's path as text")
+        if name is not None:
+            contained(folder, name, f"{where}: depth of frame {i}")
+            if not (folder / name).is_file():
+                raise InputError(f"{where}: depth image {name} is not there; add it, or remove the key")
+        kept.append(name)
+    return tuple(kept)
+
+
+def depth_beside(folder: Path, images: Sequence[str]) -> Names | None:
+    """Depth images in depth/, named as the images; None where there are none."""
+    names = [f"{FOLDER}/{Path(name).stem}.png" for name in images]
+    there = [(folder / name).is_file() for name in names]
+    if not any(there):
+        return None
+    return tuple(name if is_there else None for name, is_there in zip(names, there, strict=True))

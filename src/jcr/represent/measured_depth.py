@@ -1,0 +1,107 @@
+"""Measured depth in pointmaps: scaled by the robot, weighed by its own noise, and held against what images match."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from jcr.camera import project, rays
+from jcr.capture.depth_images import read_depth
+from jcr.geometry import apply, inverse
+from jcr.records import MATCHED, PRIOR, Capture, HandEye, Reconstruction
+
+TOO_WRONG = 20.0
+"""Percent by which a depth camera's lengths may be off; more is another unit, or another camera's depth."""
+AGREES = 3.0
+"""Standard deviations within which matched and measured depth are of one thing."""
+SLOPE = 0.05
+"""Relative difference of depth between neighbouring pixels, beyond which one mixes both sides of an edge."""
+UNKNOWN = 0.02
+"""Relative sigma of depths that come without one."""
+REACH_M = (0.1, 6.0)
+"""Depth cameras for arms measure in between."""
+
+
+def with_measured_depth(
+    capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye
+) -> tuple[Reconstruction, tuple[str, ...]]:
+    """The reconstruction with the depth images in its pointmaps, and what the user should know of them.
+
+    Depth is divided by what the robot says it is too long. Where images match a depth too, the two are averaged if they
+    agree, and else the matched one stays, for several images say it; planes that were filled in give way.
+    """
+    check = hand_eye.depth_check
+    if capture.depths is None:
+        return reconstruction, ()
+    if check is None or not hand_eye.converged:
+        return reconstruction, ("the depth images are not used: the robot cannot tell their scale",)
+    if abs(check.off_percent) > TOO_WRONG:
+        return reconstruction, (
+            f"the depth images are not used: their lengths are {check.off_percent:+.0f} % off by the robot; they must "
+            "be in mm and aligned with the colour images",
+        )
+    std = (
+        np.zeros_like(reconstruction.confidence)
+        if reconstruction.depth_std is None
+        else reconstruction.depth_std
+    )
+    points, confidence, std = (
+        reconstruction.points_in_recon.copy(),
+        reconstruction.confidence.copy(),
+        std.copy(),
+    )
+    known = confidence > 0
+    reason = (
+        np.where(known, MATCHED, 0).astype(np.uint8)
+        if reconstruction.reason is None
+        else reconstruction.reason.copy()
+    )
+    usual = float(np.median(confidence[known])) if known.any() else 1.0
+    against = both = 0
+    ray = rays(reconstruction.pointmap_intrinsics)
+    at = np.rint(project(reconstruction.intrinsics, ray)).astype(int)
+    for k, row in enumerate(reconstruction.image_index):
+        if row >= len(capture.depths) or (name := capture.depths[row]) is None:
+            continue
+        depth, inside = _sampled(read_depth(capture.folder / name, capture.image_size), at)
+        z = depth / (1 + 0.01 * check.off_percent)
+        sigma = check.std_m(z)
+        recon_from_camera = reconstruction.recon_from_camera[k]
+        there = hand_eye.scale * apply(inverse(recon_from_camera), points[k].astype(float))[..., 2]
+        matched = known[k] & (reason[k] != PRIOR)
+        of_matched = np.where(std[k] > 0, hand_eye.scale * std[k].astype(float), UNKNOWN * there)
+        agrees = inside & matched & (np.abs(z - there) < AGREES * np.hypot(sigma, of_matched))
+        against += int((inside & matched & ~agrees).sum())
+        both += int((inside & matched).sum())
+        share = np.where(agrees, sigma**2 / (sigma**2 + of_matched**2), 0.0)
+        z = share * there + (1 - share) * z
+        sigma = np.where(agrees, of_matched * np.sqrt(share), sigma)
+        new = agrees | (inside & ~matched)
+        x_in_recon = apply(recon_from_camera, (z / hand_eye.scale)[..., None] * ray)
+        points[k][new] = x_in_recon[new]
+        std[k][new] = sigma[new] / hand_eye.scale
+        confidence[k][new & ~matched] = usual
+        reason[k][new] = MATCHED
+    notes = ()
+    if both and against > 0.2 * both:
+        notes = (
+            f"measured and matched depth differ at {100 * against / both:.0f} % of the pixels that have both; there the "
+            "matched one is kept",
+        )
+    found = replace(
+        reconstruction, points_in_recon=points, confidence=confidence, depth_std=std, reason=reason
+    )
+    return found, notes
+
+
+def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:
+    """The depth (m) at pixels (u, v), and where it is one: of no edge, and within reach."""
+    height, width = depth.shape
+    u, v = at[..., 0], at[..., 1]
+    inside = (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)
+    u, v = u.clip(1, width - 2), v.clip(1, height - 2)
+    around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)]).astype(float)
+    z = around[4]
+    whole = (around > 0).all(0) & (np.ptp(around, axis=0) < SLOPE * z)
+    return z, inside & whole & (z > REACH_M[0]) & (z < REACH_M[1])

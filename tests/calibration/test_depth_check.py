@@ -1,0 +1,172 @@
+"""A depth camera whose scale is wrong: the robot says by how much, and the map has it corrected."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file
+from jcr.calibration.depth_check import depth_check
+from jcr.calibration.words import summary
+from jcr.camera import rays
+from jcr.capture.depth_images import read_depth
+from jcr.capture.images import encode_png
+from jcr.capture.read import read_capture
+from jcr.errors import InputError
+from jcr.files import write_bytes
+from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.represent.measured_depth import with_measured_depth
+
+LENS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
+OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
+"""Too long by 3 %; sigma 2 mm at 0.7 m."""
+X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconstruction, HandEye, np.ndarray]:
+    """A capture with depth images, its features, the calibration, and the true depth."""
+    folder, draw = tmp_path_factory.mktemp("depth"), np.random.default_rng(0)
+    base_from_camera = looking_at_table(12)
+    true = np.stack([cast_depth(pose, LENS) for pose in base_from_camera])
+    wrong = OFF * true + NOISE_PER_M * true**2 * draw.normal(size=true.shape)
+    wrong[:, 50:60, 100:120] = 0
+    names = tuple(f"depth/{k}.png" for k in range(len(true)))
+    for name, depth in zip(names, wrong, strict=True):
+        write_bytes(folder / name, encode_png(np.rint(1e3 * depth).clip(0, 65535).astype(np.uint16)))
+    gripper = base_from_camera @ inverse(X)
+    gripper[:, :3, 3] += 3e-4 * draw.normal(size=(12, 3))
+    images = tuple(f"{k}.png" for k in range(12))
+    capture = Capture(folder, images, gripper, (WIDTH, HEIGHT), LENS, depths=names)
+    base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
+    cameras = inverse(base_from_recon) @ base_from_camera
+    cameras[:, :3, 3] /= SCALE
+    return capture, _reconstruction(cameras, true, draw), solve_hand_eye(gripper, cameras), true
+
+
+def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Generator) -> Reconstruction:
+    count = 150
+    image = np.repeat(np.arange(len(true)), count)
+    v, u = draw.integers(1, HEIGHT - 1, image.shape), draw.integers(1, WIDTH - 1, image.shape)
+    hit = true[image, v, u] > 0
+    image, v, u = image[hit], v[hit], u[hit]
+    z = true[image, v, u] / SCALE * (1 + 1e-3 * draw.normal(size=len(u)))
+    points = np.stack([apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(LENS)[v, u], strict=True)])
+    tracks = Tracks(image, np.stack([u, v], 1).astype(float), np.arange(len(image)), points)
+    nothing = np.zeros(true.shape)
+    return Reconstruction(
+        np.arange(len(true)), cameras, LENS, LENS, np.zeros((*true.shape, 3)), nothing,
+        np.zeros((*true.shape, 3), np.uint8), tracks, "cast", reason=nothing.astype(np.uint8), depth_std=nothing,
+    )  # fmt: skip
+
+
+def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple):
+    capture, reconstruction, hand_eye, _ = measured
+    check = depth_check(capture, reconstruction, hand_eye)
+    assert check is not None and check.images == 12 and check.features > 500
+    assert check.off_percent == pytest.approx(3.0, abs=min(3 * check.std_percent, 0.5))
+    depth = np.array([0.65, 0.75])
+    noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
+    assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
+    assert (check.std_m(depth) > noise).all()
+    content = calibration_file(capture, reconstruction, replace(hand_eye, depth_check=check), {}, "0")
+    said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long by the robot"
+    assert said in summary(content)
+    assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
+    assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None
+
+
+def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured: tuple):
+    capture, reconstruction, hand_eye, true = measured
+    hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    found, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    assert not notes and (found.reason == np.where(found.confidence > 0, MATCHED, 0)).all()
+    there = found.confidence > 0
+    assert there.mean() > 0.5 * (true > 0).mean() and not there[:, 51:59, 101:119].any()
+    z = hand_eye.scale * np.stack(
+        [
+            apply(inverse(c), p)[..., 2]
+            for c, p in zip(found.recon_from_camera, found.points_in_recon, strict=True)
+        ]
+    )
+    off, sigma = (z - true)[there], hand_eye.scale * np.asarray(found.depth_std)[there]
+    assert abs(np.median(off / true[there])) < 3e-3  # 3 % before
+    assert (np.abs(off) < sigma).mean() > 0.6 and (np.abs(off) < 3 * sigma).mean() > 0.97
+
+
+def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(measured: tuple):
+    capture, reconstruction, hand_eye, true = measured
+    hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    # A sheet that depth cameras see through: half of the matched depth lies 10 cm nearer; filled planes elsewhere.
+    nearer = true.copy()
+    nearer[:, :, : WIDTH // 2] -= 0.1
+    matched = (true > 0.2).astype(float)
+    points = np.stack(
+        [
+            apply(c, d[..., None] / SCALE * rays(LENS))
+            for c, d in zip(reconstruction.recon_from_camera, nearer, strict=True)
+        ]
+    )
+    reason = np.where(matched > 0, MATCHED, 0).astype(np.uint8)
+    reason[:, :20] = np.where(matched[:, :20] > 0, PRIOR, 0)
+    std = np.full(true.shape, 5e-4 / SCALE)
+    dense = replace(reconstruction, points_in_recon=points, confidence=matched, reason=reason, depth_std=std)
+    found, notes = with_measured_depth(capture, dense, hand_eye)
+    assert notes and "differ" in notes[0]
+    left = np.zeros(true.shape, bool)
+    left[:, 20:, : WIDTH // 2] = matched[:, 20:, : WIDTH // 2] > 0
+    assert (found.points_in_recon == points)[left].mean() > 0.99
+    given_way = (found.reason == MATCHED) & (reason == PRIOR)
+    assert given_way.sum() > 0.5 * (reason == PRIOR).sum()
+    assert (np.asarray(found.depth_std) <= std + 1e-12)[(reason == MATCHED)].all()
+
+
+def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
+    capture, reconstruction, hand_eye, _ = measured
+    check = depth_check(capture, reconstruction, hand_eye)
+    assert check is not None
+    found, notes = with_measured_depth(
+        capture, reconstruction, replace(hand_eye, depth_check=replace(check, off_percent=900.0))
+    )
+    assert found is reconstruction and "+900 % off by the robot" in notes[0]
+    _, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    assert "the robot cannot tell" in notes[0]
+
+
+def test_depth_images_of_a_capture_are_found_and_faults_named(tmp_path: Path):
+    folder = tmp_path / "capture"
+    frames = []
+    for k in range(4):
+        write_bytes(folder / f"images/{k}.png", encode_png(np.full((20, 30, 3), 50 * k, np.uint8)))
+        write_bytes(folder / f"depth/{k}.png", encode_png(np.full((20, 30), 700 + k, np.uint16)))
+        pose = transform(rotation_exp(np.array([0, 0.1 * k, 0])), np.array([0.1 * k, 0, 0.3]))
+        frames.append(
+            {"image": f"images/{k}.png", "base_from_gripper": pose.tolist(), "depth": f"depth/{k}.png"}
+        )
+    del frames[3]["depth"]
+
+    def written(**changed: object) -> Path:
+        content = {"frames": [frames[0] | changed, *frames[1:]], "intrinsics": None}
+        (folder / "capture.json").write_text(json.dumps(content))
+        return folder
+
+    capture = read_capture(written())
+    assert capture.depths == ("depth/0.png", "depth/1.png", "depth/2.png", None)
+    assert read_depth(folder / "depth/2.png", (30, 20))[5, 5] == pytest.approx(0.702)
+    for wrong, said in ((5, "as text"), ("../x.png", "depth of frame 0"), ("depth/9.png", "not there")):
+        with pytest.raises(InputError, match=said):
+            read_capture(written(depth=wrong))
+    with pytest.raises(InputError, match="16 bits"):
+        read_depth(folder / "images/0.png", (30, 20))
+    with pytest.raises(InputError, match="align depth"):
+        read_depth(folder / "depth/0.png", (60, 40))
+    (folder / "capture.json").unlink()
+    rows = "\n".join(",".join([f"{k}.png", *map(str, [0.1 * k, 0, 0.3, 0, 0.1 * k, 0])]) for k in range(4))
+    (folder / "poses.csv").write_text("image,x,y,z,roll,pitch,yaw\n" + rows + "\n")
+    table = read_capture(folder)
+    assert table.depths == tuple(f"depth/{k}.png" for k in range(4))

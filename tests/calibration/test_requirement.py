@@ -1,0 +1,103 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.requirement import GRASPING, within_95
+from jcr.calibration.stage import calibrate_poses
+from jcr.calibration.words import shortfall, summary
+from jcr.errors import InputError
+from jcr.geometry import step_between, transform
+from jcr.records import HandEye, PosePairs
+from jcr.report.html import poses_report_html
+from jcr.results import PosesResult
+from jcr.simulate.problem import hand_eye_problem
+
+NOISE = (5e-4, np.radians(0.1))
+
+
+def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
+    problem = hand_eye_problem(np.random.default_rng(seed), count, robot_noise=NOISE)
+    names = tuple(f"sample {k}" for k in range(count))
+    found = PosePairs(Path("a.yaml"), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    return found, problem.gripper_from_camera
+
+
+def page(of: PosePairs, hand_eye: HandEye) -> tuple[CalibrationFile, str]:
+    content = calibration_file(of, of, hand_eye, {}, "0.0")
+    return content, poses_report_html(PosesResult(Path("out"), of, content, hand_eye, False))
+
+
+@pytest.mark.parametrize("spread", [(1, 1, 1), (3, 1, 0.1), (1, 0, 0), (10, 1, 1)])
+def test_95_percent_of_errors_are_below_the_length(spread: tuple[float, float, float]):
+    errors = np.random.default_rng(0).normal(size=(100_000, 3)) * spread
+    length = within_95(np.diag(np.square(spread).astype(float)))
+    assert (np.linalg.norm(errors, axis=1) < length).mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_what_is_reached_is_said_of_the_camera_or_of_what_it_looks_at():
+    given, x = pairs(12, 12)
+    at_camera = calibrate_poses(given)
+    required = at_camera.requirement
+    assert required is not None and (required.translation_mm, required.rotation_deg) == GRASPING
+    assert not required.asked and required.distance_mm == 0
+    at_scene = calibrate_poses(given, CalibrateOptions(require_at="scene")).requirement
+    assert at_scene is not None and 300 < at_scene.distance_mm < 1000
+    # Draws of the transform move the point ahead of the camera by as much.
+    steps = np.random.default_rng(0).multivariate_normal(np.zeros(7), at_camera.covariance, 20_000)[:, :6]
+    ahead = at_camera.gripper_from_camera @ transform(
+        np.eye(3), np.array([0, 0, 1e-3 * at_scene.distance_mm])
+    )
+    arm = ahead[:3, 3] - at_camera.gripper_from_camera[:3, 3]
+    moved = np.linalg.norm(steps[:, :3] + np.cross(steps[:, 3:], arm), axis=1)
+    assert (1e3 * moved < at_scene.reached_mm).mean() == pytest.approx(0.95, abs=0.01)
+    off = 1e3 * np.linalg.norm(step_between(at_camera.gripper_from_camera, x)[:3])
+    assert off < 1.5 * required.reached_mm
+
+
+def test_the_images_that_are_missing_are_counted_and_proposed():
+    given, _ = pairs(12, 12)
+    reached = calibrate_poses(given).requirement
+    assert reached is not None and reached.is_met and reached.more_images == 0
+    asked = CalibrateOptions(require=(0.75 * reached.reached_mm, 10.0))
+    hand_eye = calibrate_poses(given, asked)
+    required = hand_eye.requirement
+    assert required is not None and not required.is_met and required.more_images
+    assert len(hand_eye.next_poses) == max(2, required.more_images)
+    content, html = page(given, hand_eye)
+    say = shortfall(content)
+    assert say is not None and f"add {required.more_images} image" in say
+    assert "within what is needed" in summary(content)
+    assert 'class="verdict fair"' in html and 'class="verdict good"' not in html
+    assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
+    # As many more really reach it, give or take: 12 and those counted, drawn anew.
+    more, _ = pairs(12, 12 + required.more_images)
+    then = calibrate_poses(more, asked).requirement
+    assert then is not None and then.reached_mm < 1.3 * required.translation_mm
+
+
+def test_what_no_number_of_images_reaches_is_not_promised():
+    given, _ = pairs(12, 12)
+    content, html = page(given, calibrate_poses(given, CalibrateOptions(require=(0.01, 0.001))))
+    assert content.requirement is not None and content.requirement.more_images is None
+    assert "a dozen more images would not do" in (shortfall(content) or "") and "would not do" in html
+    met = page(given, calibrate_poses(given))
+    assert shortfall(met[0]) is None and 'class="verdict good"' in met[1]
+
+
+def test_an_answer_that_is_rejected_is_red_whatever_was_asked():
+    given, _ = pairs(12, 12)
+    met = calibrate_poses(given, CalibrateOptions(require=(1000.0, 100.0)))
+    content, html = page(given, replace(met, converged=False, warnings=("the images disagree",)))
+    assert content.requirement is not None and content.requirement.is_met
+    assert 'class="verdict bad"' in html and "the images disagree" in html
+
+
+@pytest.mark.parametrize("asked", [(0.0, 1.0), (2.0, -1.0), (float("nan"), 1.0)])
+def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
+    with pytest.raises(InputError, match="--require"):
+        calibrate_poses(pairs(1, 6)[0], CalibrateOptions(require=asked))
