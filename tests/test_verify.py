@@ -122,7 +122,9 @@ def drifts(
     fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD, bool))
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
     systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
-    return drift(fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic, 1e-3)
+    return drift(
+        fit, (reported[:OLD], places[:OLD]), (reported[rows], places[rows], spread), systematic, 1e-3
+    )
 
 
 def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():

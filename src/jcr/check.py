@@ -149,7 +149,10 @@ def _registered(
             return None, []
         board = proposed([read_image(capture.folder / name) for name in capture.images])
         return None, [str(error)] if board is None else [str(error), board]
-    return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise), [*found.warnings, *found.notes]
+    return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise), [
+        *found.warnings,
+        *found.notes,
+    ]
 
 
 def _held_against(

@@ -82,5 +82,3 @@ def of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> Fl
     """The covariance of some of the poses."""
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     return covariance[np.ix_(rows, rows)]
-
-
