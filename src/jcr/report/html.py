@@ -148,7 +148,9 @@ def _failure(calibration: CalibrationFile) -> str:
         remedies.insert(0, board[0])
     items = "".join(
         f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
-        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: {escape((attempt.why_not or '').split('; ')[0])}</li>"
+        f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: "
+        + escape("; ".join(part for part in (attempt.why_not or "").split("; ") if part not in remedies))
+        + "</li>"
         for attempt in calibration.attempts
     )
     tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
