@@ -149,8 +149,7 @@ def _failure(calibration: CalibrationFile) -> str:
     items = "".join(
         f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
         f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: "
-        + escape("; ".join(part for part in (attempt.why_not or "").split("; ") if part not in remedies))
-        + "</li>"
+        f"{escape(attempt.why_not or '')}</li>"
         for attempt in calibration.attempts
     )
     tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
