@@ -42,14 +42,15 @@ def checked_capture(
 
 
 def require_images(folder: Path, images: Sequence[str], where: str) -> None:
-    """InputError where images are too many, named twice, not there, or out of the folder: before anything takes long."""
+    """InputError where images are named twice, not there, too many or out of the folder: before anything takes long."""
     twice = [name for name, count in Counter(images).items() if count > 1]
     if twice:
         raise InputError(
             f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
         )
-    require_frames(len(images), where, 0)
     rows = [k for k, name in enumerate(images) if not os.path.exists(folder / name)]
+    if not rows:
+        require_frames(len(images), where, 0)
     for k in rows[:NAMED] or range(len(images)):
         contained(folder, images[k], f"{where}: frame {k}")
     missing = [images[k] for k in rows]
