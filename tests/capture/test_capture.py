@@ -136,6 +136,16 @@ def test_the_bits_that_are_used_are_read(tmp_path: Path, bits: int, shape: tuple
     assert (read_image(tmp_path / "deep.png")[..., 0] == ramp).all()
 
 
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_a_defective_pixel_does_not_say_how_many_bits_are_used(tmp_path: Path, ending: str):
+    """And a TIFF is read as a PNG is: Pillow keeps of its colours the upper eight bits, which are black here."""
+    deep = np.broadcast_to(np.arange(64, dtype=np.uint16)[:, None] << 6, (48, 64, 3)).copy()
+    deep[5, 7, 0] = 65535
+    cv2.imwrite(str(tmp_path / f"deep{ending}"), deep)
+    shown = read_image(tmp_path / f"deep{ending}")
+    assert (shown[..., 1] == deep[..., 1] >> 4).all() and shown[5, 7, 2] == 255
+
+
 def test_sixteen_bit_grey_and_cmyk_are_read(tmp_path: Path):
     ramp = np.tile(np.linspace(0, 65535, 64).astype(np.uint16), (48, 1))
     Image.fromarray(ramp).save(tmp_path / "grey.png")

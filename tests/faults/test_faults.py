@@ -155,6 +155,20 @@ def image_named(name: str) -> Plant:
     return written(lambda case: case.edit(lambda c: c["frames"][0].update(image=name)))
 
 
+def linked_to_itself(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to(path.name)
+
+
+def pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def verify(case: Case) -> list[str]:
+    return ["verify", str(case.done), str(case.capture), "--quiet"]
+
+
 def linked_out(case: Case) -> None:
     secret = case.capture.parent / "secret.png"
     case.first.rename(secret)
@@ -275,6 +289,16 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         2,
         "million pixels",
     ),
+    "picture of fractions": (
+        picture(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")),
+        2,
+        "fractions",
+    ),
+    "32-bit picture": (
+        picture(lambda p: Image.new("I", SIZE, 1 << 20).save(p, format="TIFF")),
+        2,
+        "more than 16 bits",
+    ),
     "decompression bomb": (picture(bomb), 2, "million pixels"),
     "one picture under two names": (
         written(lambda c: shutil.copy(c.first, c.first.with_name("1.png"))),
@@ -299,6 +323,12 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     "missing picture": (picture(Path.unlink), 2, "no such image"),
     "picture that is a folder": (picture(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
     "picture that is a pipe": (picture(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
+    "picture that is a link to itself": (picture(linked_to_itself), 2, "leads back to itself"),
+    "folder of pictures that is a link to itself": (
+        picture(lambda p: (shutil.rmtree(p.parent), linked_to_itself(p.parent))),
+        2,
+        "leads back to itself",
+    ),
     # The poses.
     "NaN in a pose": (posed(lambda p: p * np.nan, only=2), 2, "NaN or infinity"),
     "infinity in a pose": (posed(lambda p: p + np.inf, only=2), 2, "NaN or infinity"),
@@ -356,6 +386,18 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         damaged("map.safetensors", query, lambda p: p.write_bytes(b"\x07" * 1000)),
         2,
         "damaged",
+    ),
+    "run.json that is a pipe": (damaged("run.json", verify, pipe), 2, "a pipe or a device"),
+    "run.json that is a link to itself": (damaged("run.json", verify, linked_to_itself), 2, "holds no run"),
+    "reconstruction.npz that is a pipe": (
+        damaged("reconstruction.npz", verify, pipe),
+        2,
+        "a pipe or a device",
+    ),
+    "cloud.ply that is a pipe": (
+        damaged("cloud.ply", lambda c: ["measure", str(c.done)], pipe),
+        2,
+        "a pipe or a device",
     ),
     "no map": (damaged("map.safetensors", query, Path.unlink), 2, "no map here"),
     # Weights and predictions.
@@ -417,6 +459,15 @@ def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(tmp_path:
     said = capsys.readouterr().err
     assert "reconstruction.npz: damaged" in said and said.count("\n") == 1
     assert state(copy) == before
+
+
+@pytest.mark.parametrize("name", ["calibration.json", "log.txt", "report.html", "run.json"])
+def test_a_folder_where_a_result_belongs_is_named(tmp_path: Path, sound: Path, capsys, name: str):
+    (tmp_path / "out" / name).mkdir(parents=True)
+    assert dispatch(["calibrate", str(sound), str(tmp_path / "out"), "--backend", "colmap", "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert f"{name}: Is a directory" in said and said.count("\n") == 1
+    assert not list((tmp_path / "out").rglob("*.part*"))
 
 
 def test_the_evil_file_would_be_written_where_it_is_looked_for(tmp_path: Path):

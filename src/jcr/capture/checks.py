@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.images import TURNED, how_stored, read_image
-from jcr.capture.options import MIN_FRAMES
+from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
@@ -35,11 +35,6 @@ def checked_capture(
     if not images:
         require_frames(0, where)
     require_images(folder, images, where)
-    twice = [name for name, count in Counter(images).items() if count > 1]
-    if twice:
-        raise InputError(
-            f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
-        )
     check_metres(base_from_gripper, where)
     size = _common_size(folder, images)
     orientation = _common_orientation(folder, images)
@@ -47,8 +42,15 @@ def checked_capture(
 
 
 def require_images(folder: Path, images: Sequence[str], where: str) -> None:
-    """InputError where images are not there, or lead out of the folder: before anything takes long."""
+    """InputError where images are named twice, not there, too many or out of the folder: before anything takes long."""
+    twice = [name for name, count in Counter(images).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"{where}: names {first_few(sorted(twice))} more than once; keep one frame per image"
+        )
     rows = [k for k, name in enumerate(images) if not os.path.exists(folder / name)]
+    if not rows:
+        require_frames(len(images), where, 0)
     for k in rows[:NAMED] or range(len(images)):
         contained(folder, images[k], f"{where}: frame {k}")
     missing = [images[k] for k in rows]
@@ -68,7 +70,9 @@ def first_few(names: Sequence[str]) -> str:
 
 
 def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
-    """Raises InputError where there are fewer frames than a calibration, or whatever else, needs."""
+    """Raises InputError where there are fewer frames than a calibration, or whatever else, needs, or too many."""
+    if count > MAX_FRAMES:
+        raise InputError(f"{where}: {count} frames; choose {MAX_FRAMES} at most, 8 to 15 are good")
     if count < at_least:
         raise InputError(f"{where}: {count} frames; at least {at_least} are needed, 8 to 12 are good")
 

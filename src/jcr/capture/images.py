@@ -34,6 +34,10 @@ TURNED = {
 """What is done to show an image of that orientation (EXIF 2.32, tag 274)."""
 PNG_DEPTH = 24
 """Byte of a PNG's header that says how many bits a sample has."""
+BITS_PER_SAMPLE = 258
+"""The TIFF tag."""
+DEFECTIVE = 10_000
+"""One pixel in so many may be one that the sensor does not read."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
@@ -53,7 +57,8 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
                     raise InputError(f"{path}: holds {pictures} pictures; save one as PNG or JPEG")
                 opened.load()
                 if (deep := _sixteen_bit(path, opened)) is not None:
-                    shown = Image.fromarray((deep >> (_bits(deep) - 8)).astype(np.uint8))
+                    eight = np.minimum(deep >> (_bits(deep) - 8), 255)
+                    shown = Image.fromarray(eight.astype(np.uint8))
                     shown.getexif()[ORIENTATION] = opened.getexif().get(ORIENTATION, 1)
                     opened = shown
                 return np.asarray(ImageOps.exif_transpose(opened).convert("RGB"))
@@ -68,23 +73,41 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
 
 
 def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
-    """Pixels of an image of 16 bits, grey or RGB; None of any other. Pillow keeps the upper eight of coloured ones."""
+    """Pixels of an image of 16 bits, grey or RGB; None of any other. Pillow keeps the upper eight of coloured ones.
+
+    Raises InputError for fractions and for more than 16 bits: what is black and what is white there, no file says.
+    """
+    if opened.mode == "F":
+        raise InputError(f"{path}: pixels that are fractions; save it with 8 or 16 bits")
     if opened.mode.startswith("I"):
-        return np.clip(np.asarray(opened, dtype=np.int64), 0, 65535).astype(np.uint16)
-    if opened.format != "PNG" or opened.mode not in ("RGB", "RGBA"):
-        return None
-    with path.open("rb") as stream:
-        depth = stream.read(PNG_DEPTH + 1)[PNG_DEPTH]
-    if depth != 16:
+        values = np.asarray(opened, dtype=np.int64)
+        if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
+            raise InputError(f"{path}: pixels of more than 16 bits; save it with 8 or 16 bits")
+        return values.astype(np.uint16)
+    if opened.mode not in ("LA", "RGB", "RGBA") or _depth(path, opened) != 16:
         return None
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     bgr = cv2.imread(str(path), flags)
     return None if bgr is None or bgr.dtype != np.uint16 else np.asarray(bgr[..., ::-1])
 
 
+def _depth(path: Path, opened: Image.Image) -> int:
+    """Bits of a sample of a PNG or a TIFF, which Pillow's mode does not tell; 8 of any other."""
+    if opened.format == "TIFF":
+        return max(opened.tag_v2.get(BITS_PER_SAMPLE, (8,)))  # type: ignore[attr-defined]
+    if opened.format != "PNG":
+        return 8
+    with path.open("rb") as stream:
+        return stream.read(PNG_DEPTH + 1)[PNG_DEPTH]
+
+
 def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
-    """Bits that an image of 16 uses: sensors of 8, 10, 12 or 14 fill the lower ones, and black is what they show."""
-    largest = int(deep.max(initial=0))
+    """Bits that an image of 16 uses: sensors of 8, 10, 12 or 14 fill the lower ones, and black is what they show.
+
+    Single defective pixels, which may say anything, do not count.
+    """
+    rank = -2 - deep.size // DEFECTIVE
+    largest = int(np.partition(deep, rank, axis=None)[rank])
     return next(bits for bits in (8, 10, 12, 14, 16) if largest < 1 << bits)
 
 

@@ -8,6 +8,8 @@ import tyro
 
 MIN_FRAMES = 3
 """Fewer do not calibrate."""
+MAX_FRAMES = 1000
+"""More is a video: every image is compared with others, and every pose's errors with all the others'."""
 
 FormatName = Literal[
     "auto",

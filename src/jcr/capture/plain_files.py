@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 LONGEST = 255
 """Bytes of a file's name that file systems take."""
+MAX_YAML = 4_000_000
+"""Characters: more takes long to read, and is no capture."""
 LONGEST_SHOWN = 80
 """Characters of a value that a message quotes."""
 
@@ -41,8 +43,13 @@ def read_yaml(file: Path) -> Any:
     """The content of a YAML file, plain data alone; InputError when it is none."""
     import yaml
 
+    text = read_text(file)
+    if len(text) > MAX_YAML:
+        raise InputError(
+            f"{file}: {len(text) / 1e6:.0f} MB of YAML; {MAX_YAML // 1_000_000} MB at most, which hold 1000 samples"
+        )
     try:
-        return yaml.safe_load(read_text(file))
+        return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}" if mark else ""

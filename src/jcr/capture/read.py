@@ -94,6 +94,7 @@ def read_source(
         if options.pose_inverted:
             found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
         if not isinstance(found, Capture):
+            require_frames(len(found.base_from_gripper), str(path), 0)
             return found
         require_frames(len(found), str(path), at_least)
         remarks = [remark for remark in (how_turned(found), how_scaled(found)) if remark is not None]

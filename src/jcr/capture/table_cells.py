@@ -1,6 +1,7 @@
 """The cells of a table on disk, csv, tsv, txt or npy, with the names and units that its header gives."""
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def read_cells(file: Path) -> Cells:
     if header is None:
         return Cells(None, frozenset(), rows)
     names, units = zip(*(_name_and_unit(cell) for cell in header), strict=True)
-    twice = {name for name in names if names.count(name) > 1}
+    twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{file}: two columns are named {', '.join(sorted(twice))}; keep one")
     return Cells(names, frozenset(units) - {"", "s", "ns"}, rows)

@@ -4,6 +4,7 @@ Its cameras have OpenGL's axes (y up, z backward) and pixels counted from the co
 """
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_capture, checked_lens, read_rigid
+from jcr.capture.checks import checked_capture, checked_lens, read_rigid, require_frames
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
 from jcr.capture.table import PICTURES, gripper_poses
@@ -41,6 +42,7 @@ def read_cameras(file: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f'{file}: has no list "frames" of file_path and transform_matrix')
+    require_frames(len(frames), str(file), 0)
     names, cameras = [], []
     for k, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -55,9 +57,12 @@ def _located(file: Path, name: str, k: int) -> str:
     """The image's path, with the ending that some writers leave out."""
     name = str(Path(name))
     for candidate in (name, *(f"{name}{suffix}" for suffix in PICTURES)):
-        if contained(file.parent, candidate, f"{file}: frame {k}").is_file():
-            return candidate
-    return name
+        if os.path.isfile(file.parent / candidate):
+            break
+    else:
+        candidate = name
+    contained(file.parent, candidate, f"{file}: frame {k}")
+    return candidate
 
 
 def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
