@@ -12,6 +12,7 @@ import pytest
 from dying_process import dies_on_bad
 from jcr import batch as module
 from jcr.batch import STATE, BatchOptions, Row, Task, batch, run_one
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.pipeline import RunOptions
@@ -79,6 +80,12 @@ def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.
     rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
     assert [row.status for row in rows] == ["done", "done", "done", "failed"]
     assert "process died" in rows[-1].reason
+
+
+def test_a_capture_that_falls_short_of_what_is_required_is_not_done(tmp_path: Path, captures: list[Path]):
+    options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)))
+    row = run_one(Task(captures[1], tmp_path / "b", options, True, ReadOptions()))
+    assert row.status == "not trusted" and row.reason, row
 
 
 def test_folders_of_one_name_are_kept_apart(tmp_path: Path):

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.words import shortfall
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
@@ -133,8 +134,8 @@ def run_one(task: Task) -> Row:
         except NotTrustedError as error:
             content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
-        if content.doubt is not None:
-            row = replace(row, reason=reason or content.doubt)
+        if row.status != "done":
+            row = replace(row, reason=reason or content.doubt or shortfall(content) or "")
         write_text(
             task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
         )
@@ -143,6 +144,12 @@ def run_one(task: Task) -> Row:
         return replace(failed, reason=str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
         return replace(failed, reason=f"{type(error).__name__}: {error}")
+
+
+def _falls_short(content: CalibrationFile) -> bool:
+    """Of what the user requires; the default is a wish."""
+    required = content.requirement
+    return required is not None and required.asked and not required.is_met
 
 
 def _finished(task: Task, made_from: str) -> Row | None:
@@ -158,7 +165,7 @@ def _row(task: Task, content: CalibrationFile) -> Row:
     row = Row(
         str(task.capture),
         str(task.out),
-        "done" if content.converged else "not trusted",
+        "not trusted" if content.doubt is not None or _falls_short(content) else "done",
         content.backend,
         len(content.images),
         content.images_used,

@@ -7,10 +7,12 @@ import pytest
 
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.requirement import GRASPING, within_95
+from jcr.calibration.requirement import GRASPING, advised, within_95
 from jcr.calibration.stage import calibrate_poses
 from jcr.calibration.words import shortfall, summary
-from jcr.errors import InputError
+from jcr.cli.output import Output
+from jcr.cli.result import show
+from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between, transform
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
@@ -80,6 +82,17 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     assert then is not None and then.reached_mm < 1.3 * required.translation_mm
 
 
+def test_a_scale_that_was_known_is_not_promised_again():
+    problem = hand_eye_problem(np.random.default_rng(5), 8, robot_noise=NOISE)
+    cameras = problem.recon_from_camera.copy()
+    cameras[:, :3, 3] *= problem.scale
+    given = PosePairs(Path("a.yaml"), tuple("abcdefgh"), problem.base_from_gripper, cameras, True)
+    known = calibrate_poses(given)
+    free = advised(known, given.base_from_gripper, CalibrateOptions())
+    first, other = (found.next_poses[0].expected_std for found in (known, free))
+    assert (first[:3] > other[:3]).any() and np.linalg.norm(first[:3]) > np.linalg.norm(other[:3])
+
+
 def test_what_no_number_of_images_reaches_is_not_promised():
     given, _ = pairs(12, 12)
     content, html = page(given, calibrate_poses(given, CalibrateOptions(require=(0.01, 0.001))))
@@ -95,6 +108,20 @@ def test_an_answer_that_is_rejected_is_red_whatever_was_asked():
     content, html = page(given, replace(met, converged=False, warnings=("the images disagree",)))
     assert content.requirement is not None and content.requirement.is_met
     assert 'class="verdict bad"' in html and "the images disagree" in html
+
+
+def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pytest.CaptureFixture[str]):
+    given, _ = pairs(12, 12)
+    for asked in (None, (0.5, 0.1)):
+        hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
+        result = PosesResult(Path("out"), given, page(given, hand_eye)[0], hand_eye, False)
+        if asked is None:
+            assert show(result, Output()) == 0
+            said = capsys.readouterr()
+            assert "95 % of errors are below" in said.out and not said.err
+            continue
+        with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
+            show(result, Output())
 
 
 @pytest.mark.parametrize("asked", [(0.0, 1.0), (2.0, -1.0), (float("nan"), 1.0)])

@@ -24,15 +24,21 @@ MOST = 12
 """Poses that are proposed to reach what is required; of more, nobody is told a number."""
 
 
-def advised(hand_eye: HandEye, gripper: Float[ndarray, "m 4 4"], options: CalibrateOptions) -> HandEye:
+def advised(
+    hand_eye: HandEye,
+    gripper: Float[ndarray, "m 4 4"],
+    options: CalibrateOptions,
+    scale_std: float | None = None,
+) -> HandEye:
     """With what the motions show of each direction, the requirement, and the gripper poses to add.
 
-    `gripper` are the poses that the solver was given, in its order. Raises InputError where the requirement is none.
+    `gripper` are the poses that the solver was given, in its order; `scale_std` is how well the scale was
+    known beforehand (relative). Raises InputError where the requirement is none.
     """
     used = gripper[hand_eye.inliers]
     required = _required(hand_eye, used, options)
     if hand_eye.converged:
-        reach, proposed = _worthwhile(hand_eye, used, required)
+        reach, proposed = _worthwhile(hand_eye, used, required, scale_std)
         required = replace(required, more_images=reach)
     else:
         # An X that is not trusted is not used, nor a robot that is worse than assumed promised away.
@@ -81,7 +87,7 @@ def _reached(
 
 
 def _worthwhile(
-    hand_eye: HandEye, used: Float[ndarray, "k 4 4"], required: Requirement
+    hand_eye: HandEye, used: Float[ndarray, "k 4 4"], required: Requirement, scale_std: float | None
 ) -> tuple[int | None, list[NextPose]]:
     """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
 
@@ -101,6 +107,8 @@ def _worthwhile(
         np.concatenate([pose_information(used, x, noise).sum(0)[None], pose_information(added, x, noise)]), 0
     )
     information[:, range(7), range(7)] += PRIOR_STD**-2.0
+    if scale_std is not None:
+        information[:, 6, 6] += scale_std**-2.0
     expected = np.linalg.inv(information)[:, :7, :7]
     shrinks = np.sqrt(np.maximum(np.diag(hand_eye.covariance - stays), 0.0))
     share = shrinks / np.sqrt(np.diag(expected[0]))

@@ -26,7 +26,7 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.fit import Cues, exceeds
 from jcr.handeye.residuals import paper_residuals
-from jcr.handeye.solve import judged, solve_hand_eye
+from jcr.handeye.solve import SCALE_STD, judged, solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
 from jcr.records import (
     Capture,
@@ -82,7 +82,8 @@ def calibrate(
         hand_eye = _scale_checked(hand_eye)
     if hand_eye.converged:
         hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
-    return advised(hand_eye, capture.base_from_gripper[reconstruction.image_index], options)
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    return advised(hand_eye, gripper, options, reconstruction.metric_std)
 
 
 def _calibrated(
@@ -305,7 +306,9 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     that do not show a scale are helped by taking it as 1.
     """
     options = options or CalibrateOptions()
-    return advised(_calibrated_poses(pairs, options), pairs.base_from_gripper, options)
+    hand_eye = _calibrated_poses(pairs, options)
+    is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
+    return advised(hand_eye, pairs.base_from_gripper, options, SCALE_STD if is_known else None)
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
