@@ -25,6 +25,8 @@ from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.capture_json import kept
 from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
+from jcr.cell.cameras_json import FILE as CAMERAS
+from jcr.cell.cameras_json import CamerasFile, read_cameras, write_cameras
 from jcr.errors import InputError
 from jcr.files import remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
@@ -46,7 +48,7 @@ STATE = "run.json"
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
 CLOUD, REPORT = "cloud.ply", "report.html"
 OF_RECONSTRUCTION = (STATE, RECONSTRUCTION)
-OF_CALIBRATION = (CLOUD, MAP, REPORT)
+OF_CALIBRATION = (CLOUD, MAP, REPORT, CAMERAS)
 """What holds of one calibration alone."""
 PASSING = {"timings_s", "warnings", "version", "attempts"}
 """Of calibration.json: what may differ between two of the same calibration."""
@@ -197,6 +199,17 @@ class RunFolder:
         """Write cloud.ply and map.safetensors."""
         write_cloud(self.path / CLOUD, cloud)
         scene.save(self.path / MAP)
+
+    def cameras(self) -> CamerasFile | None:
+        """cameras.json; None where there is none, InputError where it was damaged."""
+        return read_cameras(self.path)
+
+    def keep_cameras(self, content: CamerasFile | None) -> None:
+        """Write cameras.json, or remove what is of no camera any more."""
+        if content is None:
+            (self.path / CAMERAS).unlink(missing_ok=True)
+        else:
+            write_cameras(self.path, content)
 
     def keep_report(self, page: str) -> None:
         """Write report.html."""

@@ -12,7 +12,7 @@ from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, cam
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.given_intrinsics import lens_doubt
-from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
+from jcr.calibration.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
@@ -67,7 +67,7 @@ def calibrate(
     its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
     images.
     """
-    systematic, posed_arm, unused = _systematic(capture, options := options or CalibrateOptions())
+    systematic, posed_arm, unused = systematic_of(capture, options := options or CalibrateOptions())
     systematic = _of_poses(systematic, reconstruction.image_index)
     hand_eye = _calibrated(capture, reconstruction, options, systematic)
     if posed_arm is not None:
@@ -402,7 +402,7 @@ def _robot_examined(
     return replace(hand_eye, joint_offsets=joint_offsets(*of_used, arm, joints[used]))
 
 
-def _systematic(
+def systematic_of(
     capture: Capture, options: CalibrateOptions
 ) -> tuple[Float[ndarray, "r r"], tuple[Arm, Joints] | None, str | None]:
     """Covariance of the systematic errors of the capture's gripper poses, the arm with its tool and joint angles, and
@@ -440,9 +440,7 @@ def _of_poses(covariance: Float[ndarray, "r r"], poses: Int[ndarray, " m"]) -> F
 
 
 def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
-    if capture.intrinsics is None:
-        return prior_of(found, ESTIMATED)
-    return prior_of(found, MEASURED if capture.intrinsics_std is None else capture.intrinsics_std)
+    return prior_about(found, capture.intrinsics is not None, capture.intrinsics_std)
 
 
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:

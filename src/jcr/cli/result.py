@@ -16,11 +16,19 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     Returns exit status 0, or raises NotTrustedError.
     """
     from jcr.calibration.words import summary
+    from jcr.cell.cameras_json import in_words
 
-    content = result.calibration
-    output.result(summary(content) + after, content.model_dump())
+    content, cameras = result.calibration, getattr(result, "cameras", None)
+    facts, text = content.model_dump(), summary(content)
+    if cameras is not None:
+        facts |= {"cameras": cameras.model_dump()["cameras"], "arms": cameras.model_dump()["arms"]}
+        text += "\n".join(in_words(cameras)) + "\n"
+    output.result(text + after, facts)
     for remark in content.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     if content.doubt is not None:
         raise NotTrustedError(f"not to be trusted: {content.doubt}")
+    for camera in () if cameras is None else cameras.cameras:
+        if camera.doubt is not None:
+            raise NotTrustedError(f"camera {camera.name} is not to be trusted: {camera.doubt}")
     return 0
