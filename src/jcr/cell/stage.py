@@ -334,7 +334,8 @@ def _adjusted(
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     held = None
-    if reconstruction.evidence is not None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
+    # Where bundle adjustment did not decide the calibration, the images' own geometry is not believed here either.
+    if hand_eye.refinement is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         held, own = _as_given(reconstruction, hand_eye), replace(own, **NOTHING)
     rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
     picture, x_px, point = [own.image], [own.x_px], [own.point]

@@ -124,7 +124,7 @@ def _before_table(
     if kind == "fixed":
         azimuth = rng.uniform(-2.5, 2.5)
         away = np.array([0.75 * np.cos(azimuth), 0.75 * np.sin(azimuth), rng.uniform(0.6, 1.1)])
-        base_from_camera = _looking_at(target + away, target, rng)
+        base_from_camera = looking_at(target + away, target, rng)
         rigs.append(base_from_camera[None])
         mounts.append(np.eye(4))
         lenses.append(FIXED_LENS)
@@ -154,17 +154,17 @@ def _carried(
     bent = _drawn(preset, rng)
     posture = bent.arm.rest.copy()
     posture[0] += rng.uniform(-1, 1)
-    joints = _about(bent.arm, posture, count, rng)
+    joints = about_posture(bent.arm, posture, count, rng)
     true = bent.true(joints)
     gripper_from_object = random_hand_eye(rng)
     gripper_from_object[:3, 3] = BOX_AHEAD * bent.arm.forward
     middle = (true @ gripper_from_object)[:, :3, 3].mean(0)
     away = rng.normal(size=3)
     away[2] = abs(away[2])
-    base_from_camera = _looking_at(middle + 0.75 * away / np.linalg.norm(away), middle, rng)
-    others = _about(bent.arm, posture, EFFECTIVE_POSES, rng)
+    base_from_camera = looking_at(middle + 0.75 * away / np.linalg.norm(away), middle, rng)
+    others = about_posture(bent.arm, posture, EFFECTIVE_POSES, rng)
     start = base_from_camera, gripper_from_object
-    effective = _effective_exchanged(bent, others, *start)
+    effective = effective_exchanged(bent, others, *start)
     x_in_object, normal = _box(points, rng)
     rigs = inverse(true @ gripper_from_object) @ base_from_camera
     truth = dict(zip(("base_from_camera", "gripper_from_object"), effective, strict=True))
@@ -190,13 +190,13 @@ def _drawn(preset: PresetName, rng: np.random.Generator) -> BentArm:
     return bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
 
 
-def _about(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
+def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
     """Postures about one; the wrist moves most."""
     width = STRIDE * np.array([0.5, 0.5, 0.5, 1.5, 1.5, 2.0])
     return posture + width * rng.uniform(-1, 1, (count, arm.dof))
 
 
-def _looking_at(
+def looking_at(
     place: Float[ndarray, "3"], target: Float[ndarray, "3"], rng: np.random.Generator
 ) -> Float[ndarray, "4 4"]:
     """base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
@@ -215,7 +215,7 @@ def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], 
     return x * BOX, side[:, None] * np.eye(3)[axis]
 
 
-def _effective_exchanged(
+def effective_exchanged(
     bent: BentArm,
     joints: Joints,
     base_from_camera: Float[ndarray, "4 4"],
