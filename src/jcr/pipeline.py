@@ -19,6 +19,7 @@ from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
+from jcr.errors import NotTrustedError
 from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of

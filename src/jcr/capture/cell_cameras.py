@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.checks import first_few, image_sizes, read_rigid, require_images
-from jcr.capture.lens_json import lens_as_json, read_lens, read_std, std_as_json
+from jcr.capture.lens_json import lens_as_json, read_lens_of_these, read_std, std_as_json
 from jcr.capture.plain_files import shown
 from jcr.errors import InputError
 from jcr.records import Capture, CellCamera, Mount
@@ -109,7 +109,7 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
             f"{where}: {images[k]} has {sizes[k][0]}x{sizes[k][1]} pixels, {images[0]} {sizes[0][0]}x{sizes[0][1]}; "
             "all pictures of a camera must have one size"
         )
-    lens = read_lens(camera.get("intrinsics"), sizes[0], where)
+    lens = read_lens_of_these(camera.get("intrinsics"), sizes[0], where)
     std = read_std(camera.get("intrinsics_std"), lens, where)
     return CellCamera(
         name,

@@ -11,6 +11,9 @@ from jcr.capture.checks import checked_lens
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Intrinsics
 
+FAR_OFF_CENTRE = 0.3
+"""Of the width or height: no lens has its principal point so far from the middle, unless pictures were cropped."""
+
 
 def read_lens(lens: Any, size: tuple[int, int], where: Path | str) -> Intrinsics | None:
     """The lens of images of `size` from the "intrinsics" of a capture.json; InputError if it cannot be.
@@ -37,6 +40,29 @@ def lens_as_json(lens: Intrinsics) -> dict[str, Any]:
     model = {} if lens.model == "pinhole" else {"model": lens.model}
     numbers = {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
     return model | numbers | {"distortion": list(lens.distortion)}
+
+
+def read_lens_of_these(lens: Any, size: tuple[int, int], where: Path | str) -> Intrinsics | None:
+    """The same of a camera whose intrinsics come from elsewhere: InputError where they are of another resolution.
+
+    They may say it themselves, as "width" and "height"; else the principal point does.
+    """
+    found = read_lens(lens, size, where)
+    if found is None:
+        return None
+    stated = lens.get("width", size[0]), lens.get("height", size[1])
+    off = abs(found.cx / size[0] - 0.5), abs(found.cy / size[1] - 0.5)
+    if stated != size or max(off) > FAR_OFF_CENTRE:
+        sign = (
+            f"they say {stated[0]}x{stated[1]}"
+            if stated != size
+            else f"centre ({found.cx:.4g}, {found.cy:.4g})"
+        )
+        raise InputError(
+            f"{where}: intrinsics of another resolution ({sign}) than its {size[0]}x{size[1]} pictures; give those of "
+            "this resolution, or null to estimate them"
+        )
+    return found
 
 
 def read_std(given: Any, lens: Intrinsics | None, where: Path | str) -> Float[ndarray, " p"] | None:

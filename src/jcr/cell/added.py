@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
 from jcr.capture.images import read_image
-from jcr.capture.lens_json import read_lens
+from jcr.capture.lens_json import read_lens_of_these
 from jcr.capture.plain_files import read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -48,14 +48,7 @@ def camera_of(
         content = read_json(intrinsics)
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
-        if isinstance(content, dict):
-            stated = content.get("width"), content.get("height")
-            if None not in stated and stated != sizes[0]:
-                raise InputError(
-                    f"{pictures[0]}: {sizes[0][0]}x{sizes[0][1]} pixels, but {intrinsics} is of {stated[0]}x{stated[1]} "
-                    "ones; take the picture at that resolution, or give the intrinsics of this one"
-                )
-        lens = read_lens(content, sizes[0], str(intrinsics))
+        lens = read_lens_of_these(content, sizes[0], f"{pictures[0]}, {intrinsics}")
     images = tuple(str(picture.resolve()) for picture in pictures)
     return CellCamera(name, "base", images, sizes[0], lens, folder=Path("/"))
 

@@ -130,7 +130,7 @@ def _before_table(
         lenses.append(FIXED_LENS)
         pictures.append((count, 1))
         truth["base_from_camera"] = fits[0].base_from_recon @ base_from_camera
-    x_in_base = target + rng.uniform(*TABLE, (points, 3))
+    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
     starts = [(x, inverse(base)) for x, base in zip(mounted, bases, strict=False)]
     return _seen(
         kind,
@@ -167,7 +167,7 @@ def _carried(
     effective = effective_exchanged(bent, others, *start)
     x_in_object, normal = _box(points, rng)
     rigs = inverse(true @ gripper_from_object) @ base_from_camera
-    truth = dict(zip(("base_from_camera", "gripper_from_object"), effective, strict=True))
+    truth = {"base_from_camera": effective[0], "gripper_from_object": effective[1]}
     reported = [disturbed(bent.reported(joints), PRESETS[preset].white, rng)]
     pictures = [(k, 0) for k in range(count)]
     return _seen(
