@@ -1,4 +1,4 @@
-"""Further cameras of a simulated capture: beside the table, on the wrist, on a second arm; or one that watches a carton.
+"""Further cameras of a simulated capture: beside the table, on the wrist, on a second arm; or one that watches a package.
 
 Written in capture.json's "cameras", with the truth in reference.json.
 """
@@ -20,7 +20,7 @@ from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, steps
 from jcr.records import Intrinsics
 from jcr.simulate.cell import about_posture, effective_exchanged, looking_at
-from jcr.simulate.objects import CATALOGUE
+from jcr.simulate.objects import held_package
 from jcr.simulate.options import SimulateOptions
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
@@ -29,9 +29,12 @@ from jcr.simulate.scenes import Scene, make_scene, moved
 from jcr.simulate.taken import degraded, encoded, pinhole, with_lens_error, with_robot_noise
 from jcr.simulate.truth import Truth
 
-CARRIED = "carton"
-AHEAD = 0.1
+AHEAD = 0.06
 """m from the gripper's frame to the bottom of what it carries."""
+AWAY = 0.55
+"""m from the camera that watches the gripper to what that carries."""
+TURNS, SHIFTS = np.array([0.55, 0.55, 1.0]), 0.07
+"""rad and m to either side: how a gripper without an arm moves before it."""
 
 
 @dataclass(frozen=True)
@@ -155,15 +158,16 @@ def _taken(
 
 
 def simulate_eye_to_hand(out: Path, options: SimulateOptions, progress: Progress) -> Path:
-    """Write a capture whose camera stands fixed and watches a carton in the gripper, before the scene."""
+    """Write a capture whose camera stands fixed and watches a package in the gripper, before the scene."""
     rng = np.random.default_rng([options.seed, 16])
     scene = make_scene(options.scene, options.seed, options.table)
     gripper_from_object = random_hand_eye(rng)
     if options.robot is None:
         middle = scene.table_center_in_base + [0.0, 0.0, 0.4]
-        turns = rotation_exp(np.array([0.7, 0.7, 1.2]) * rng.uniform(-1, 1, (options.images, 3)))
+        turns = rotation_exp(TURNS * rng.uniform(-1, 1, (options.images, 3)))
         reported = true = transform(
-            turns @ rotation_exp(rng.normal(size=3)), middle + 0.1 * rng.uniform(-1, 1, (options.images, 3))
+            turns @ rotation_exp(rng.normal(size=3)),
+            middle + SHIFTS * rng.uniform(-1, 1, (options.images, 3)),
         )
         gripper_from_object[:3, 3] = [0.0, 0.0, AHEAD]
         joints, bent = None, None
@@ -175,7 +179,7 @@ def simulate_eye_to_hand(out: Path, options: SimulateOptions, progress: Progress
         gripper_from_object[:3, 3] = AHEAD * bent.arm.forward
     middle = (true @ gripper_from_object)[:, :3, 3].mean(0)
     side = rng.uniform(0.3, 1.2) * rng.choice([-1, 1])
-    away = 0.75 * np.array([np.cos(side), np.sin(side), 0.5]) / np.hypot(1, 0.5)
+    away = AWAY * np.array([np.cos(side), np.sin(side), 0.5]) / np.hypot(1, 0.5)
     base_from_camera = looking_at(middle + away, middle, rng)
     found = base_from_camera, gripper_from_object
     if bent is not None:
@@ -183,7 +187,7 @@ def simulate_eye_to_hand(out: Path, options: SimulateOptions, progress: Progress
             bent, about_posture(bent.arm, bent.arm.rest, EFFECTIVE_POSES, rng), *found
         )
     lens = pinhole(rng)
-    thing = CATALOGUE[CARRIED](rng)
+    thing = held_package(rng)
     images = []
     suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
     for k, gripper in steps(progress, "render", list(enumerate(true))):

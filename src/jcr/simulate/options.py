@@ -63,6 +63,6 @@ class SimulateOptions:
     """1 or 2: a second arm on the other side of the table, with a wrist camera of its own. (With --robot, of the same
     make and as exact.)"""
     eye_to_hand: bool = False
-    """The camera stands fixed and watches a carton that the gripper carries and turns, before the scene."""
+    """The camera stands fixed and watches a package that the gripper carries and turns, before the scene."""
     truth: Literal["full", "scene"] = "full"
     """Write truth/ with depth and labels of every image, or with scene.json alone."""
