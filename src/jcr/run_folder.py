@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 """Held by the run that writes there."""
+MOVING = "moving"
+"""Pictures of a fixed camera without what stands still, of which a carried thing is reconstructed."""
 CAPTURE = "capture"
 """Images and poses that were read from another format than capture.json."""
 STATE = "run.json"
@@ -123,6 +125,10 @@ class RunFolder:
         Raises InputError where either is missing or damaged, nothing was found, or they are not of the same images.
         """
         calibration = self.calibration()
+        if calibration.mount == "base":
+            raise InputError(
+                f"{self.path}: is of a camera that watches the gripper; this needs one that the gripper carries"
+            )
         if calibration.gripper_from_camera is None:
             raise InputError(
                 f"{self.path}: found no calibration ({calibration.doubt}); mend the capture, run it again"

@@ -1,8 +1,8 @@
 """What moves before a fixed camera, by itself: the pictures with all that stands still taken out.
 
-Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many pictures show
-the same colour at a pixel, that is what stands there; a picture keeps what differs from it, and fades to grey elsewhere,
-softly, for a sharp border would be a feature of its own.
+Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many pictures
+show the same colour at a pixel, that is what stands there; a picture keeps what differs from it, and fades to grey
+elsewhere, softly, for a sharp border would be a feature of its own.
 """
 
 from collections.abc import Sequence
@@ -61,10 +61,7 @@ def _background(
     return reduced[best, rows, columns], enough
 
 
-def write_moving_parts(images: Sequence[Path], folder: Path) -> tuple[str, ...]:
-    """Write them as PNG files in the folder, which is made; their names there."""
-    names = []
-    for k, picture in enumerate(moving_parts([read_image(image) for image in images])):
-        names.append(f"{k:04d}.png")
-        write_bytes(folder / names[-1], encode_png(picture))
-    return tuple(names)
+def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
+    """Write those of the pictures of a folder under the same names in another; PNG, whatever the names end with."""
+    for name, picture in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
+        write_bytes(folder / name, encode_png(picture))

@@ -7,16 +7,23 @@ they are (ties.py).
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from jcr.calibration.calibration_json import image_verdicts
 from jcr.calibration.intrinsics_prior import prior_about
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.stage import MIN_OBSERVATIONS, of_images, systematic_of
+from jcr.calibration.stage import MIN_OBSERVATIONS, calibrate, of_images, systematic_of
+from jcr.cell.background import write_moving_parts
 from jcr.cell.bundle import Freedom, Pictures, Scene, adjust_images
+from jcr.cell.found import CameraFound, PictureFound
 from jcr.cell.ties import Tie, tied
+from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, scale_translation
 from jcr.handeye.solve import judged, solve_hand_eye
+from jcr.progress import Progress
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction, RobotNoise
 
 
@@ -52,6 +59,50 @@ def of_camera(capture: Capture, camera: CellCamera) -> Capture:
         camera_name=camera.name,
         mount="base",
         others=(),
+    )
+
+
+def calibrated_alone(
+    capture: Capture,
+    camera: CellCamera,
+    moving: Path,
+    reconstruct_options: ReconstructOptions,
+    options: CalibrateOptions,
+    progress: Progress,
+) -> CameraFound:
+    """A further camera that watches the gripper of a capture; `moving` is a folder for pictures of what moves."""
+    own = of_camera(capture, camera)
+    write_moving_parts(own.folder, own.images, moving)
+    seen = replace(exchanged(own), folder=moving)
+    try:
+        reconstruction = reconstruct(seen, replace(reconstruct_options, backend="auto"), progress)
+        found = refined(own, reconstruction, calibrate(seen, reconstruction, options), options)
+    except NotTrustedError as error:
+        pictures = tuple(PictureFound(image, False, 0, None, "not registered") for image in camera.images)
+        return CameraFound(camera.name, camera.mount, camera.arm, pictures, warnings=(str(error),))
+    pictures = []
+    for verdict, pixels in image_verdicts(own, reconstruction, found):
+        row = own.images.index(verdict.image)
+        points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
+        pictures.append(PictureFound(verdict.image, verdict.used, points, pixels, verdict.reason))
+    middle = found.base_from_recon[:3, 3] + found.base_from_recon[:3, :3] @ (
+        found.scale * np.median(reconstruction.tracks.points_in_recon, axis=0)
+    )
+    in_base = own.base_from_gripper[:, :3, :3] @ middle + own.base_from_gripper[:, :3, 3]
+    away = float(np.median((in_base - found.gripper_from_camera[:3, 3]) @ found.gripper_from_camera[:3, 2]))
+    std = found.intrinsics_covariance
+    return CameraFound(
+        camera.name,
+        camera.mount,
+        camera.arm,
+        tuple(pictures),
+        found.gripper_from_camera,
+        found.covariance[:6, :6],
+        away,
+        found.intrinsics,
+        None if std is None else np.sqrt(np.diag(std)),
+        found.converged,
+        found.warnings,
     )
 
 

@@ -67,6 +67,8 @@ def place_cameras(
     One that cannot be placed is in the result with the reason.
     """
     options, progress = options or CalibrateOptions(), progress or silent
+    if not others:
+        return CellFound((), (), None)
     if not hand_eye.converged:
         why = f"the {capture.camera_name} camera's own calibration is not to be trusted"
         failures = [

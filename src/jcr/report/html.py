@@ -11,6 +11,7 @@ from jcr.calibration.words import attempt_in_words, budget_in_words, missed, pix
 from jcr.extras import is_installed
 from jcr.geometry import Transforms, scale_translation
 from jcr.records import COEFFICIENTS, Capture
+from jcr.report.cell_cameras import cameras_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.map_pictures import map_section
 from jcr.report.map_samples import sample_surface
@@ -38,6 +39,17 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     become unreadable.
     """
     calibration, hand_eye = result.calibration, result.hand_eye
+    if result.capture.mount == "base":
+        sections = [
+            _verdict(calibration),
+            _tiles(calibration),
+            _warnings(calibration),
+            transform_section(hand_eye, "base"),
+            images_section(result),
+            residuals_section(result),
+            _details(calibration, options or {}),
+        ]
+        return _page(result.capture, calibration, sections)
     base_from_camera = hand_eye.base_from_recon @ scale_translation(
         result.reconstruction.recon_from_camera, hand_eye.scale
     )
@@ -47,6 +59,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         _tiles(calibration),
         _warnings(calibration),
         transform_section(hand_eye),
+        "" if result.cameras is None else cameras_section(result.cameras),
         scene_section(result, base_from_camera, surface),
         images_section(result),
         residuals_section(result),

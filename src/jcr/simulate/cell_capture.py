@@ -1,4 +1,4 @@
-"""Further cameras of a simulated capture: beside the table, on the wrist, on a second arm; or one that watches a package.
+"""Further cameras of a simulated capture: beside the table, on the wrist, on a second arm; or one that watches.
 
 Written in capture.json's "cameras", with the truth in reference.json.
 """
