@@ -41,6 +41,10 @@ BENCHES = {
         True,
         of_captures=True,
     ),
+    "cameras": Bench(
+        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld pictures of captures in DIR",
+        of_captures=True,
+    ),
     "gate": Bench("scenes that mislead matching, with the robot's gate and without", True),
     "many": Bench("from 8 to 200 images: seconds and peak memory", True),
     "calibrate": Bench(

@@ -24,6 +24,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     ),
     (("export/", "formats of other tools", 1), ("simulate/", "captures with known answers", 1)),
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
+    (("cell/", "every camera of the cell: fixed, several on a wrist, two arms, eye-to-hand", 1),),
     (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
     (("match/", "features and matches that the robot checks", 1),),

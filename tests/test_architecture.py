@@ -21,6 +21,7 @@ LAYERS = [
     {"match"},
     {"reconstruct"},
     {"calibration"},
+    {"cell"},
     {"represent", "segment"},
     {"export"},
     {"simulate"},
@@ -40,6 +41,7 @@ BACK_ENDS = ["backends", "from_pairs", "colmap", "marker", "predictions"]
 SOLVERS = [
     "least_squares",
     *(f"handeye.{name}" for name in ("closed_form", "fit", "known_scale", "residuals", "robust", "solve")),
+    *(f"cell.{name}" for name in ("bundle", "carried", "localise", "stage", "ties")),
     *(f"calibration.{name}" for name in ("bundle", "cues", "drift", "given_intrinsics", "stage")),
     *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
 ]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jcr.check import check as check_capture
     from jcr.cli.export import export_run
     from jcr.handeye.solve import solve_hand_eye
-    from jcr.pipeline import build_map, calibrate, measure, run
+    from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.represent.map_file import load_map
     from jcr.results import RunOptions
     from jcr.verify import verify as verify_run
@@ -33,6 +33,7 @@ _MODULE_OF = {
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
     "run": "jcr.pipeline",
+    "add_camera": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
     "build_map": "jcr.pipeline",
     "measure": "jcr.pipeline",
@@ -44,6 +45,7 @@ __all__ = [
     "NotTrustedError",
     "ReadOptions",
     "RunOptions",
+    "add_camera",
     "build_map",
     "calibrate",
     "check_capture",

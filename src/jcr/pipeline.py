@@ -18,14 +18,18 @@ from jcr.calibration.stage import is_one
 from jcr.calibration.words import shortfall
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
+from jcr.cell.added import camera_of, keep_camera, read_added_cameras
+from jcr.cell.cameras_json import CamerasFile, cameras_file
+from jcr.cell.found import CameraFound
+from jcr.errors import NotTrustedError
 from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
 from jcr.reconstruct.board_in_view import proposed
-from jcr.records import Capture, PosePairs
+from jcr.records import Capture, CellCamera, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
-from jcr.run_folder import RunFolder, State, held, state_of
+from jcr.run_folder import MOVING, RunFolder, State, held, state_of
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -45,6 +49,8 @@ def run(
     camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
+    if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
+        return calibrate(capture, out, options, progress=progress)
     if options.map is None:
         options = _with_dense(options, False)
     else:
@@ -69,7 +75,13 @@ def calibrate(
     """
     options = _with_dense(_with_backend(options, backend, capture), False)
     with held(Path(out)) as folder:
-        calibrated = _calibrate(folder.keep_capture(capture), folder, options, progress or silent)
+        capture = folder.keep_capture(capture)
+        if capture.mount == "base":
+            return _report(
+                _watched(capture, folder, options, progress or silent), folder, options, progress or silent
+            )
+        calibrated = _calibrate(capture, folder, options, progress or silent)
+        calibrated = _placed(calibrated, folder, options, progress or silent)
         return _report(calibrated, folder, options, progress or silent)
 
 
@@ -123,6 +135,51 @@ def build_map(
         return _all_stages(capture, added, folder, options, progress or silent)
 
 
+def add_camera(
+    out: str | Path,
+    name: str,
+    pictures: Sequence[str | Path],
+    intrinsics: str | Path | None = None,
+    *,
+    progress: Progress | None = None,
+) -> RunResult:
+    """A fixed camera placed in the run folder `out` by pictures of the scene that was mapped there.
+
+    `intrinsics` is a JSON file as capture.json has them; None: they are estimated. The camera becomes part of the run,
+    cameras.json and the report. Raises InputError for pictures that are not of one camera or fit no intrinsics, and
+    NotTrustedError, with nothing kept, where they do not show the camera's place or the run is not calibrated.
+    """
+    made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
+    earlier = RunFolder(Path(out)).calibration()
+    if earlier.doubt is not None:
+        raise NotTrustedError(
+            f"{out}: no camera can be placed by a calibration that is not to be trusted: {earlier.doubt}"
+        )
+    options = RunOptions(made_with.reconstruct, made_with.calibrate)
+    with held(Path(out)) as folder:
+        added = read_added_cameras(folder.path, capture)
+        taken = [capture.camera_name, *(camera.name for camera in (*capture.others, *added))]
+        camera = camera_of(
+            name,
+            [Path(picture) for picture in pictures],
+            None if intrinsics is None else Path(intrinsics),
+            taken,
+        )
+        result = _calibrate(capture, folder, options, progress or silent)
+        placed = _cameras(result, (*added, camera), options, progress or silent, folder)
+        assert placed is not None
+        if (found := placed.cameras[-1]).doubt is not None:
+            raise NotTrustedError(f"{name}: {found.doubt}")
+        keep_camera(folder.path, capture, camera)
+        result = _placed(result, folder, options, progress or silent)
+        if folder.has_map():
+            cloud = folder.cloud()
+            result = replace(
+                result, cloud=cloud, scene=folder.scene(), measured=measured(cloud, result.calibration)
+            )
+        return _report(result, folder, options, progress or silent)
+
+
 def measure(out: str | Path) -> Measured:
     """The support plane of a run and what stands on it, from its cloud and its calibration.
 
@@ -135,7 +192,7 @@ def measure(out: str | Path) -> Measured:
 def _all_stages(
     capture: Capture, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
-    calibrated = _calibrate(capture, folder, options, progress)
+    calibrated = _placed(_calibrate(capture, folder, options, progress), folder, options, progress)
     if options.map is not None:
         calibrated = _map(calibrated, added, folder, options, progress)
     return _report(calibrated, folder, options, progress)
@@ -169,6 +226,89 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
         content = content.model_copy(update={"warnings": [*content.warnings, *filter(None, [board])]})
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
+
+
+def _placed(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """With the other cameras of the cell, those of the capture and those added to the run."""
+    start = time.perf_counter()
+    added = read_added_cameras(folder.path, result.capture)
+    cameras = _cameras(result, added, options, progress, folder)
+    folder.keep_cameras(cameras)
+    if cameras is None:
+        return result
+    content = _timed(result.calibration, "cameras", start)
+    folder.amend_calibration(content)
+    return replace(result, calibration=content, cameras=cameras)
+
+
+def _cameras(
+    result: RunResult,
+    added: Sequence[CellCamera],
+    options: RunOptions,
+    progress: Progress,
+    folder: RunFolder,
+) -> CamerasFile | None:
+    from jcr.cell.stage import place_cameras
+
+    others = (*result.capture.others, *added)
+    if not others:
+        return None
+    of_scene = [camera for camera in others if not camera.watches_gripper]
+    found = place_cameras(
+        result.capture, of_scene, result.reconstruction, result.hand_eye, options.calibrate, progress
+    )
+    by_name = {camera.name: camera for camera in found.cameras}
+    by_name |= {
+        camera.name: _watching(result.capture, camera, folder, options, progress)
+        for camera in others
+        if camera.watches_gripper
+    }
+    return cameras_file(replace(found, cameras=tuple(by_name[camera.name] for camera in others)), __version__)
+
+
+def _watched(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """A fixed camera that watches what the gripper carries, calibrated; there is no map of that."""
+    from jcr.cell.background import write_moving_parts
+    from jcr.cell.carried import exchanged, refined
+
+    write_moving_parts(capture.folder, capture.images, folder.path / MOVING)
+    seen = replace(exchanged(capture), folder=folder.path / MOVING)
+    state = state_of(seen, options.reconstruct, options.calibrate)
+    state = state.model_copy(update={"capture": str(capture.folder.resolve())})
+    try:
+        choice = _kept(seen, folder, state, progress) or choose(
+            seen,
+            options.reconstruct,
+            options.calibrate,
+            progress,
+            lambda made: folder.keep_reconstruction(made, state),
+        )
+    except NothingFoundError as nothing:
+        _fail(capture, folder, state, options, nothing)
+        raise
+    folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
+    hand_eye = refined(capture, choice.reconstruction, choice.hand_eye, options.calibrate)
+    content = calibration_file(
+        capture, choice.reconstruction, hand_eye, choice.timings_s, __version__, choice.attempts
+    )
+    folder.keep_calibration(content)
+    return RunResult(folder.path, capture, content, hand_eye, choice.reconstruction)
+
+
+def _watching(
+    capture: Capture, camera: CellCamera, folder: RunFolder, options: RunOptions, progress: Progress
+) -> CameraFound:
+    """The same of a further camera of a capture, as one of its cameras."""
+    from jcr.cell.carried import calibrated_alone
+
+    return calibrated_alone(
+        capture,
+        camera,
+        folder.path / MOVING / camera.name,
+        _with_dense(options, False).reconstruct,
+        options.calibrate,
+        progress,
+    )
 
 
 def _kept(capture: Capture, folder: RunFolder, state: State, progress: Progress) -> Choice | None:

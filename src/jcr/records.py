@@ -52,6 +52,37 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
 
+Mount = Literal["gripper", "base"]
+"""What a camera is bolted to: the gripper of an arm, or the ground that the arm's base stands on."""
+
+
+@dataclass(frozen=True)
+class CellCamera:
+    """A further camera of the robot's cell, and its pictures."""
+
+    name: str
+    mount: Mount
+    images: tuple[str, ...]
+    """Paths relative to the folder."""
+    image_size: tuple[int, int]
+    intrinsics: Intrinsics | None = None
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    folder: Path | None = None
+    """None: the capture's."""
+    frame: Int[ndarray, " k"] | None = None
+    """Rows of the capture at whose gripper poses the pictures were taken: of a camera on the same gripper, or of a fixed
+    one that watches what this gripper carries. None of others."""
+    arm: str | None = None
+    """The other arm that carries it; None: the capture's own, or none."""
+    base_from_gripper: Float[ndarray, "k 4 4"] | None = None
+    """Of the other arm, in its own base, at each picture."""
+
+    @property
+    def watches_gripper(self) -> bool:
+        """Whether it is fixed and sees what the gripper carries instead of the scene."""
+        return self.mount == "base" and self.frame is not None
+
+
 @dataclass(frozen=True)
 class Capture:
     """Images of one scene and the gripper pose at each, checked on reading."""
@@ -82,6 +113,10 @@ class Capture:
     """EXIF's, of all images: 1 as the sensor has them; others were turned upright, and the camera frame is theirs."""
     depths: tuple[str | None, ...] | None = None
     """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
+    camera_name: str = "wrist"
+    mount: Mount = "gripper"
+    """base: a fixed camera, and the images show what the gripper carries."""
+    others: tuple[CellCamera, ...] = ()
 
     def __len__(self) -> int:
         return len(self.images)

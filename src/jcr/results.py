@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
+from jcr.cell.cameras_json import CamerasFile
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
@@ -47,6 +48,8 @@ class RunResult:
     scene: "SceneMap | None" = None
     measured: Measured | None = None
     """None without a map, and where no plane carries the scene."""
+    cameras: CamerasFile | None = None
+    """The other cameras of the cell; None where there are none."""
 
     @property
     def converged(self) -> bool:

@@ -25,6 +25,8 @@ from jcr.capture.added import FOLDER as ADDED
 from jcr.capture.capture_json import kept
 from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
+from jcr.cell.cameras_json import FILE as CAMERAS
+from jcr.cell.cameras_json import CamerasFile, read_cameras, write_cameras
 from jcr.errors import InputError
 from jcr.files import read_bytes, remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 """Held by the run that writes there."""
+MOVING = "moving"
+"""Pictures of a fixed camera without what stands still, of which a carried thing is reconstructed."""
 CAPTURE = "capture"
 """Images and poses that were read from another format than capture.json."""
 STATE = "run.json"
@@ -46,7 +50,7 @@ STATE = "run.json"
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
 CLOUD, REPORT = "cloud.ply", "report.html"
 OF_RECONSTRUCTION = (STATE, RECONSTRUCTION)
-OF_CALIBRATION = (CLOUD, MAP, REPORT)
+OF_CALIBRATION = (CLOUD, MAP, REPORT, CAMERAS)
 """What holds of one calibration alone."""
 PASSING = {"timings_s", "warnings", "notes", "version", "attempts", "requirement", "next_poses"}
 """Of calibration.json: what may differ between two of the same calibration."""
@@ -121,6 +125,10 @@ class RunFolder:
         Raises InputError where either is missing or damaged, nothing was found, or they are not of the same images.
         """
         calibration = self.calibration()
+        if calibration.mount == "base":
+            raise InputError(
+                f"{self.path}: is of a camera that watches the gripper; this needs one that the gripper carries"
+            )
         if calibration.gripper_from_camera is None:
             raise InputError(
                 f"{self.path}: found no calibration ({calibration.doubt}); mend the capture, run it again"
@@ -197,6 +205,17 @@ class RunFolder:
         """Write cloud.ply and map.safetensors."""
         write_cloud(self.path / CLOUD, cloud)
         scene.save(self.path / MAP)
+
+    def cameras(self) -> CamerasFile | None:
+        """cameras.json; None where there is none, InputError where it was damaged."""
+        return read_cameras(self.path)
+
+    def keep_cameras(self, content: CamerasFile | None) -> None:
+        """Write cameras.json, or remove what is of no camera any more."""
+        if content is None:
+            (self.path / CAMERAS).unlink(missing_ok=True)
+        else:
+            write_cameras(self.path, content)
 
     def keep_report(self, page: str) -> None:
         """Write report.html."""

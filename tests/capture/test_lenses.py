@@ -11,7 +11,7 @@ import yaml
 
 import jcr
 from jcr.calibration.calibration_json import Lens
-from jcr.capture import camera_info, capture_json, colmap_model
+from jcr.capture import camera_info, capture_json, colmap_model, lens_json
 from jcr.export import ros
 from jcr.records import Intrinsics
 
@@ -25,7 +25,7 @@ LENSES = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1,
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_lens_survives_capture_json_camera_info_and_calibration_json(lens: Intrinsics, tmp_path: Path):
-    read = capture_json.read_lens(json.loads(json.dumps(capture_json.lens_as_json(lens))), SIZE, tmp_path)
+    read = lens_json.read_lens(json.loads(json.dumps(lens_json.lens_as_json(lens))), SIZE, tmp_path)
     assert read == lens
     mount = ros.camera_mount(np.eye(4), np.eye(7))
     (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount, lens))
@@ -72,9 +72,9 @@ def test_a_capture_names_the_models_that_there_are():
     with pytest.raises(
         jcr.InputError, match="lens model 'omni' is not known; give one of pinhole, rational, fisheye"
     ):
-        capture_json.read_lens(lens | {"model": "omni"}, SIZE, Path("capture.json"))
+        lens_json.read_lens(lens | {"model": "omni"}, SIZE, Path("capture.json"))
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye lens, k1,k2,k3,k4"):
-        capture_json.read_lens(lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json"))
+        lens_json.read_lens(lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json"))
 
 
 def through(lens: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:

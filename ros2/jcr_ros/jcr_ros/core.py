@@ -16,7 +16,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.camera_info import lens_of_ros
-from jcr.capture.capture_json import lens_as_json
+from jcr.capture.lens_json import lens_as_json
 from jcr.capture.ros_image import picture_of
 from jcr.errors import InputError
 from jcr.export.ros import CameraMount, camera_mount

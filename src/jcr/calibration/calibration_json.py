@@ -24,6 +24,7 @@ from jcr.records import (
     HandEye,
     ImageVerdict,
     Intrinsics,
+    Mount,
     PosePairs,
     Reconstruction,
     Requirement,
@@ -223,19 +224,35 @@ class CalibrationFile(_Part):
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
     """What the stages did of their own accord, and nobody need act on."""
+    mount: Mount = "gripper"
+    """base: the camera is fixed and watches what the gripper carries; gripper_from_camera and base_from_recon are then
+    null, and uncertainty is that of base_from_camera, along axes of the base."""
+    base_from_camera: Matrix | None = None
+    gripper_from_object: Matrix | None = None
+    """Of the frame of the reconstruction, scaled to metres: what the gripper carried."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> "CalibrationFile":
-        found = self.gripper_from_camera is not None
-        parts = ("scale", "base_from_recon", "residuals", "uncertainty", "robot_noise")
-        for name in parts:
+        of_mount = {"gripper": "gripper_from_camera", "base": "base_from_camera"}
+        name_found = of_mount[self.mount]
+        found = getattr(self, name_found) is not None
+        frame = "base_from_recon" if self.mount == "gripper" else "gripper_from_object"
+        for name in ("scale", frame, "residuals", "uncertainty", "robot_noise"):
             if (getattr(self, name) is not None) is not found:
-                raise ValueError(f"{name} is null and gripper_from_camera is not, or the other way round")
+                raise ValueError(f"{name} is null and {name_found} is not, or the other way round")
+        other = of_mount["base" if self.mount == "gripper" else "gripper"]
+        if getattr(self, other) is not None:
+            raise ValueError(f"{other} of a camera whose mount is {self.mount}")
         if self.converged and not found:
-            raise ValueError("converged without a gripper_from_camera")
+            raise ValueError(f"converged without a {name_found}")
         if not self.converged and not self.warnings:
             raise ValueError("not converged, and no warning says why")
         return self
+
+    @property
+    def parent_from_camera(self) -> list[list[float]] | None:
+        """gripper_from_camera, or base_from_camera of a fixed one."""
+        return self.gripper_from_camera if self.mount == "gripper" else self.base_from_camera
 
     @property
     def doubt(self) -> str | None:
@@ -267,10 +284,15 @@ def calibration_file(
     offsets, ratio = hand_eye.joint_offsets, hand_eye.angle_ratio
     told = reconstruction.warnings if isinstance(reconstruction, Reconstruction) else ()
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
+    mount = capture.mount if isinstance(capture, Capture) else "gripper"
+    camera, recon = hand_eye.gripper_from_camera.tolist(), hand_eye.base_from_recon.tolist()
     return CalibrationFile(
-        gripper_from_camera=hand_eye.gripper_from_camera.tolist(),
+        mount=mount,
+        gripper_from_camera=camera if mount == "gripper" else None,
+        base_from_recon=recon if mount == "gripper" else None,
+        base_from_camera=camera if mount == "base" else None,
+        gripper_from_object=recon if mount == "base" else None,
         scale=hand_eye.scale,
-        base_from_recon=hand_eye.base_from_recon.tolist(),
         converged=hand_eye.converged,
         backend=reconstruction.backend,
         images=[
@@ -343,6 +365,7 @@ def failed_file(
 ) -> CalibrationFile:
     """The file of a capture whose images gave no camera poses at all."""
     return CalibrationFile(
+        mount=capture.mount,
         gripper_from_camera=None,
         scale=None,
         base_from_recon=None,

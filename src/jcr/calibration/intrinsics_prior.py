@@ -89,6 +89,13 @@ def prior_of(
     return IntrinsicsPrior(directions, np.array(list(known.values())))
 
 
+def prior_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None = None) -> IntrinsicsPrior:
+    """Of a camera whose intrinsics were given, with standard deviations or not, or were found by the reconstruction."""
+    if not given:
+        return prior_of(found, ESTIMATED)
+    return prior_of(found, MEASURED if std is None else std)
+
+
 def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c c"]:
     """Covariance, in the directions of the prior, by which what images show is off; no more than the prior's own."""
     features = prior_of(intrinsics, FROM_FEATURES)

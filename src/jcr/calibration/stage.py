@@ -13,7 +13,7 @@ from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
-from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, IntrinsicsPrior, prior_of
+from jcr.calibration.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined
@@ -348,9 +348,7 @@ def is_one(hand_eye: HandEye) -> bool:
 
 
 def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
-    if capture.intrinsics is None:
-        return prior_of(found, ESTIMATED)
-    return prior_of(found, MEASURED if capture.intrinsics_std is None else capture.intrinsics_std)
+    return prior_about(found, capture.intrinsics is not None, capture.intrinsics_std)
 
 
 def _noise(options: CalibrateOptions) -> tuple[float, float] | None:

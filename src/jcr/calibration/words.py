@@ -58,11 +58,12 @@ def found(content: "CalibrationFile") -> list[str]:
     if uncertainty is None or scale is None:
         return [f"no calibration: {content.doubt}"]
     with np.printoptions(precision=6, suppress=True):
-        matrix = str(np.array(content.gripper_from_camera)).splitlines()
+        matrix = str(np.array(content.parent_from_camera)).splitlines()
     x, y, z = uncertainty.translation_std_mm
     rx, ry, rz = uncertainty.rotation_std_deg
     lines = [
-        f"gripper_from_camera ({content.images_used} of {len(content.images)} images, back end {content.backend})",
+        f"{content.mount}_from_camera ({content.images_used} of {len(content.images)} images, "
+        f"back end {content.backend})",
         *(f"  {row}" for row in matrix),
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
         *([] if content.requirement is None else [f"  {reached_in_words(content.requirement)}"]),

@@ -9,14 +9,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.checks import checked_capture, checked_lens, first_few, read_rigid, require_images
+from jcr.capture.cell_cameras import cameras_as_json, with_cameras
+from jcr.capture.checks import checked_capture, first_few, read_rigid, require_images
 from jcr.capture.depth_images import depth_of_frames
+from jcr.capture.lens_json import lens_as_json, read_lens, read_std, std_as_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
-from jcr.records import COEFFICIENTS, Capture, Intrinsics
+from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
 MOST_TURNS = 6 * np.pi + 0.01
@@ -50,63 +52,17 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     joints = _joints(frames, images, file)
     robot, notes = _robot(content.get("robot"), joints, file)
     lens = read_lens(content.get("intrinsics"), capture.image_size, file)
-    return replace(
+    capture = replace(
         capture,
         intrinsics=lens,
-        intrinsics_std=_intrinsics_std(content.get("intrinsics_std"), lens, file),
+        intrinsics_std=read_std(content.get("intrinsics_std"), lens, file),
         notes=notes,
         joints=joints,
         robot=robot,
         urdf=_urdf(content.get("urdf"), file),
         depths=depth_of_frames(frames, folder, str(file)),
     )
-
-
-def read_lens(lens: Any, size: tuple[int, int], file: Path) -> Intrinsics | None:
-    """The lens of images of `size` from the "intrinsics" of a capture.json; InputError if it cannot be."""
-    if lens is None:
-        return None
-    where = f"{file}: intrinsics"
-    if not isinstance(lens, dict) or not {"fx", "fy", "cx", "cy"} <= lens.keys():
-        raise InputError(f"{where}: need numbers fx, fy, cx, cy and distortion [k1,k2,p1,p2,k3], or null")
-    focal_and_centre = [lens[key] for key in ("fx", "fy", "cx", "cy")]
-    model = lens.get("model", "pinhole")
-    if model not in COEFFICIENTS:
-        raise InputError(f"{where}: lens model {model!r} is not known; give one of {', '.join(COEFFICIENTS)}")
-    distortion = lens.get("distortion") or [0.0] * len(COEFFICIENTS[model])
-    if not isinstance(distortion, list):
-        raise InputError(f"{where}: distortion must be a list [{','.join(COEFFICIENTS[model])}]")
-    return checked_lens(focal_and_centre, distortion, size, where, model)
-
-
-def lens_as_json(lens: Intrinsics) -> dict[str, Any]:
-    """The "intrinsics" of a capture.json."""
-    model = {} if lens.model == "pinhole" else {"model": lens.model}
-    numbers = {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy")}
-    return model | numbers | {"distortion": list(lens.distortion)}
-
-
-def _intrinsics_std(given: Any, lens: Intrinsics | None, file: Path) -> Float[ndarray, " p"] | None:
-    """Standard deviations in the units of "intrinsics", some or all; 0 is exact."""
-    if given is None:
-        return None
-    where = f"{file}: intrinsics_std"
-    if lens is None:
-        raise InputError(f"{where}: there are no intrinsics whose errors these could be; give both or none")
-    names = ("fx", "fy", "cx", "cy")
-    if not isinstance(given, dict) or not given.keys() <= {*names, "distortion"}:
-        raise InputError(f"{where}: need some of fx, fy, cx, cy (px) and distortion [k1,k2,p1,p2,k3]")
-    distortion = given.get("distortion") or []
-    if not isinstance(distortion, list) or len(distortion) > len(lens.distortion):
-        raise InputError(f"{where}: distortion must be a list of at most {len(lens.distortion)} numbers")
-    values = [given.get(name) for name in names] + distortion
-    if not all(
-        value is None or (type(value) in (int, float) and 0 <= value < lens.width) for value in values
-    ):
-        raise InputError(f"{where}: standard deviations are numbers of 0 or more, or null")
-    std = np.full(4 + len(lens.distortion), np.nan)
-    std[: len(values)] = [np.nan if value is None else value for value in values]
-    return std
+    return with_cameras(capture, content.get("cameras"), file)
 
 
 def write(folder: Path, capture: Capture, **remarks: Any) -> None:
@@ -130,11 +86,9 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     lens = None if capture.intrinsics is None else lens_as_json(capture.intrinsics)
     stated: dict[str, Any] = {"frames": frames, "intrinsics": lens}
     if capture.intrinsics_std is not None:
-        std = [None if np.isnan(value) else value for value in capture.intrinsics_std.tolist()]
-        stated["intrinsics_std"] = dict(zip(("fx", "fy", "cx", "cy"), std, strict=False)) | {
-            "distortion": std[4:]
-        }
-    write_text(folder / FILE, json.dumps(stated | arm | remarks, indent=1) + "\n")
+        stated["intrinsics_std"] = std_as_json(capture.intrinsics_std)
+    stated |= arm | cameras_as_json(capture) | remarks
+    write_text(folder / FILE, json.dumps(stated, indent=1) + "\n")
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
@@ -144,7 +98,8 @@ def kept(capture: Capture, folder: Path) -> Capture:
     """
     if capture.source is None:
         return capture
-    for name in filter(None, (*capture.images, *(capture.depths or ()))):
+    others = (name for camera in capture.others for name in camera.images)
+    for name in filter(None, (*capture.images, *(capture.depths or ()), *others)):
         write_bytes(folder / name, (capture.folder / name).read_bytes())
     write(folder, capture, source=str(capture.source))
     return replace(read(folder), cameras=capture.cameras, notes=capture.notes)

@@ -153,6 +153,11 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
     return first
 
 
+def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
+    """Width and height of every image, each decoded once; InputError where one is no picture."""
+    return [read_image(folder / name).shape[1::-1] for name in images]
+
+
 def _common_orientation(folder: Path, images: Sequence[str]) -> int:
     """The EXIF orientation of all images; InputError where they differ, as a camera's axes cannot."""
     first = how_stored(folder / images[0]).orientation

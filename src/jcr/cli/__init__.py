@@ -28,6 +28,7 @@ COMMANDS = {
     "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
+    "add-camera": "where a fixed camera is, from its pictures of the scene of a run",
     "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
     "measure": "support plane and the objects on it: height, footprint, label",
     "view": "a run in 3D, in the browser",

@@ -39,7 +39,7 @@ def script(shell: str) -> str:
 
 def _arguments(name: str) -> Iterator[Argument]:
     try:
-        command = import_module(f"jcr.cli.{name}")
+        command = import_module(f"jcr.cli.{name.replace('-', '_')}")
     except InputError:  # what it needs is not installed
         return
     yield from arguments_of(command.Arguments)

@@ -16,10 +16,15 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     Returns exit status 0, or raises NotTrustedError, also of one that is less exact than the user requires.
     """
     from jcr.calibration.words import shortfall, summary
+    from jcr.cell.cameras_json import in_words
     from jcr.results import RunResult
 
-    content = result.calibration
-    output.result(summary(content) + after, content.model_dump())
+    content, cameras = result.calibration, getattr(result, "cameras", None)
+    facts, text = content.model_dump(), summary(content)
+    if cameras is not None:
+        facts |= {"cameras": cameras.model_dump()["cameras"], "arms": cameras.model_dump()["arms"]}
+        text += "\n".join(in_words(cameras)) + "\n"
+    output.result(text + after, facts)
     for remark in content.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     # Notes on poses that were given are the reader's, which has printed them.
@@ -27,6 +32,9 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
         sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
         raise NotTrustedError(f"not to be trusted: {content.doubt}")
+    for camera in () if cameras is None else cameras.cameras:
+        if camera.doubt is not None:
+            raise NotTrustedError(f"camera {camera.name} is not to be trusted: {camera.doubt}")
     if (short := shortfall(content)) is not None:
         if content.requirement is not None and content.requirement.asked:
             raise NotTrustedError(short)

@@ -88,20 +88,25 @@ def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
 class Region:
     """The fit of an effective transform to the poses of a capture, s = 6n; the scale is not part of it."""
 
-    by_unknown: Float[ndarray, "s 12"]
-    """J, without the scale."""
-    fit: Float[ndarray, "12 s"]
+    by_unknown: Float[ndarray, "s u"]
+    """J, without the scale: 12 unknowns, and of further arms 12 each."""
+    fit: Float[ndarray, "u s"]
     """A = (JᵀWJ)⁻¹JᵀW; zero for poses that are not used."""
     unknowns: int = 13
-    """Of the whole problem, the first 13 of which are those of equation.py."""
+    """Of the whole problem; they begin as those of equation.py do."""
 
     @staticmethod
     def of_poses(jacobian: Float[ndarray, "s p"]) -> "Region":
         """That of the poses whose residuals have this derivative; the least change where these do not determine it."""
         by_unknown = np.delete(jacobian[:, :13], SCALE, axis=1)
+        return Region.of_unknowns(by_unknown, jacobian.shape[1])
+
+    @staticmethod
+    def of_unknowns(by_unknown: Float[ndarray, "s u"], unknowns: int) -> "Region":
+        """That of residuals with this derivative by what the effective transform may choose."""
         root = np.tile(EFFECTIVE_WEIGHT, len(by_unknown) // 6)
         fit = np.linalg.pinv(root[:, None] * by_unknown, rcond=1e-9) * root
-        return Region(by_unknown, fit, jacobian.shape[1])
+        return Region(by_unknown, fit, unknowns)
 
     def left(self, systematic: Float[ndarray, "s s"]) -> Float[ndarray, "s s"]:
         """Covariance of what a systematic error leaves after the effective transform took its part."""
@@ -118,16 +123,17 @@ class Region:
         own, m = self._corrected, second_moment.shape[-3]
         spread = (m - 1) / m * (own @ second_moment @ own.swapaxes(1, 2)).sum(-3)
         out = np.zeros((*spread.shape[:-2], self.unknowns, self.unknowns))
-        rows = np.delete(np.arange(13), SCALE)
+        rows = np.delete(np.arange(1 + self.by_unknown.shape[1]), SCALE)
         out[..., rows[:, None], rows] = spread
         return out
 
     @cached_property
-    def _corrected(self) -> Float[ndarray, "m 12 6"]:
+    def _corrected(self) -> Float[ndarray, "m u 6"]:
         """By which each pose's residuals pass into the unknowns, as if its own leverage were none."""
         m = len(self.by_unknown) // 6
-        own = self.fit.reshape(12, m, 6).swapaxes(0, 1)
-        leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, 12) @ own) / EFFECTIVE_WEIGHT
+        u = self.by_unknown.shape[1]
+        own = self.fit.reshape(u, m, 6).swapaxes(0, 1)
+        leverage = EFFECTIVE_WEIGHT[:, None] * (self.by_unknown.reshape(m, 6, u) @ own) / EFFECTIVE_WEIGHT
         values, vectors = np.linalg.eigh((leverage + leverage.swapaxes(1, 2)) / 2)
         vectors = vectors / EFFECTIVE_WEIGHT[:, None]
         return own @ (vectors / np.maximum(1 - values, LEAST_FREE)[:, None] @ np.linalg.inv(vectors))

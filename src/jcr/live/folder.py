@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.capture_json import FILE, read_lens
+from jcr.capture.capture_json import FILE
 from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
+from jcr.capture.lens_json import read_lens
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text

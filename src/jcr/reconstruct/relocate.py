@@ -33,7 +33,11 @@ MEASUREMENTS = 10
 
 
 @dataclass(frozen=True)
-class _Features:
+class Features:
+    """What is found in one image."""
+
+    x_px: Float[ndarray, "k 2"]
+    """In the original image, distorted."""
     rays: Float[ndarray, "k 2"]
     """(x/z, y/z), undistorted."""
     descriptors: Float32[ndarray, "k 128"]
@@ -62,13 +66,14 @@ def relocate(
     `older` are the images of the reconstruction's rows, in their order; all are of one camera.
     """
     lens = reconstruction.intrinsics
-    known = [_features(image, lens) for image in older]
+    known = [features(image, lens) for image in older]
     return [
-        _located(_features(image, lens), known, reconstruction.recon_from_camera, lens.fx) for image in new
+        _located(features(image, lens), known, reconstruction.recon_from_camera, lens.fx) for image in new
     ]
 
 
-def _features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> _Features:
+def features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> Features:
+    """SIFT of an image of this lens, reduced to WORKING_SIZE_PX."""
     scale = min(1.0, WORKING_SIZE_PX / max(lens.width, lens.height))
     size = round(lens.width * scale), round(lens.height * scale)
     grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
@@ -76,22 +81,25 @@ def _features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> _Features:
     sift = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(grey, None)
     if not points:
-        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+        return Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return _Features(unproject(resized(lens, *size), np.array([point.pt for point in points]))[:, :2], root)
+    at_work = resized(lens, *size)
+    found = np.array([point.pt for point in points])
+    to_original = np.array([lens.width / size[0], lens.height / size[1]])
+    return Features((found + 0.5) * to_original - 0.5, unproject(at_work, found)[:, :2], root)
 
 
 def _located(
-    features: _Features, known: list[_Features], recon_from_camera: Float[ndarray, "m 4 4"], focal_px: float
+    new: Features, known: list[Features], recon_from_camera: Float[ndarray, "m 4 4"], focal_px: float
 ) -> Located | int:
-    rays = features.rays
+    rays = new.rays
     gate = GATE_PX / focal_px
-    of_row = [_matches(features.descriptors, others.descriptors) for others in known]
+    of_row = [matches(new.descriptors, others.descriptors) for others in known]
     feature = np.concatenate([mine for mine, _ in of_row])
     row = np.repeat(np.arange(len(known)), [len(mine) for mine, _ in of_row])
     seen = np.concatenate([known[k].rays[theirs] for k, (_, theirs) in enumerate(of_row)])
-    x_in_recon, spread, good = _triangulated(feature, row, seen, recon_from_camera, gate, len(rays))
+    x_in_recon, spread, good = triangulated(feature, row, seen, recon_from_camera, gate, len(rays))
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     points, spread, rays = x_in_recon[good], spread[good], rays[good]
@@ -106,7 +114,7 @@ def _located(
     return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
 
 
-def _matches(
+def matches(
     mine: Float32[ndarray, "k 128"], theirs: Float32[ndarray, "l 128"]
 ) -> tuple[Int[ndarray, " c"], Int[ndarray, " c"]]:
     """Pairs that are each other's nearest and clearly nearer than the next."""
@@ -121,7 +129,7 @@ def _matches(
     return kept, best[kept]
 
 
-def _triangulated(
+def triangulated(
     feature: Int[ndarray, " c"],
     row: Int[ndarray, " c"],
     seen: Float[ndarray, "c 2"],

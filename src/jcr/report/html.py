@@ -25,6 +25,7 @@ from jcr.calibration.words import (
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics
+from jcr.report.cell_cameras import cameras_section
 from jcr.report.features import features_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
 from jcr.report.map_pictures import map_section
@@ -76,6 +77,18 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
     """
     calibration, hand_eye, capture = result.calibration, result.hand_eye, result.capture
     reconstruction, rows = result.reconstruction, result.image_index
+    if result.capture.mount == "base":
+        sections = [
+            _verdict(calibration),
+            _tiles(calibration),
+            _remarks("warnings", "Warnings", calibration.remarks),
+            _remarks("notes", "Notes", calibration.notes),
+            transform_section(hand_eye, "base"),
+            images_section(result),
+            residuals_section(result),
+            _details(calibration, options or {}),
+        ]
+        return _page(capture.folder, calibration, sections)
     base_from_camera = hand_eye.base_from_recon @ scale_translation(
         reconstruction.recon_from_camera, hand_eye.scale
     )
@@ -86,6 +99,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         _remarks("warnings", "Warnings", calibration.remarks),
         _remarks("notes", "Notes", calibration.notes),
         transform_section(hand_eye),
+        "" if result.cameras is None else cameras_section(result.cameras),
         scene_section(result, base_from_camera, surface),
         images_section(result),
         features_section(result),

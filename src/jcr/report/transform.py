@@ -4,6 +4,7 @@ import json
 from html import escape
 
 from jcr.export.ros import (
+    BASE,
     CHILD,
     PARENT,
     camera_info,
@@ -11,16 +12,19 @@ from jcr.export.ros import (
     static_transform_publisher,
     urdf_origin,
 )
-from jcr.records import HandEye
+from jcr.records import HandEye, Mount
 from jcr.report.markup import filled
 from jcr.report.notations import Notation, matrix_json, notations
 from jcr.rounding import significant
 
 
-def transform_section(hand_eye: HandEye) -> str:
-    """Matrix, quaternion, angles and rotation vector with their uncertainty; lines for ROS and URDF."""
-    x = hand_eye.gripper_from_camera
-    ros, urdf = static_transform_publisher(PARENT, CHILD, x), urdf_origin(x)
+def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> str:
+    """Matrix, quaternion, angles and rotation vector with their uncertainty; lines for ROS and URDF.
+
+    Of a fixed camera the transform is base_from_camera.
+    """
+    x, parent = hand_eye.gripper_from_camera, PARENT if mount == "gripper" else BASE
+    ros, urdf = static_transform_publisher(parent, CHILD, x), urdf_origin(x)
     return filled(
         "transform.html",
         matrix="\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in x),
@@ -31,7 +35,13 @@ def transform_section(hand_eye: HandEye) -> str:
         urdf=escape(urdf),
         copy_urdf=copy_button(urdf, "the URDF origin"),
         camera_info=_camera_info(hand_eye),
-        parent=PARENT,
+        parent=parent,
+        where="Where the camera sits on the gripper"
+        if mount == "gripper"
+        else "Where the fixed camera stands",
+        to="gripper frame of the given poses" if mount == "gripper" else "robot's base frame",
+        name=f"{mount}_from_camera",
+        whose="the frame of the gripper poses" if mount == "gripper" else "the robot's base",
         child=CHILD,
         doubt="" if hand_eye.converged else '<p class="why">Not to be trusted: see above.</p>',
     )

@@ -1,103 +1,46 @@
 """A simulated capture: what a wrist camera sees on its way over a scene, written with the truth beside it."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
-import cv2
 import numpy as np
-import tyro
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, UInt16
 from numpy import ndarray
 
 from jcr.capture.images import encode_png
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
-from jcr.geometry import retract
 from jcr.handeye.arms import RobotName, arm_named
-from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, silent, steps
-from jcr.records import Intrinsics
-from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
+from jcr.simulate.cell_capture import Further, add_cameras, simulate_eye_to_hand, sizes_of
+from jcr.simulate.options import SimulateOptions
+from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
 from jcr.simulate.robots import (
     EFFECTIVE_POSES,
     BentArm,
     bend,
-    effective_hand_eye_about,
+    effective_about,
     hand_eye_on,
     patterned,
     table_center,
 )
-from jcr.simulate.scenes import SceneName, TableName, make_scene, moved
+from jcr.simulate.scenes import make_scene, moved
+from jcr.simulate.taken import degraded, encoded, pinhole, with_lens_error, with_robot_noise
 from jcr.simulate.truth import Truth, write_depth, write_labels, write_robot, write_truth
 
-_WIDTH, _HEIGHT = 640, 480
 
-
-@dataclass(frozen=True)
-class SimulateOptions:
-    """What to simulate."""
-
-    scene: SceneName = "tabletop"
-    """Objects and table: a mix on wood; 8 or 7 items on a plain light table; 7 on a plain dark one; tape,
-    box, mug and toolbox for measuring."""
-    images: int = 12
-    """How many images; of the pattern `varied` fewer are the first ones of more (`two` has 2)."""
-    pattern: Pattern = "varied"
-    """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
-    pure translation, a turntable, xyz + yaw (SCARA), turning about a tool point or about the camera's centre,
-    two images."""
-    robot: RobotName | None = None
-    """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
-    its nominal kinematics (unset: a gripper without an arm)."""
-    joint_offsets: float = 0.0
-    """Sigma of the offsets of the robot's joints, in degrees. With this and the next three, reference.json has the
-    effective hand-eye transform, and the physical one beside it."""
-    link_errors: float = 0.0
-    """Sigma of the translations of the robot's joint axes, in mm; of their rotations, 0.19 degrees per mm."""
-    gear_errors: float = 0.0
-    """Sigma of eccentric gears or encoders, in degrees: amplitudes of sine and cosine of each joint's angle."""
-    sag: float = 0.0
-    """Sigma of the deflection of each joint under gravity, in degrees with the arm stretched out."""
-    seed: int = 0
-    """Objects, layout, textures, lamp, lens, hand-eye and poses all follow from it."""
-    texture: bool = True
-    """Print and grain on the surfaces; without, each has one uniform colour, with nothing for features."""
-    table: TableName | None = None
-    """Light or dark table top (unset: as the scene has it)."""
-    robot_noise: tuple[float, float] = (0.0, 0.0)
-    """Sigma per axis, in mm and degrees, of Gaussian errors of the gripper poses in capture.json; the images
-    show the true ones."""
-    unknown_intrinsics: bool = False
-    """Leave the intrinsics out of capture.json. (Known or not, the lens is a pinhole without distortion.)"""
-    lens_error: float = 0.0
-    """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
-    the image's width for each coordinate of the principal point. The images show the true ones."""
-    noise: float = 0.0
-    """Sigma of the pixel noise, in grey levels of 255."""
-    blur: float = 0.0
-    """Sigma of the blur, in pixels."""
-    depth: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="PERCENT MM")] = None
-    """Depth images as a depth camera takes them: lengths too long by so much, and the sigma of a depth at 1 m, which
-    grows with the square of the distance; none at edges."""
-    vignetting: float = 0.0
-    """Share of light lost in the corners, 0 to 1."""
-    jpeg_quality: int | Literal["lossless"] = 90
-    """1 to 100, or lossless: PNG."""
-    truth: Literal["full", "scene"] = "full"
-    """Write truth/ with depth and labels of every image, or with scene.json alone."""
-
-
-def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: Progress = silent) -> Path:
+def simulate(out: Path, options: SimulateOptions | None = None, progress: Progress = silent) -> Path:
     """Write a capture folder with reference.json and truth/ to `out`, and return `out`.
 
     The same options give the same capture.json and truth/scene.json, and on one machine the same images.
     Raises InputError for options that mean nothing, where `out` holds something already, and where MuJoCo or
     an OpenGL library is missing.
     """
-    _check(out, options)
+    _check(out, options := options or SimulateOptions())
+    if options.eye_to_hand:
+        return simulate_eye_to_hand(out, options, progress)
     # One stream of random numbers a matter: a change in one must not disturb the others.
     motion, lens, robot = (np.random.default_rng([options.seed, stream]) for stream in (4, 5, 6))
     scene = make_scene(options.scene, options.seed, options.table)
@@ -121,7 +64,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
         gripper_from_camera=gripper_from_camera,
         base_from_gripper=base_from_gripper,
         base_from_camera=base_from_gripper @ gripper_from_camera,
-        intrinsics=_pinhole(lens),
+        intrinsics=pinhole(lens),
         labels=scene.labels,
         table_height=scene.table_height,
         workspace_in_base=scene.workspace_in_base,
@@ -135,8 +78,8 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
         with_truth=options.truth == "full" or options.depth is not None,
     )
     for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
-        image = _degraded(view.image, options, np.random.default_rng([options.seed, 7, k]))
-        write_bytes(out / truth.images[k], _encoded(image, options.jpeg_quality))
+        image = degraded(view.image, options, np.random.default_rng([options.seed, 7, k]))
+        write_bytes(out / truth.images[k], encoded(image, options.jpeg_quality))
         if options.truth == "full" and view.depth is not None and view.label is not None:
             write_depth(truth, k, view.depth)
             write_labels(truth, k, view.label)
@@ -144,6 +87,7 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
             measured = _measured(view.depth, options.depth, np.random.default_rng([options.seed, 8, k]))
             write_bytes(out / _depth_name(k), encode_png(measured))
     write_truth(truth)
+    reference: dict[str, object]
     if arm is None:
         reference = {"gripper_from_camera": gripper_from_camera.tolist(), "how": "simulated, exact"}
     else:
@@ -153,6 +97,13 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
             "physical_gripper_from_camera": arm.physical.tolist(),
             "how": f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras",
         }
+    further = Further({}, {})
+    if options.fixed_cameras or options.wrist_cameras > 1 or options.arms > 1:
+        x_and_base = (
+            (gripper_from_camera, np.eye(4)) if arm is None else (arm.effective, arm.effective_from_true_base)
+        )
+        further = add_cameras(out, options, scene, truth, x_and_base, suffix)
+        reference |= further.reference
     write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
     frames: list[dict[str, object]] = [
         {"image": image, "base_from_gripper": matrix.tolist()}
@@ -167,7 +118,10 @@ def simulate(out: Path, options: SimulateOptions = SimulateOptions(), progress: 
         for frame, row in zip(frames, arm.joints.tolist(), strict=True):
             frame["joints"] = row
     # Last: a folder with a capture.json is a complete capture.
-    write_text(out / "capture.json", json.dumps(_capture_json(truth, options, frames), indent=1) + "\n")
+    write_text(
+        out / "capture.json",
+        json.dumps(_capture_json(truth, options, frames) | further.content, indent=1) + "\n",
+    )
     return out
 
 
@@ -194,22 +148,17 @@ class _Arm:
     physical: Float[ndarray, "4 4"]
     """gripper_from_camera where the camera is bolted."""
     effective: Float[ndarray, "4 4"]
+    effective_from_true_base: Float[ndarray, "4 4"]
 
 
 def _arm(options: SimulateOptions, robot: RobotName, motion: np.random.Generator) -> _Arm:
     errors, elsewhere = (np.random.default_rng([options.seed, stream]) for stream in (8, 9))
-    sizes = ErrorSizes(
-        joint_offset=np.radians(options.joint_offsets),
-        link=1e-3 * options.link_errors,
-        sag=np.radians(options.sag),
-        gear=np.radians(options.gear_errors),
-    )
-    bent = bend(arm_named(robot), sizes, errors)
+    bent = bend(arm_named(robot), sizes_of(options), errors)
     target = table_center(bent.arm)
     physical = hand_eye_on(bent.arm, motion)
     joints = patterned(bent.arm, options.pattern, options.images, target, physical, motion)
-    effective = effective_hand_eye_about(bent, physical, options.images, elsewhere, target)
-    return _Arm(bent, joints, physical, effective)
+    fit = effective_about(bent, physical, options.images, elsewhere, target)
+    return _Arm(bent, joints, physical, fit.gripper_from_camera, fit.base_from_recon)
 
 
 def _check(out: Path, options: SimulateOptions) -> None:
@@ -239,31 +188,16 @@ def _check(out: Path, options: SimulateOptions) -> None:
         raise InputError(
             f"--robot-noise, --noise, --blur, --lens-error, {', '.join(bends)}: sigmas; give 0 or more"
         )
+    if not (0 <= options.fixed_cameras <= 20 and options.wrist_cameras in (1, 2) and options.arms in (1, 2)):
+        raise InputError("--fixed-cameras 0 to 20, --wrist-cameras 1 or 2, --arms 1 or 2: give one of these")
+    if options.eye_to_hand and (options.fixed_cameras or options.wrist_cameras > 1 or options.arms > 1):
+        raise InputError(
+            "--eye-to-hand: has one camera, which watches the gripper; leave the further ones out"
+        )
     if not 0 <= options.vignetting <= 1:
         raise InputError(f"--vignetting {options.vignetting}: give 0 to 1")
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists already and is no empty folder; name a new one, or remove it first")
-
-
-def _pinhole(rng: np.random.Generator) -> Intrinsics:
-    """A lens of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
-
-    MuJoCo's image spans [-½, W-½] when pixel (0, 0) is the centre of a pixel, so its middle is (W-1)/2.
-    """
-    focal_px = float(0.5 * _HEIGHT / np.tan(0.5 * np.radians(rng.uniform(40, 48))))
-    return Intrinsics(focal_px, focal_px, (_WIDTH - 1) / 2, (_HEIGHT - 1) / 2, _WIDTH, _HEIGHT)
-
-
-def with_lens_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
-    """Intrinsics that are off by Gaussian errors: fx and fy by one of `percent`, cx and cy each of that of the width."""
-    focal, x, y = 0.01 * percent * rng.normal(size=3)
-    return replace(
-        camera,
-        fx=camera.fx * (1 + focal),
-        fy=camera.fy * (1 + focal),
-        cx=camera.cx + x * camera.width,
-        cy=camera.cy + y * camera.width,
-    )
 
 
 def _capture_json(
@@ -277,37 +211,3 @@ def _capture_json(
         **({} if options.robot is None else {"robot": options.robot}),
         "source": {"program": "jcr simulate", "options": asdict(options)},
     }
-
-
-def with_robot_noise(
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    translation_mm: float,
-    rotation_deg: float,
-    rng: np.random.Generator,
-) -> Float[ndarray, "n 4 4"]:
-    """What a robot of that accuracy reports: each pose after a step of independent Gaussians in every axis."""
-    sizes = np.repeat([1e-3 * translation_mm, np.radians(rotation_deg)], 3)
-    return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
-
-
-def _degraded(
-    image: UInt8[ndarray, "h w 3"], options: SimulateOptions, rng: np.random.Generator
-) -> UInt8[ndarray, "h w 3"]:
-    """The image of a cheaper camera: blurred, darker towards the corners, noisy."""
-    light = image.astype(np.float32)
-    if options.blur:
-        light = cv2.GaussianBlur(light, (0, 0), options.blur)
-    if options.vignetting:
-        height, width = image.shape[:2]
-        x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)[:, None]
-        light *= (1 - options.vignetting * 0.5 * (x * x + y * y))[..., None]
-    if options.noise:
-        light += rng.normal(0, options.noise, image.shape)
-    return np.clip(light + 0.5, 0, 255).astype(np.uint8)
-
-
-def _encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:
-    """RGB as JPEG of that quality, or as PNG."""
-    if jpeg_quality == "lossless":
-        return encode_png(image)
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()

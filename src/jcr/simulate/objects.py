@@ -89,6 +89,11 @@ def package(rng: np.random.Generator) -> TableObject:
     return _package("box", rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
 
 
+def held_package(rng: np.random.Generator) -> TableObject:
+    """A larger printed package, as a gripper would hold before a fixed camera."""
+    return _package("held", rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23)))
+
+
 def book(rng: np.random.Generator) -> TableObject:
     """A closed book, lying, whose pages show on three sides."""
     x, y, z = rng.uniform((0.12, 0.17, 0.018), (0.15, 0.21, 0.035))

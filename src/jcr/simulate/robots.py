@@ -15,7 +15,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_exp, scale_translation, skew, transform
 from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
-from jcr.handeye.known_scale import fit_known_scale
+from jcr.handeye.known_scale import Fit, fit_known_scale
 from jcr.handeye.robots import (
     Arm,
     ErrorSizes,
@@ -257,11 +257,23 @@ def effective_hand_eye_about(
 
     Other poses of the same views: a capture of few does not reach where the pattern's later ones are.
     """
+    return effective_about(bent, gripper_from_camera, count, rng, target_in_base).gripper_from_camera
+
+
+def effective_about(
+    bent: BentArm,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    count: int,
+    rng: np.random.Generator,
+    target_in_base: Float[ndarray, "3"] | None = None,
+) -> Fit:
+    """The same with the effective base, from the one in which the true poses are."""
     captures = -(-EFFECTIVE_POSES // count)
     others = [views(bent.arm, count, gripper_from_camera, rng, target_in_base) for _ in range(captures)]
     joints = np.concatenate(others)
     cameras = bent.true(joints) @ gripper_from_camera
-    return effective_hand_eye(bent.reported(joints), cameras, gripper_from_camera)
+    start = gripper_from_camera, np.eye(4)
+    return fit_known_scale(bent.reported(joints), cameras, start, EFFECTIVE_NOISE)
 
 
 def effective_hand_eye(

@@ -1,0 +1,296 @@
+"""`jcr bench cameras DIR`: further cameras and arms, simulated against the truth and real pictures against the robot."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.stats import chi2
+
+from jcr.calibration.intrinsics_prior import prior_of
+from jcr.calibration.stage import calibrate
+from jcr.camera import parameters, with_parameters
+from jcr.capture.read import read_capture
+from jcr.cell.bundle import Freedom, Scene, adjust_images
+from jcr.cell.stage import place_cameras
+from jcr.cell.ties import Answer, Placed, Tie, tied
+from jcr.errors import InputError, NotTrustedError
+from jcr.geometry import inverse, scale_translation, skew, step_between
+from jcr.handeye.systematic import smooth_errors
+from jcr.reconstruct.backends import ReconstructOptions, reconstruct
+from jcr.records import Capture, CellCamera
+from jcr.simulate.cell import CellProblem, Kind, cell_problem
+from jcr.simulate.robots import PresetName
+
+DRAWS = 40
+COUNT = 10
+"""Poses of each arm."""
+PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
+WITHHELD = 4
+"""Every so many of a real capture's images are declared pictures of fixed cameras, one each."""
+Of = Callable[[Placed], Float[ndarray, "4 4"]]
+
+
+def wanted(problem: CellProblem) -> dict[str, Of]:
+    """What is asked of a cell, by the name that its truth has."""
+    if problem.kind == "carried":
+        return {"base_from_camera": lambda p: p.x[0]}
+    if problem.kind == "wrists":
+        return {
+            "gripper_from_camera": lambda p: p.x[0],
+            "gripper_from_second": lambda p: p.x[0] @ scale_translation(p.scene.rig_from_camera[1], p.scale),
+        }
+    if problem.kind == "arms":
+        return {
+            "gripper_from_camera": lambda p: p.x[0],
+            "gripper_from_second": lambda p: p.x[1],
+            "base1_from_base2": lambda p: p.z[0] @ inverse(p.z[1]),
+        }
+    return {"base_from_camera": lambda p: p.z[0] @ scale_translation(p.scene.world_from_rig[COUNT], p.scale)}
+
+
+WORDS: dict[Kind, str] = {
+    "fixed": "a fixed camera",
+    "wrists": "two cameras on a wrist",
+    "arms": "two arms",
+    "carried": "eye-to-hand",
+}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One answer against its truth."""
+
+    error: Float[ndarray, "6"]
+    covariance: Float[ndarray, "6 6"]
+
+    @property
+    def squared(self) -> float:
+        """Mahalanobis' distance."""
+        return float(self.error @ np.linalg.solve(self.covariance, self.error))
+
+    @property
+    def sigmas(self) -> float:
+        """Of the worst axis."""
+        return float((np.abs(self.error) / np.sqrt(np.diag(self.covariance))).max())
+
+
+def run(captures: Path, boards: Sequence[str] = ()) -> str:
+    """Markdown: 40 simulated draws of each kind, and withheld pictures of every capture below `captures`.
+
+    Raises InputError where there is no capture, or boards are named.
+    """
+    if boards:
+        raise InputError("bench cameras: takes no --boards; leave them out")
+    folders = sorted(path.parent for path in captures.glob("*/capture.json"))
+    if not folders:
+        raise InputError(f"{captures}: no folder below it holds a capture.json")
+    drawn = {(kind, preset): _drawn(kind, preset) for kind in get_args(Kind) for preset in PRESET_NAMES}
+    real = [line for folder in folders for line in _withheld(folder)]
+    return _page(drawn, real)
+
+
+def answered(problem: CellProblem, seed: int) -> Answer:
+    """The cell from its pictures and poses; intrinsics are off by what is usual of given ones."""
+    rng = np.random.default_rng([seed, 17])
+    cameras = []
+    for camera in problem.cameras:
+        free = prior_of(camera)
+        off = free.directions @ (free.std * rng.normal(size=len(free.std)))
+        cameras.append(with_parameters(camera, parameters(camera) + off))
+    mounts = np.array([False, *[problem.kind == "wrists"] * (len(cameras) - 1)])
+    scene = Scene(problem.world_from_rig, problem.rig_from_camera, tuple(cameras), problem.points_in_world)
+    imaged = adjust_images(scene, problem.pictures, Freedom(tuple(map(prior_of, cameras)), mounts))
+    ties = [
+        Tie(np.arange(COUNT) + COUNT * k, poses, smooth_errors(poses), start, problem.kind == "carried")
+        for k, (poses, start) in enumerate(zip(problem.reported, problem.starts, strict=True))
+    ]
+    return tied(imaged, ties, problem.scale)
+
+
+def _drawn(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
+    out: dict[str, list[Draw]] = {}
+    for seed in range(DRAWS):
+        problem = cell_problem(kind, preset, COUNT, seed)
+        answer = answered(problem, seed)
+        for name, of in wanted(problem).items():
+            found, covariance = answer.transform(of)
+            out.setdefault(name, []).append(Draw(step_between(found, problem.truth[name]), covariance))
+    return out
+
+
+@dataclass(frozen=True)
+class Row:
+    """One withheld picture."""
+
+    capture: str
+    image: str
+    lens: str
+    points: int
+    draw: Draw | None
+    """Of base_from_camera against the robot's pose and X; None where it was not placed."""
+    std_mm: float = 0.0
+    std_deg: float = 0.0
+    scene_mm: float = 0.0
+    says: str = ""
+
+
+def _withheld(folder: Path) -> list[Row]:
+    capture = read_capture(folder)
+    apart = list(range(2, len(capture), WITHHELD))
+    kept = [row for row in range(len(capture)) if row not in apart]
+    rest = _of_rows(capture, kept)
+    try:
+        reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap", dense=False))
+        hand_eye = calibrate(rest, reconstruction)
+    except NotTrustedError as refusal:
+        return [Row(folder.name, "–", "", 0, None, says=str(refusal))]
+    if not hand_eye.converged:
+        return [Row(folder.name, "–", "", 0, None, says=hand_eye.warnings[0])]
+    cameras = [
+        CellCamera(f"fixed{row}", "base", (capture.images[row],), capture.image_size, capture.intrinsics)
+        for row in apart
+    ]
+    found = place_cameras(rest, cameras, reconstruction, hand_eye)
+    lens, rows = "estimated" if capture.intrinsics is None else "given", []
+    rig = int(hand_eye.inliers.sum())
+    for row, camera in zip(apart, found.cameras, strict=True):
+        points = camera.pictures[0].points
+        if camera.parent_from_camera is None or camera.covariance is None:
+            rows.append(Row(folder.name, capture.images[row], lens, points, None, says=camera.warnings[0]))
+            continue
+        assert found.answer is not None
+        draw = _against_robot(found.answer, rig, capture.base_from_gripper[row])
+        rig += 1
+        std = np.sqrt(np.diag(camera.covariance))
+        rows.append(
+            Row(
+                folder.name,
+                capture.images[row],
+                lens,
+                points,
+                draw,
+                1e3 * float(std[:3].max()),
+                float(np.degrees(std[3:].max())),
+                1e3 * (camera.std_at_scene or 0.0),
+                "" if camera.converged else camera.warnings[0],
+            )
+        )
+    return rows
+
+
+def _of_rows(capture: Capture, rows: list[int]) -> Capture:
+    return replace(
+        capture,
+        images=tuple(capture.images[row] for row in rows),
+        base_from_gripper=capture.base_from_gripper[rows],
+        joints=None if capture.joints is None else capture.joints[rows],
+    )
+
+
+def _against_robot(answer: Answer, rig: int, gripper: Float[ndarray, "4 4"]) -> Draw:
+    """base_from_camera of a rig that no arm moved, against the pose that its arm reported and X, with errors of both."""
+
+    def placed(p: Placed) -> Float[ndarray, "4 4"]:
+        return p.z[0] @ scale_translation(p.scene.world_from_rig[rig], p.scale)
+
+    def carried(p: Placed) -> Float[ndarray, "4 4"]:
+        return gripper @ p.x[0]
+
+    j = answer.derivative(placed) - answer.derivative(carried)
+    moves = np.eye(6)
+    moves[:3, 3:] = -skew(gripper[:3, :3] @ answer.placed.x[0][:3, 3])
+    sizes = np.hypot(answer.noise, answer.systematic_left)
+    robot = moves @ np.diag(np.repeat(sizes, 3) ** 2) @ moves.T
+    error = step_between(placed(answer.placed), carried(answer.placed))
+    return Draw(error, j @ answer.covariance @ j.T + robot)
+
+
+def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Sequence[Row]) -> str:
+    every = [draw for names in drawn.values() for draws in names.values() for draw in draws]
+    beyond = 100 * np.mean([draw.sigmas > 3 for draw in every])
+    placed = [row for row in real if row.draw is not None]
+    lines = [
+        f"> Simulated cells of {COUNT} poses an arm, {DRAWS} draws of each kind: {100 * _inside(every, 0.95):.0f} % of "
+        f"{len(every)} answers lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that of "
+        f"99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
+    ]
+    if placed:
+        errors = np.array([_size(row.draw) for row in placed if row.draw is not None])
+        named = sorted({row.capture for row in placed})
+        median = np.median(errors, axis=0)
+        lines.append(
+            f"> Real pictures declared to be of fixed cameras, {len(placed)} of {len([r for r in real if r.lens])} "
+            f"placed, of {', '.join(named)}: base_from_camera {median[0]:.1f} mm and {median[1]:.2f}° from the robot's "
+            f"pose times X (median), at most {errors[:, 0].max():.1f} mm; "
+            f"{sum(row.draw.sigmas > 3 for row in placed if row.draw is not None)} beyond 3 σ of both on an axis."
+        )
+    lines += [
+        "",
+        "Simulated: arms of UR5e kinematics, white: random errors of 0.5 mm and 0.1°; typical: joint offsets of 0.1° "
+        "and link errors of 0.3 mm, the truth then the effective transform. Points of a table (of a box of "
+        f"{_box()} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
+        "length, 0.5 % of the width). No pictures: what bundle adjustment and the robots make of them.",
+        "",
+        "| cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ | "
+        "squared distance / 6 |",
+        "|---" * 10 + "|",
+    ]
+    for (kind, preset), names in drawn.items():
+        for name, draws in names.items():
+            sizes = np.array([_size(draw) for draw in draws])
+            low, high = np.median(sizes, axis=0), np.quantile(sizes, 0.95, axis=0)
+            std = np.median([_std(draw) for draw in draws], axis=0)
+            inside = [f"{100 * _inside(draws, share):.0f} %" for share in (0.95, 0.99)]
+            lines.append(
+                f"| {WORDS[kind]} | {preset} | {name} | {low[0]:.2f} mm {low[1]:.3f}° | "
+                f"{high[0]:.2f} mm {high[1]:.3f}° | {std[0]:.2f} mm {std[1]:.3f}° | {' | '.join(inside)} | "
+                f"{100 * np.mean([draw.sigmas > 3 for draw in draws]):.0f} % | "
+                f"{np.mean([draw.squared for draw in draws]) / 6:.2f} |"
+            )
+    lines += [
+        "",
+        f"Real: every {WITHHELD}th image of a capture is declared the picture of a fixed camera of its own, its gripper "
+        "pose withheld; base_from_camera then against the pose that the robot reported there, times the X of the other "
+        "images. In σ: largest on an axis, of the camera's place, X and the robot's pose together.",
+        "",
+        "| capture | picture | intrinsics | points | off: mm | ° | in σ | ±σ: mm | ° | at the scene: mm |",
+        "|---" * 10 + "|",
+    ]
+    for row in real:
+        if row.draw is None:
+            lines.append(
+                f"| {row.capture} | {row.image} | {row.lens} | {row.points} | – | – | – | – | – | – |"
+            )
+            continue
+        mm, deg = _size(row.draw)
+        lines.append(
+            f"| {row.capture} | {row.image} | {row.lens} | {row.points} | {mm:.2f} | {deg:.3f} | "
+            f"{row.draw.sigmas:.1f} | {row.std_mm:.2f} | {row.std_deg:.3f} | {row.scene_mm:.1f} |"
+        )
+    lines += ["", *(f"- {row.capture}, {row.image}: {row.says}" for row in real if row.says)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _box() -> str:
+    from jcr.simulate.cell import BOX
+
+    return "x".join(f"{1e3 * side:.0f}" for side in BOX)
+
+
+def _inside(draws: Sequence[Draw], share: float) -> float:
+    return float(np.mean([draw.squared < chi2.ppf(share, 6) for draw in draws]))
+
+
+def _size(draw: Draw) -> tuple[float, float]:
+    """mm and degrees of the error."""
+    return 1e3 * float(np.linalg.norm(draw.error[:3])), float(np.degrees(np.linalg.norm(draw.error[3:])))
+
+
+def _std(draw: Draw) -> tuple[float, float]:
+    """mm and degrees per axis, root mean square."""
+    metres, radians = np.sqrt(np.diag(draw.covariance).reshape(2, 3).mean(1))
+    return 1e3 * float(metres), float(np.degrees(radians))

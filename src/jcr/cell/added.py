@@ -1,0 +1,69 @@
+"""Cameras added to a run after its calibration: copies of their pictures in the run folder."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from jcr.capture.cell_cameras import cameras_as_json, with_cameras
+from jcr.capture.images import read_image
+from jcr.capture.lens_json import read_lens_of_these
+from jcr.capture.plain_files import read_json
+from jcr.errors import InputError
+from jcr.files import write_bytes, write_text
+from jcr.records import Capture, CellCamera
+
+FOLDER, FILE = "cameras", "cameras.json"
+
+
+def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
+    """The cameras added to a run so far; InputError where their file or a picture was damaged."""
+    folder = run_folder / FOLDER
+    if not (folder / FILE).is_file():
+        return ()
+    alone = replace(capture, folder=folder, others=())
+    read = with_cameras(alone, read_json(folder / FILE), folder / FILE)
+    return tuple(replace(camera, folder=folder) for camera in read.others)
+
+
+def camera_of(
+    name: str, pictures: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]
+) -> CellCamera:
+    """A fixed camera of pictures where they lie; InputError for pictures that cannot be those of one camera.
+
+    `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
+    that other cameras have.
+    """
+    if name in taken:
+        raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
+    sizes = [read_image(picture).shape[1::-1] for picture in pictures]
+    for picture, size in zip(pictures, sizes, strict=True):
+        if size != sizes[0]:
+            raise InputError(
+                f"{picture}: {size[0]}x{size[1]} pixels, but {pictures[0]} has {sizes[0][0]}x{sizes[0][1]}; pictures of "
+                "one camera have one size: add each camera by itself"
+            )
+    lens = None
+    if intrinsics is not None:
+        content = read_json(intrinsics)
+        if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
+            content = content["intrinsics"]
+        lens = read_lens_of_these(content, sizes[0], f"{pictures[0]}, {intrinsics}")
+    images = tuple(str(picture.resolve()) for picture in pictures)
+    return CellCamera(name, "base", images, sizes[0], lens, folder=Path("/"))
+
+
+def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellCamera:
+    """Make the camera part of the run: its pictures copied, its entry written."""
+    folder = run_folder / FOLDER
+    images = []
+    for k, image in enumerate(camera.images):
+        source = (camera.folder or capture.folder) / image
+        images.append(f"{camera.name}/{k:03d}{source.suffix.lower()}")
+        write_bytes(folder / images[-1], source.read_bytes())
+    kept = replace(camera, images=tuple(images), folder=folder)
+    every = (*read_added_cameras(run_folder, capture), kept)
+    content = cameras_as_json(replace(capture, others=every))["cameras"]
+    del content[capture.camera_name]
+    write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
+    return kept

@@ -1,0 +1,77 @@
+"""What was found of a cell's further cameras."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.geometry import skew
+from jcr.records import Intrinsics, Mount
+
+if TYPE_CHECKING:
+    from jcr.cell.ties import Answer
+
+
+@dataclass(frozen=True)
+class PictureFound:
+    """What became of one picture."""
+
+    image: str
+    used: bool
+    points: int
+    """Shared with the images of the capture's own camera."""
+    reprojection_px: float | None
+    reason: str | None
+    """Why it was not used."""
+
+
+@dataclass(frozen=True)
+class CameraFound:
+    """Where one camera of the cell is."""
+
+    name: str
+    mount: Mount
+    arm: str | None
+    pictures: tuple[PictureFound, ...]
+    parent_from_camera: Float[ndarray, "4 4"] | None = None
+    """base_from_camera or gripper_from_camera, of its own arm; None where it was not found."""
+    covariance: Float[ndarray, "6 6"] | None = None
+    """Of its step."""
+    scene_distance: float | None = None
+    """m along the optical axis to what it sees."""
+    intrinsics: Intrinsics | None = None
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    converged: bool = False
+    warnings: tuple[str, ...] = ()
+    """The first says why it is not to be trusted, where it is not."""
+
+    @property
+    def std_at_scene(self) -> float | None:
+        """m: one sigma, along the worst axis, of a point that the camera sees at that distance."""
+        if self.parent_from_camera is None or self.covariance is None or self.scene_distance is None:
+            return None
+        arm = self.scene_distance * self.parent_from_camera[:3, 2]
+        j = np.concatenate([np.eye(3), -skew(arm)], axis=1)
+        return float(np.sqrt(np.linalg.eigvalsh(j @ self.covariance @ j.T)[-1]))
+
+
+@dataclass(frozen=True)
+class ArmFound:
+    """Where another arm stands."""
+
+    name: str
+    base_from_other: Float[ndarray, "4 4"]
+    """From its base to that of the capture's own arm."""
+    covariance: Float[ndarray, "6 6"]
+
+
+@dataclass(frozen=True)
+class CellFound:
+    """All that was placed."""
+
+    cameras: tuple[CameraFound, ...]
+    arms: tuple[ArmFound, ...]
+    answer: "Answer | None"
+    """None where no camera could be placed."""

@@ -1,0 +1,290 @@
+"""Cells with several cameras as numbers, without pictures: what robots report and pictures show, and the truth.
+
+Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
+arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
+those of arms that bend as robots.py has it, and the truth is the effective transform.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.camera import project
+from jcr.cell.bundle import Pictures
+from jcr.geometry import (
+    apply,
+    apply_similarity,
+    inverse,
+    retract,
+    rotation_exp,
+    skew,
+    step_between,
+    transform,
+)
+from jcr.handeye.arms import arm_named
+from jcr.handeye.equation import predict, residuals
+from jcr.handeye.known_scale import FREE, fit_known_scale
+from jcr.handeye.robots import Arm, Joints
+from jcr.records import Intrinsics
+from jcr.simulate.observations import LENS
+from jcr.simulate.poses import random_hand_eye
+from jcr.simulate.problem import disturbed
+from jcr.simulate.robots import (
+    EFFECTIVE_NOISE,
+    EFFECTIVE_POSES,
+    PRESETS,
+    BentArm,
+    PresetName,
+    bend,
+    hand_eye_on,
+    table_center,
+    views,
+)
+
+Kind = Literal["fixed", "wrists", "arms", "carried"]
+FIXED_LENS = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
+TABLE = np.array([[-0.25, -0.25, 0.0], [0.25, 0.25, 0.12]])
+"""m about the middle of the table: where points lie."""
+BOX = np.array([0.16, 0.12, 0.1])
+"""m: the thing in the gripper, its middle this far ahead of the gripper's frame."""
+BOX_AHEAD = 0.12
+STRIDE = 0.4
+"""rad by which joints move about a posture while the box is watched."""
+
+
+@dataclass(frozen=True)
+class CellProblem:
+    """What is reported and seen, and the truth."""
+
+    kind: Kind
+    reported: tuple[Float[ndarray, "n 4 4"], ...]
+    """base_from_gripper of each arm."""
+    pictures: Pictures
+    """Rigs are those of the first arm in order, then of the second, then fixed cameras."""
+    world_from_rig: Float[ndarray, "m 4 4"]
+    """In a frame and unit of their own, as a reconstruction has them."""
+    rig_from_camera: Float[ndarray, "c 4 4"]
+    """In that unit."""
+    points_in_world: Float[ndarray, "p 3"]
+    cameras: tuple[Intrinsics, ...]
+    scale: float
+    truth: dict[str, Float[ndarray, "4 4"]]
+    """gripper_from_camera, and of a second one or arm; base_from_camera, base1_from_base2, gripper_from_object."""
+    starts: tuple[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]], ...]
+    """True X and base_from_world of each arm, where a search may start."""
+
+
+def cell_problem(
+    kind: Kind, preset: PresetName, count: int, seed: int, noise_px: float = 0.5, points: int = 400
+) -> CellProblem:
+    """A random cell of that kind, of UR5e arms with errors of `preset`, and `count` poses of each."""
+    make = _carried if kind == "carried" else _before_table
+    return make(kind, preset, count, np.random.default_rng([seed, 13]), noise_px, points)
+
+
+def _before_table(
+    kind: Kind, preset: PresetName, count: int, rng: np.random.Generator, noise_px: float, points: int
+) -> CellProblem:
+    arms = [_drawn(preset, rng) for _ in range(2 if kind == "arms" else 1)]
+    base_from_second = transform(
+        rotation_exp(np.array([0.0, 0.0, np.pi + rng.uniform(-0.3, 0.3)])), np.zeros(3)
+    )
+    target = table_center(arms[0].arm)
+    base_from_second[:3, 3] = target - base_from_second[:3, :3] @ target + 0.03 * rng.normal(size=3)
+    bases = [np.eye(4), base_from_second]
+    rigs, reported, fits, mounted = [], [], [], []
+    for bent, world_from_base in zip(arms, bases, strict=False):
+        x = hand_eye_on(bent.arm, rng)
+        joints = views(bent.arm, count, x, rng)
+        others = np.concatenate([views(bent.arm, count, x, rng) for _ in range(-(-EFFECTIVE_POSES // count))])
+        cameras = world_from_base @ bent.true(others) @ x
+        fits.append(
+            fit_known_scale(bent.reported(others), cameras, (x, inverse(world_from_base)), EFFECTIVE_NOISE)
+        )
+        rigs.append(world_from_base @ bent.true(joints) @ x)
+        reported.append(disturbed(bent.reported(joints), PRESETS[preset].white, rng))
+        mounted.append(x)
+    mounts, lenses = [np.eye(4)], [LENS]
+    pictures = [(k, 0) for k in range(count)]
+    truth = {"gripper_from_camera": fits[0].gripper_from_camera}
+    if kind == "wrists":
+        mounts.append(transform(rotation_exp(0.05 * rng.normal(size=3)), np.array([0.055, 0.0, 0.0])))
+        lenses.append(FIXED_LENS)
+        pictures += [(k, 1) for k in range(count)]
+        truth["gripper_from_second"] = fits[0].gripper_from_camera @ mounts[1]
+    if kind == "arms":
+        mounts.append(np.eye(4))
+        lenses.append(FIXED_LENS)
+        pictures += [(count + k, 1) for k in range(count)]
+        truth["gripper_from_second"] = fits[1].gripper_from_camera
+        truth["base1_from_base2"] = fits[0].base_from_recon @ inverse(fits[1].base_from_recon)
+    if kind == "fixed":
+        azimuth = rng.uniform(-2.5, 2.5)
+        away = np.array([0.75 * np.cos(azimuth), 0.75 * np.sin(azimuth), rng.uniform(0.6, 1.1)])
+        base_from_camera = looking_at(target + away, target, rng)
+        rigs.append(base_from_camera[None])
+        mounts.append(np.eye(4))
+        lenses.append(FIXED_LENS)
+        pictures.append((count, 1))
+        truth["base_from_camera"] = fits[0].base_from_recon @ base_from_camera
+    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
+    starts = [(x, inverse(base)) for x, base in zip(mounted, bases, strict=False)]
+    return _seen(
+        kind,
+        reported,
+        np.concatenate(rigs),
+        mounts,
+        lenses,
+        pictures,
+        x_in_base,
+        None,
+        truth,
+        starts,
+        noise_px,
+        rng,
+    )
+
+
+def _carried(
+    kind: Kind, preset: PresetName, count: int, rng: np.random.Generator, noise_px: float, points: int
+) -> CellProblem:
+    bent = _drawn(preset, rng)
+    posture = bent.arm.rest.copy()
+    posture[0] += rng.uniform(-1, 1)
+    joints = about_posture(bent.arm, posture, count, rng)
+    true = bent.true(joints)
+    gripper_from_object = random_hand_eye(rng)
+    gripper_from_object[:3, 3] = BOX_AHEAD * bent.arm.forward
+    middle = (true @ gripper_from_object)[:, :3, 3].mean(0)
+    away = rng.normal(size=3)
+    away[2] = abs(away[2])
+    base_from_camera = looking_at(middle + 0.75 * away / np.linalg.norm(away), middle, rng)
+    others = about_posture(bent.arm, posture, EFFECTIVE_POSES, rng)
+    start = base_from_camera, gripper_from_object
+    effective = effective_exchanged(bent, others, *start)
+    x_in_object, normal = _box(points, rng)
+    rigs = inverse(true @ gripper_from_object) @ base_from_camera
+    truth = {"base_from_camera": effective[0], "gripper_from_object": effective[1]}
+    reported = [disturbed(bent.reported(joints), PRESETS[preset].white, rng)]
+    pictures = [(k, 0) for k in range(count)]
+    return _seen(
+        kind,
+        reported,
+        rigs,
+        [np.eye(4)],
+        [FIXED_LENS],
+        pictures,
+        x_in_object,
+        normal,
+        truth,
+        [start],
+        noise_px,
+        rng,
+    )
+
+
+def _drawn(preset: PresetName, rng: np.random.Generator) -> BentArm:
+    return bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
+
+
+def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
+    """Postures about one; the wrist moves most."""
+    width = STRIDE * np.array([0.5, 0.5, 0.5, 1.5, 1.5, 2.0])
+    return posture + width * rng.uniform(-1, 1, (count, arm.dof))
+
+
+def looking_at(
+    place: Float[ndarray, "3"], target: Float[ndarray, "3"], rng: np.random.Generator
+) -> Float[ndarray, "4 4"]:
+    """base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
+    z = target - place + 0.03 * rng.normal(size=3)
+    z /= np.linalg.norm(z)
+    x = np.cross(z, rng.normal(size=3))
+    x /= np.linalg.norm(x)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
+def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3"]]:
+    """Points on the faces of the box, and the faces' normals."""
+    axis, side = rng.integers(0, 3, points), rng.choice([-1.0, 1.0], points)
+    x = rng.uniform(-0.5, 0.5, (points, 3))
+    x[np.arange(points), axis] = 0.5 * side
+    return x * BOX, side[:, None] * np.eye(3)[axis]
+
+
+def effective_exchanged(
+    bent: BentArm,
+    joints: Joints,
+    base_from_camera: Float[ndarray, "4 4"],
+    gripper_from_object: Float[ndarray, "4 4"],
+) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]:
+    """The pair that from reported poses best predicts where the camera sees the object; as effective_hand_eye."""
+    reported, true = bent.reported(joints), bent.true(joints)
+    object_from_camera = inverse(true @ gripper_from_object) @ base_from_camera
+    x, z, weight = base_from_camera, gripper_from_object, 1 / np.repeat(EFFECTIVE_NOISE, 3)
+    for _ in range(30):
+        predicted = predict(x, 1.0, z, object_from_camera)
+        off = step_between(reported, inverse(predicted))
+        rotation_t = np.swapaxes(predicted[:, :3, :3], 1, 2)
+        to_inverse = np.zeros((len(true), 6, 6))
+        to_inverse[:, :3, :3] = to_inverse[:, 3:, 3:] = -rotation_t
+        to_inverse[:, :3, 3:] = -rotation_t @ skew(predicted[:, :3, 3])
+        j = to_inverse @ residuals(x, 1.0, z, inverse(reported), object_from_camera)[1]
+        rows = (weight[:, None] * j[:, :, FREE]).reshape(-1, len(FREE))
+        step = -np.linalg.lstsq(rows, (weight * off).ravel(), rcond=1e-9)[0]
+        x, z = retract(x, step[:6]), retract(z, step[6:])
+        if np.abs(step).max() < 1e-12:
+            break
+    return x, z
+
+
+def _seen(
+    kind: Kind,
+    reported: list[Float[ndarray, "n 4 4"]],
+    rigs: Float[ndarray, "m 4 4"],
+    mounts: list[Float[ndarray, "4 4"]],
+    lenses: list[Intrinsics],
+    pictures: list[tuple[int, int]],
+    x_in_true: Float[ndarray, "p 3"],
+    normal: Float[ndarray, "p 3"] | None,
+    truth: dict[str, Float[ndarray, "4 4"]],
+    starts: list[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]],
+    noise_px: float,
+    rng: np.random.Generator,
+) -> CellProblem:
+    """The problem in a frame and unit of its own, every point seen with noise by all cameras that have it in view."""
+    picture, x_px, point = [], [], []
+    for k, (rig, camera) in enumerate(pictures):
+        lens, place = lenses[camera], rigs[rig] @ mounts[camera]
+        x = apply(inverse(place), x_in_true)
+        pixels = project(lens, x)
+        shown = (x[:, 2] > 0) & ((pixels > 0) & (pixels < [lens.width, lens.height])).all(1)
+        if normal is not None:
+            shown &= ((place[:3, 3] - x_in_true) * normal).sum(1) > 0
+        point.append(np.flatnonzero(shown))
+        picture.append(np.full(shown.sum(), k))
+        x_px.append(pixels[shown] + noise_px * rng.normal(size=(int(shown.sum()), 2)))
+    world_from_true = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    scale = float(np.exp(rng.uniform(-2, 2)))
+
+    def in_world(true: Float[ndarray, "*k 4 4"]) -> Float[ndarray, "*k 4 4"]:
+        moved = world_from_true @ true
+        return transform(moved[..., :3, :3], moved[..., :3, 3] / scale)
+
+    rig_of, camera_of = np.array(pictures).T
+    true_from_scaled = inverse(world_from_true)
+    return CellProblem(
+        kind,
+        tuple(reported),
+        Pictures(rig_of, camera_of, np.concatenate(picture), np.concatenate(x_px), np.concatenate(point)),
+        in_world(rigs),
+        np.stack([transform(mount[:3, :3], mount[:3, 3] / scale) for mount in mounts]),
+        apply_similarity(world_from_true, 1.0, x_in_true) / scale,
+        tuple(lenses),
+        scale,
+        truth,
+        tuple((x, z @ true_from_scaled) for x, z in starts),
+    )

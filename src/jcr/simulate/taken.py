@@ -1,0 +1,71 @@
+"""What a camera and a robot make of the truth: lenses, the errors of cheaper cameras, poses as they are reported."""
+
+from dataclasses import replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.capture.images import encode_png
+from jcr.geometry import retract
+from jcr.records import Intrinsics
+from jcr.simulate.options import SimulateOptions
+
+_WIDTH, _HEIGHT = 640, 480
+
+
+def pinhole(rng: np.random.Generator) -> Intrinsics:
+    """A lens of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
+
+    MuJoCo's image spans [-½, W-½] when pixel (0, 0) is the centre of a pixel, so its middle is (W-1)/2.
+    """
+    focal_px = float(0.5 * _HEIGHT / np.tan(0.5 * np.radians(rng.uniform(40, 48))))
+    return Intrinsics(focal_px, focal_px, (_WIDTH - 1) / 2, (_HEIGHT - 1) / 2, _WIDTH, _HEIGHT)
+
+
+def with_lens_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
+    """Intrinsics that are off by Gaussian errors: fx and fy by one of `percent`, cx and cy each of that of the width."""
+    focal, x, y = 0.01 * percent * rng.normal(size=3)
+    return replace(
+        camera,
+        fx=camera.fx * (1 + focal),
+        fy=camera.fy * (1 + focal),
+        cx=camera.cx + x * camera.width,
+        cy=camera.cy + y * camera.width,
+    )
+
+
+def with_robot_noise(
+    base_from_gripper: Float[ndarray, "n 4 4"],
+    translation_mm: float,
+    rotation_deg: float,
+    rng: np.random.Generator,
+) -> Float[ndarray, "n 4 4"]:
+    """What a robot of that accuracy reports: each pose after a step of independent Gaussians in every axis."""
+    sizes = np.repeat([1e-3 * translation_mm, np.radians(rotation_deg)], 3)
+    return retract(base_from_gripper, sizes * rng.normal(size=(len(base_from_gripper), 6)))
+
+
+def degraded(
+    image: UInt8[ndarray, "h w 3"], options: SimulateOptions, rng: np.random.Generator
+) -> UInt8[ndarray, "h w 3"]:
+    """The image of a cheaper camera: blurred, darker towards the corners, noisy."""
+    light = image.astype(np.float32)
+    if options.blur:
+        light = cv2.GaussianBlur(light, (0, 0), options.blur)
+    if options.vignetting:
+        height, width = image.shape[:2]
+        x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)[:, None]
+        light *= (1 - options.vignetting * 0.5 * (x * x + y * y))[..., None]
+    if options.noise:
+        light += rng.normal(0, options.noise, image.shape)
+    return np.clip(light + 0.5, 0, 255).astype(np.uint8)
+
+
+def encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:
+    """RGB as JPEG of that quality, or as PNG."""
+    if jpeg_quality == "lossless":
+        return encode_png(image)
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()

@@ -1,0 +1,276 @@
+"""Further cameras of a cell: the truth of simulated cells within sigma, pictures placed or refused with the reason."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import jcr
+from jcr.calibration.intrinsics_prior import HELD, prior_of
+from jcr.calibration.stage import calibrate
+from jcr.camera import parameters, with_parameters
+from jcr.capture.capture_json import read, write
+from jcr.cell.added import camera_of
+from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
+from jcr.cell.stage import place_cameras
+from jcr.cell.ties import Answer, Tie, tied
+from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
+from jcr.handeye.systematic import smooth_errors
+from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
+from jcr.simulate.cell import CellProblem, Kind, cell_problem
+
+COUNT = 8
+OLD = 9
+"""Images of the bundled capture that calibrate; another is the fixed camera's."""
+SCALE = 0.37
+
+
+def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Answer:
+    """As the stage does it, from starts that are near; lenses off by what is usual."""
+    rng = np.random.default_rng(5)
+    cameras, priors = [], []
+    for camera in problem.cameras:
+        free = prior_of(camera)
+        off = free.std * rng.normal(size=len(free.std)) if lens_off else 0 * free.std
+        cameras.append(with_parameters(camera, parameters(camera) + free.directions @ off))
+        priors.append(prior_of(cameras[-1]) if lens_off else prior_of(cameras[-1], HELD))
+    move = np.eye(4) if world is None else world
+    scene = Scene(
+        move @ problem.world_from_rig,
+        problem.rig_from_camera,
+        tuple(cameras),
+        apply(move, problem.points_in_world),
+    )
+    on_wrist = problem.kind == "wrists"
+    mounts = np.array([False, *[on_wrist] * (len(cameras) - 1)])
+    imaged = adjust_images(scene, problem.pictures, Freedom(tuple(priors), mounts))
+    unmove = scale_translation(inverse(move), problem.scale)
+    ties = [
+        Tie(
+            np.arange(COUNT) + COUNT * k,
+            poses,
+            smooth_errors(poses),
+            (x, z @ unmove),
+            problem.kind == "carried",
+        )
+        for k, (poses, (x, z)) in enumerate(zip(problem.reported, problem.starts, strict=True))
+    ]
+    return tied(imaged, ties, problem.scale)
+
+
+WANTED = {
+    "fixed": (
+        "base_from_camera",
+        lambda p: p.z[0] @ scale_translation(p.scene.world_from_rig[COUNT], p.scale),
+    ),
+    "wrists": (
+        "gripper_from_second",
+        lambda p: p.x[0] @ scale_translation(p.scene.rig_from_camera[1], p.scale),
+    ),
+    "arms": ("base1_from_base2", lambda p: p.z[0] @ inverse(p.z[1])),
+    "carried": ("base_from_camera", lambda p: p.x[0]),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "preset"), [("fixed", "white"), ("wrists", "typical"), ("arms", "white"), ("carried", "typical")]
+)
+def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
+    problem = cell_problem(kind, preset, COUNT, seed=3, points=200)
+    answer = adjusted(problem)
+    name, of = WANTED[kind]
+    found, covariance = answer.transform(of)
+    error = step_between(found, problem.truth[name])
+    assert error @ np.linalg.solve(covariance, error) < 16.8  # 99 % of chi2 of 6
+    assert np.linalg.norm(error[:3]) < 0.012
+    assert np.sqrt(np.diag(covariance)[:3]).max() < 0.012
+
+
+def test_exact_robots_and_pictures_give_the_exact_answer():
+    for kind, (name, of) in WANTED.items():
+        problem = cell_problem(kind, "white", COUNT, seed=4, noise_px=1e-4, points=120)
+        exact = replace(problem, reported=truly(problem))
+        answer = adjusted(exact, lens_off=False)
+        found = of(answer.placed)
+        assert np.abs(step_between(found, problem.truth[name])).max() < 2e-5, kind
+
+
+def truly(problem: CellProblem) -> tuple[np.ndarray, ...]:
+    """What an arm would report that is exact."""
+    poses = []
+    for k, (x, z) in enumerate(problem.starts):
+        rigs = scale_translation(problem.world_from_rig[COUNT * k : COUNT * k + COUNT], problem.scale)
+        there = z @ rigs @ inverse(x)
+        poses.append(inverse(there) if problem.kind == "carried" else there)
+    return tuple(poses)
+
+
+def test_the_frame_of_the_pictures_does_not_matter():
+    problem = cell_problem("fixed", "typical", COUNT, seed=6, points=150)
+    elsewhere = transform(rotation_exp(np.array([0.4, -1.0, 0.3])), np.array([3.0, -2.0, 1.0]))
+    of = WANTED["fixed"][1]
+    one, covariance = adjusted(problem).transform(of)
+    other, of_other = adjusted(problem, elsewhere).transform(of)
+    std = np.sqrt(np.diag(covariance))
+    assert np.abs(step_between(one, other) / std).max() < 0.02
+    assert np.allclose(np.sqrt(np.diag(of_other)), std, rtol=0.02)
+
+
+def test_pictures_alone_leave_one_similarity_open():
+    problem = cell_problem("wrists", "white", COUNT, seed=2, points=100)
+    priors = tuple(prior_of(camera, HELD) for camera in problem.cameras)
+    scene = Scene(problem.world_from_rig, problem.rig_from_camera, problem.cameras, problem.points_in_world)
+    freedom = Freedom(priors, np.array([False, True]))
+    found = adjust_images(scene, problem.pictures, freedom)
+    values = np.linalg.eigvalsh(found.covariance)
+    assert (values > 1e-6 * values[-1]).sum() <= len(values) - 7
+    unseen = similarities(found.scene, freedom)
+    assert np.linalg.matrix_rank(unseen) == 7
+
+
+@pytest.fixture(scope="module")
+def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
+    """The first images of the bundled capture, as a structure from motion without error would give them."""
+    capture = jcr.read_capture(tabletop)
+    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
+    poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
+    lens = capture.intrinsics
+    assert lens is not None
+    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    none = np.zeros((OLD, 4, 6))
+    reconstruction = Reconstruction(
+        np.arange(OLD),
+        poses,
+        lens,
+        lens,
+        np.zeros((OLD, 4, 6, 3)),
+        none,
+        np.zeros((OLD, 4, 6, 3), np.uint8),
+        nothing,
+        "test",
+    )
+    old = replace(
+        capture,
+        images=capture.images[:OLD],
+        base_from_gripper=capture.base_from_gripper[:OLD],
+        joints=None if capture.joints is None else capture.joints[:OLD],
+    )
+    return old, reconstruction, calibrate(old, reconstruction)
+
+
+def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
+    return CellCamera("overhead", "base", images, capture.image_size, capture.intrinsics if known else None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_a_picture_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool):
+    old, reconstruction, hand_eye = calibrated
+    capture = jcr.read_capture(tabletop)
+    found = place_cameras(old, [fixed(capture, capture.images[10], known=known)], reconstruction, hand_eye)
+    (camera,) = found.cameras
+    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
+    error = step_between(camera.parent_from_camera, capture.base_from_gripper[10] @ x)
+    assert np.linalg.norm(error[:3]) < (0.004 if known else 0.01)
+    assert error @ np.linalg.solve(camera.covariance, error) < 16.8
+    assert camera.std_at_scene is not None and camera.std_at_scene < 0.02
+
+
+@pytest.mark.slow
+def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(calibrated, tmp_path: Path):
+    old, reconstruction, hand_eye = calibrated
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "other.png"), cv2.resize(noise, old.image_size, interpolation=cv2.INTER_CUBIC))
+    another = replace(fixed(old, "other.png"), name="other", folder=tmp_path)
+    moving = fixed(old, old.images[2], old.images[5])
+    found = place_cameras(old, [another, moving], reconstruction, hand_eye)
+    assert [camera.converged for camera in found.cameras] == [False, False]
+    assert "must see the same scene" in found.cameras[0].warnings[0]
+    assert "it is not fixed" in found.cameras[1].warnings[0]
+    untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
+    assert "not to be trusted" in untrusted.cameras[0].warnings[0]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Pictures of two sizes, all different."""
+    for k in range(8):
+        picture = np.full((48, 64, 3) if k < 7 else (24, 32, 3), 20 * k, np.uint8)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
+    return tmp_path
+
+
+def content(**cameras: object) -> dict[str, object]:
+    frames = [
+        {
+            "image": f"{k}.png",
+            "base_from_gripper": transform(np.eye(3), np.array([0.1 * k, 0.0, 0.5])).tolist(),
+        }
+        for k in range(3)
+    ]
+    return {"frames": frames, "intrinsics": None, "cameras": cameras}
+
+
+LENS = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0, 0, 0, 0, 0]}
+
+
+def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
+    frames = [{"image": "6.png", "base_from_gripper": np.eye(4).tolist()}]
+    said = content(
+        eye={"mount": "gripper"},
+        overhead={"mount": "base", "images": ["3.png"], "intrinsics": LENS, "intrinsics_std": {"fx": 0.5}},
+        second={"mount": "gripper", "images": ["4.png", None, "5.png"]},
+        right={"mount": "gripper", "arm": "right", "frames": frames},
+    )
+    (folder / "capture.json").write_text(json.dumps(said))
+    capture = read(folder)
+    assert capture.camera_name == "eye" and [camera.name for camera in capture.others] == [
+        "overhead",
+        "second",
+        "right",
+    ]
+    overhead, second, right = capture.others
+    assert overhead.intrinsics is not None and overhead.frame is None and not overhead.watches_gripper
+    assert second.frame is not None and second.frame.tolist() == [0, 2]
+    assert right.arm == "right" and right.base_from_gripper is not None and len(right.base_from_gripper) == 1
+    write(folder, capture)
+    again = read(folder)
+    assert json.loads((folder / "capture.json").read_text())["cameras"].keys() == said["cameras"].keys()  # type: ignore[attr-defined]
+    assert [
+        replace(camera, intrinsics_std=None, frame=None, base_from_gripper=None) for camera in again.others
+    ] == [
+        replace(camera, intrinsics_std=None, frame=None, base_from_gripper=None) for camera in capture.others
+    ]
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
+        ({"mount": "base", "images": []}, "no images"),
+        ({"mount": "base", "images": ["3.png", "7.png"]}, "all pictures of a camera must have one size"),
+        ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
+        ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
+        ({"mount": "base", "images": ["7.png"], "intrinsics": LENS}, "another resolution"),
+        ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
+        ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
+        ({"mount": "base", "imagse": ["3.png"], "images": ["3.png"]}, "imagse is not known"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused_in_one_line(folder: Path, camera: dict[str, object], says: str):
+    (folder / "capture.json").write_text(json.dumps(content(overhead=camera)))
+    with pytest.raises(jcr.InputError, match=says) as refusal:
+        read(folder)
+    assert "\n" not in str(refusal.value)
+
+
+def test_pictures_of_two_sizes_are_not_one_camera(folder: Path):
+    with pytest.raises(jcr.InputError, match="one size"):
+        camera_of("a", [folder / "0.png", folder / "7.png"], None, ())
+    with pytest.raises(jcr.InputError, match="choose another"):
+        camera_of("a", [folder / "0.png"], None, ("a",))
