@@ -123,6 +123,7 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
         ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
         ("camera_info.yaml", ("distortion_model",), {"a": [{}]}),
         ("added.json", ("capture",), "a\0b"),
+        ("pose.json", ("base_from_gripper",), "\x1b[2J"),
     ],
 )
 def test_what_further_values_found_stays_closed(
