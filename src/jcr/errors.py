@@ -1,8 +1,16 @@
 """The two things that can be wrong and are no bug: the user's input, and an answer not to be trusted."""
 
 
+def printable(text: str) -> str:
+    """The text without what a terminal would obey: names in files may hold any character."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
 class InputError(ValueError):
     """The user's input cannot be used; the message says what, where and how to mend it (exit status 2)."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class NotTrustedError(RuntimeError):

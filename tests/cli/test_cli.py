@@ -62,12 +62,12 @@ def test_an_added_image_extends_the_map_and_stays(done: Path, tabletop: Path, tm
     pose.write_text(json.dumps(frame["base_from_gripper"]))
     before = json.loads((out / "calibration.json").read_text())["gripper_from_camera"]
     image = tabletop / frame["image"]
-    added = run_jcr("map", out, "--add", image, pose, "--quiet")
+    added = run_jcr("map", out, "--add", image, pose, "--max-seconds", 1, "--quiet")
     assert added.returncode == 0, added.stderr
     assert json.loads((out / "calibration.json").read_text())["gripper_from_camera"] == before
     assert [f["base_from_gripper"] for f in json.loads((out / "added" / "added.json").read_text())["frames"]]
     assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
-    again = run_jcr("map", out, "--quiet")
+    again = run_jcr("map", out, "--max-seconds", 1, "--quiet")
     assert again.returncode == 0, again.stderr
     assert len(read_cloud(out / "cloud.ply").camera_centers_in_base) == 13
     twice = run_jcr("map", out, "--add", image, pose)

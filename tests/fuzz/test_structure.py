@@ -116,6 +116,26 @@ def test_many_entries_of_any_kind_are_refused_at_once(tmp_path: Path, what: str)
 
 
 @pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("capture.json, gone on with", ("frames", 3, "joints", 0), [[]]),
+        ("capture.json, gone on with", ("frames", 3, "joints"), {"a": [{}]}),
+        ("camera_info.yaml", ("distortion_model",), "plumb\0bob"),
+        ("camera_info.yaml", ("distortion_model",), {"a": [{}]}),
+        ("added.json", ("capture",), "a\0b"),
+        ("pose.json", ("base_from_gripper",), "\x1b[2J"),
+    ],
+)
+def test_what_further_values_found_stays_closed(
+    readers: dict[str, Document], name: str, place: tuple[str | int, ...], value: object
+):
+    try:
+        assert tried(readers[name], place, value)[0] == "status 2"
+    finally:
+        readers[name].write(readers[name].content)
+
+
+@pytest.mark.parametrize(
     "path",
     [
         "{episode_index:01000000000d}",

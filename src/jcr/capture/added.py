@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.checks import check_metres, read_rigid
 from jcr.capture.images import read_image
-from jcr.capture.plain_files import contained, read_json, read_npy
+from jcr.capture.plain_files import contained, read_json, read_npy, shown
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture
@@ -39,7 +39,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
         ) from None
     if whose != str(capture.folder.resolve()):
         raise InputError(
-            f"{folder}: holds images added to the run of {whose}; choose another folder for this run, or remove "
+            f"{folder}: holds images added to the run of {shown(whose)}; choose another folder for this run, or remove "
             f"{folder}"
         )
     for name in names:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture.checks import checked_lens
-from jcr.capture.plain_files import read_yaml
+from jcr.capture.plain_files import read_yaml, shown
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Intrinsics, LensModel
 
@@ -49,6 +49,8 @@ def lens_of_ros(
 
     Raises InputError for a distortion that jcr does not know, or intrinsics of another resolution.
     """
+    if not isinstance(model, str):
+        raise InputError(f"{where}: the distortion model must be a name, as plumb_bob")
     if len(matrix) != 9:
         raise InputError(f"{where}: the camera matrix has {len(matrix)} numbers, not nine")
     if not any(matrix):
@@ -64,7 +66,7 @@ def lens_of_ros(
         known = "pinhole"
     if known is None or any(coefficients[len(COEFFICIENTS[known]) :]):
         raise InputError(
-            f"{where}: distortion model {model} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
+            f"{where}: distortion model {shown(model)} with {len(coefficients)} coefficients; jcr knows plumb_bob (5), "
             "rational_polynomial (8) and equidistant (4): use rectified images, or calibrate with one of these"
         )
     if known == "rational" and not any(coefficients[5:]):

@@ -116,20 +116,24 @@ def _joints(frames: list[Any], images: list[str], file: Path) -> Float[ndarray, 
     rows = []
     for i, (name, frame) in enumerate(zip(images, frames, strict=True)):
         where = f"{file}: joints of frame {i} ({name})"
-        try:
-            row = np.array(frame["joints"], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
-        if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
-            raise InputError(f"{where}: must be a list of finite angles in radians")
-        if np.abs(row).max() > MOST_TURNS:
-            raise InputError(
-                f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them"
-            )
+        row = read_joints(frame["joints"], where)
         if rows and len(row) != len(rows[0]):
             raise InputError(f"{where}: {len(row)} angles, but frame 0 has {len(rows[0])}; give all of each")
         rows.append(row)
     return np.stack(rows)
+
+
+def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
+    """Joint angles (rad) of one frame from a list; InputError where it holds anything else."""
+    try:
+        row = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
+    if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
+        raise InputError(f"{where}: must be a list of finite angles in radians")
+    if np.abs(row).max() > MOST_TURNS:
+        raise InputError(f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them")
+    return row
 
 
 def _robot(

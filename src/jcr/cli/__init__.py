@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
 
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, NotTrustedError, printable
 
 COMMANDS = {
     "board": "a calibration board to print, for those who want one",
@@ -234,7 +234,7 @@ def _choices(listed: re.Match[str]) -> str:
 
 
 def _fail(status: int, message: str) -> int:
-    line = " ".join(message.split())
+    line = printable(" ".join(message.split()))
     # What files hold is quoted in messages, and a name may have a million letters.
     sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")
     return status

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
-from jcr.capture.capture_json import FILE
+from jcr.capture.capture_json import FILE, read_joints
 from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.lens_json import read_lens
@@ -54,7 +54,7 @@ class LiveFolder:
             self.names.append(frame["image"])
             self.poses.append(read_rigid(frame.get("base_from_gripper"), where))
             angles, depth = frame.get("joints"), frame.get("depth")
-            self.joints.append(np.array(angles, dtype=np.float64) if isinstance(angles, list) else None)
+            self.joints.append(None if angles is None else read_joints(angles, f"{where}: joints"))
             self.depths.append(depth if isinstance(depth, str) else None)
         self.lens = self.lens or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
