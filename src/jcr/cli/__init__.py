@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
-from typing import TextIO
 
 from jcr.errors import InputError, NotTrustedError
 
@@ -167,7 +166,7 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
     # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
-    complaint, told = io.StringIO(), _Help(sys.stdout)
+    complaint, told = io.StringIO(), _Help(sys.stdout.encoding or "utf-8", sys.stdout.isatty())
     try:
         with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(told):
             parsed = tyro.cli(
@@ -197,9 +196,9 @@ class _Help(io.StringIO):
 
     encoding = "utf-8"
 
-    def __init__(self, stream: TextIO):
+    def __init__(self, encoding: str, in_colour: bool):
         super().__init__()
-        self.encoding, self._in_colour = stream.encoding, stream.isatty()
+        self.encoding, self._in_colour = encoding, in_colour
 
     def isatty(self) -> bool:
         """Of the stream."""
