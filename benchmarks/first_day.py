@@ -181,7 +181,7 @@ def _realsense(capture: Capture, folder: Path) -> tuple[str, Commands]:
     )
     return about, [
         ("check scan", ""),
-        ("run scan out --require 2 0.5", ""),
+        ("calibrate scan out --require 2 0.5", ""),
         ("compare out scan", ""),
         ("export out urdf", ""),
     ]

@@ -174,7 +174,7 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
     # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
-    complaint, told = io.StringIO(), _Help(sys.stdout.encoding, sys.stdout.isatty())
+    complaint, told = io.StringIO(), _Help(sys.stdout.encoding or "utf-8", sys.stdout.isatty())
     try:
         with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(told):
             parsed = tyro.cli(

@@ -83,6 +83,8 @@ def main(arguments: Arguments) -> int:
 
 
 def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
+    from jcr.check import QUICK
+
     turn = np.degrees(found.largest_turn_rad)
     lines = [
         _as_read(capture),
@@ -94,8 +96,8 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
         looked = len(found.hand_eye.inliers)
         agreement = f"{1e3 * noise.translation:.2f} mm and {np.degrees(noise.rotation):.3f}°"
         lines.append(
-            f"poses and images agree to {agreement} per axis ({int(found.hand_eye.inliers.sum())} of "
-            f"{len(capture)} images{'' if looked == len(capture) else f', {looked} looked at'})"
+            f"poses and images agree to {agreement} per axis ({int(found.hand_eye.inliers.sum())} of {looked} images"
+            f"{f'; --thorough looks at all {len(capture)}' if looked == QUICK < len(capture) else ''})"
         )
     lines += [f"fault: {fault}" for fault in found.faults]
     lines += [f"remark: {remark}" for remark in found.remarks]

@@ -86,9 +86,10 @@ def _next_poses(result: RunResult | PosesResult) -> str:
         _next_pose(number, pose, like.like)
         for number, (pose, like) in enumerate(zip(poses, told, strict=True), 1)
     )
+    green = " The 3D view shows them in green." if isinstance(result, RunResult) else ""
     return (
         '<h3>Poses to add</h3><p class="soft">Gripper poses that would shrink these most, one after the other, in '
-        "reach of those of the capture; look that the arm is free to go there. The 3D view shows them in green.</p>"
+        f"reach of those of the capture; look that the arm is free to go there.{green}</p>"
         '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>by</th><th>then offset, '
         f"orientation, scale</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )
