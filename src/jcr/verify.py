@@ -1,5 +1,6 @@
 """Is yesterday's calibration still true of today's images? What `jcr verify` answers."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
+from jcr.cell.added import camera_of, read_added_cameras
+from jcr.cell.stage import place_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
@@ -56,6 +59,8 @@ class Verification:
     """Those that were used."""
     notes: tuple[str, ...]
     how: str
+    fixed: str | None = None
+    """Name of the camera, where it is a fixed one; the drift is then along axes of the base."""
 
     @property
     def drift_m(self) -> float:
@@ -70,12 +75,18 @@ class Verification:
     @property
     def verdict(self) -> str:
         """What has moved, in words."""
+        if self.fixed is not None:
+            return f"{self.fixed} has moved" if self.moved else "still true"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
         return f"{moved[self.cause]} has moved" if self.moved else "still true"
 
     @property
     def advice(self) -> str:
         """What to do, where something has moved."""
+        if self.fixed is not None:
+            return (
+                f"{self.fixed} has moved; fasten it, and place it anew (jcr add-camera, under another name)"
+            )
         anew = "tighten the mount, then calibrate anew from 8 or more images (jcr run)"
         if self.cause == "scene":
             return (
@@ -149,6 +160,66 @@ def verify(
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
     return _by_recalibration(calibration, new, options_then.reconstruct, options, progress)
+
+
+def verify_camera(
+    out: Path,
+    name: str,
+    pictures: Sequence[Path],
+    options: VerifyOptions = VerifyOptions(),
+    progress: Progress | None = None,
+) -> Verification:
+    """Hold the place of a fixed camera of the run folder `out` against new pictures of the same scene by it.
+
+    Both places are found together, so that what the wrist camera's calibration leaves open moves them alike. Raises
+    InputError where the run has placed no fixed camera of that name, or the pictures cannot be its; NotTrustedError
+    where they show too little of the scene.
+    """
+    folder = RunFolder(out)
+    _, reconstruction = folder.calibrated()
+    capture, made_with, cameras = folder.capture(), folder.options(), folder.cameras()
+    others = (*capture.others, *read_added_cameras(folder.path, capture))
+    then = next((camera for camera in others if camera.name == name), None)
+    fixed = (
+        []
+        if cameras is None
+        else [one.name for one in cameras.cameras if one.converged and one.mount == "base"]
+    )
+    if then is None or name not in fixed or then.watches_gripper:
+        raise InputError(
+            f"--camera {name}: {out} has placed no fixed camera of that name; there are {fixed or 'none'}"
+        )
+    now = camera_of(f"{name}_now", pictures, None, ())
+    if now.image_size != then.image_size:
+        raise InputError(
+            f"{pictures[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
+            f"{then.image_size[0]}x{then.image_size[1]}; take it with the same camera and resolution"
+        )
+    now = replace(now, intrinsics=then.intrinsics, intrinsics_std=then.intrinsics_std)
+    hand_eye = calibrate(capture, reconstruction, made_with.calibrate)
+    found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
+    for camera in found.cameras:
+        if camera.parent_from_camera is None:
+            raise NotTrustedError(f"cannot tell: {camera.warnings[0]}")
+    assert found.answer is not None
+    before, after = found.of[name], found.of[now.name]
+    j = found.answer.derivative(after) - found.answer.derivative(before)
+    covariance = j @ found.answer.covariance @ j.T
+    offset = step_between(before(found.answer.placed), after(found.answer.placed))
+    p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
+    return Verification(
+        _is_moved(offset, p_value, options),
+        "camera",
+        offset,
+        np.sqrt(np.diag(covariance)),
+        p_value,
+        None,
+        detectable(covariance, options.alpha),
+        tuple(str(picture) for picture in pictures),
+        tuple(text for camera in found.cameras for text in camera.warnings),
+        "in the mapped scene",
+        fixed=name,
+    )
 
 
 def fitted(

@@ -1,6 +1,7 @@
 """What was found of a cell's further cameras."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from jcr.geometry import skew
 from jcr.records import Intrinsics, Mount
 
 if TYPE_CHECKING:
-    from jcr.cell.ties import Answer
+    from jcr.cell.ties import Answer, Placed
 
 
 @dataclass(frozen=True)
@@ -75,3 +76,5 @@ class CellFound:
     arms: tuple[ArmFound, ...]
     answer: "Answer | None"
     """None where no camera could be placed."""
+    of: "dict[str, Callable[[Placed], Float[ndarray, '4 4']]]" = field(default_factory=dict)
+    """By camera that was placed: its parent_from_camera, wherever `answer` puts everything."""

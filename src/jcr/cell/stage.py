@@ -5,7 +5,7 @@ Every picture of another camera is localised in the reconstruction (localise.py)
 it was found: what is said here of others rests on the same images.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,8 +105,9 @@ def place_cameras(
     if options.robot_noise is not None:
         noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
     answer = tied(imaged, rigs.ties(options), 1.0, noise)
+    of = {member.camera.name: _place_of(member, c) for c, member in enumerate(placed, start=1)}
     cameras = {
-        member.camera.name: _found(member, c, answer, medians, hand_eye)
+        member.camera.name: _found(member, c, answer, of[member.camera.name], medians, hand_eye)
         for c, member in enumerate(placed, start=1)
     }
     cameras |= {camera.name: camera for camera in failed}
@@ -114,7 +115,7 @@ def place_cameras(
     for k, arm in enumerate(rigs.arms, start=1):
         transform, covariance = answer.transform(lambda p, k=k: p.z[0] @ inverse(p.z[k]))
         arms.append(ArmFound(arm, transform, covariance))
-    return CellFound(tuple(cameras[camera.name] for camera in others), tuple(arms), answer)
+    return CellFound(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
 
 
 @dataclass(frozen=True)
@@ -396,17 +397,27 @@ def _as_given(reconstruction: Reconstruction, hand_eye: HandEye) -> Float[ndarra
     return np.linalg.inv(spread_of + EXACT**2 * np.eye(len(spread_of)))
 
 
-def _found(
-    member: _Member, c: int, answer: Answer, medians: dict[tuple[str, int], float], hand_eye: HandEye
-) -> CameraFound:
-    camera, arm = member.camera, member.arm
-    rig = int(member.rig[member.rig >= 0][0])
+def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"]]:
+    """Where the camera, the c-th of the pictures', is on its parent."""
+    rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
 
     def parent_from_camera(placed: Placed) -> Float[ndarray, "4 4"]:
         if arm is None:
             return placed.z[0] @ scale_translation(placed.scene.world_from_rig[rig], placed.scale)
         return placed.x[arm] @ scale_translation(placed.scene.rig_from_camera[c], placed.scale)
 
+    return parent_from_camera
+
+
+def _found(
+    member: _Member,
+    c: int,
+    answer: Answer,
+    parent_from_camera: Callable[[Placed], Float[ndarray, "4 4"]],
+    medians: dict[tuple[str, int], float],
+    hand_eye: HandEye,
+) -> CameraFound:
+    camera = member.camera
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
     freedom = answer.imaged.freedom

@@ -20,6 +20,7 @@ from jcr.geometry import transform
 
 if TYPE_CHECKING:
     from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.cell.cameras_json import CameraPlaced
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
     from jcr.represent.scene import SceneMap
@@ -60,6 +61,9 @@ class Arguments:
     """The camera's optical frame: x right, y down, z forward."""
     base_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "base_link"
     """The robot's base, the frame of everything mapped."""
+    camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Another camera of the cell (cameras.json), for what is about one camera; unset: the run's own, and in ros2 and
+    urdf all. A fixed one's parent is the base frame."""
     to_root: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Give the transform of this link instead, from which the camera's other frames hang (e.g. camera_link)."""
     root_from_optical: Annotated[
@@ -150,7 +154,7 @@ class Run:
         from jcr.run_folder import RunFolder
 
         self.arguments, self.folder = arguments, RunFolder(arguments.out)
-        if self.calibration.gripper_from_camera is None:
+        if self.calibration.parent_from_camera is None:
             raise InputError(
                 f"{arguments.out}: found no calibration to export ({self.doubt}); run it on a mended capture"
             )
@@ -174,16 +178,21 @@ class Run:
     @property
     def mount(self) -> ros.CameraMount:
         """The camera on the gripper, as the user wants its frames."""
-        arguments, uncertainty = self.arguments, self.calibration.uncertainty
-        assert uncertainty is not None  # wherever there is a transform
-        mount = ros.camera_mount(
-            np.array(self.calibration.gripper_from_camera),
-            np.array(uncertainty.covariance),
-            arguments.parent_frame,
-            arguments.child_frame,
-            arguments.base_frame,
-            self.doubt,
-        )
+        arguments = self.arguments
+        if arguments.camera is not None:
+            mount = self._mount_of(self._camera(arguments.camera), arguments.child_frame)
+        else:
+            uncertainty = self.calibration.uncertainty
+            assert uncertainty is not None  # wherever there is a transform
+            fixed = self.calibration.mount == "base"
+            mount = ros.camera_mount(
+                np.array(self.calibration.parent_from_camera),
+                np.array(uncertainty.covariance),
+                arguments.base_frame if fixed else arguments.parent_frame,
+                arguments.child_frame,
+                arguments.base_frame,
+                self.doubt,
+            )
         if arguments.to_root is None:
             return mount
         if arguments.root_from_optical is None:
@@ -198,9 +207,58 @@ class Run:
         return ros.on_root(mount, arguments.to_root, transform(rotation, np.array([x, y, z])))
 
     @property
+    def others(self) -> list[ros.CameraMount]:
+        """Further cameras and arms; none where one camera is asked for."""
+        cameras = self.folder.cameras()
+        if cameras is None or self.arguments.camera is not None:
+            return []
+        mounts = [
+            self._mount_of(camera, f"{camera.name}_optical_frame")
+            for camera in cameras.cameras
+            if camera.parent_from_camera is not None
+        ]
+        base = self.arguments.base_frame
+        return mounts + [
+            ros.CameraMount(
+                base,
+                f"{arm.name}_{base}",
+                np.array(arm.base_from_other_base),
+                np.array(arm.uncertainty.covariance),
+                base,
+            )
+            for arm in cameras.arms
+        ]
+
+    def _camera(self, name: str) -> "CameraPlaced":
+        cameras = self.folder.cameras()
+        for camera in () if cameras is None else cameras.cameras:
+            if camera.name == name and camera.parent_from_camera is not None:
+                return camera
+        raise InputError(
+            f"--camera {name}: {self.arguments.out} has placed no camera of that name; see its cameras.json"
+        )
+
+    def _mount_of(self, camera: "CameraPlaced", child: str) -> ros.CameraMount:
+        arguments = self.arguments
+        assert camera.uncertainty is not None  # wherever there is a transform
+        parent = arguments.base_frame if camera.mount == "base" else arguments.parent_frame
+        if camera.arm is not None:
+            parent = f"{camera.arm}_{parent}"
+        return ros.camera_mount(
+            np.array(camera.parent_from_camera),
+            np.array(camera.uncertainty.covariance),
+            parent,
+            child,
+            arguments.base_frame,
+            camera.doubt,
+        )
+
+    @property
     def lens(self) -> "Intrinsics":
         """As calibrated."""
         lens = self.calibration.intrinsics
+        if self.arguments.camera is not None:
+            lens = self._camera(self.arguments.camera).intrinsics
         if lens is None:
             raise InputError(
                 f"{self.arguments.out}: knows no intrinsics, for camera poses were given and no images; export "
@@ -235,8 +293,25 @@ class Run:
 
         scale = self.calibration.scale
         assert scale is not None  # wherever there is a transform
+        if self.calibration.mount == "base":
+            raise InputError(
+                f"{self.arguments.out}: a fixed camera watched the gripper: its images show no scene in the base frame"
+            )
         base_from_recon = np.array(self.calibration.base_from_recon)
         return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
+
+    @property
+    def other_views(self) -> "list[PosedImages]":
+        """The pictures of further cameras that see the scene, in the base frame."""
+        from jcr.cell.added import read_added_cameras
+        from jcr.export.cell_views import posed_cameras
+
+        cameras = self.folder.cameras()
+        if cameras is None:
+            return []
+        others = (*self.capture.others, *read_added_cameras(self.folder.path, self.capture))
+        own = np.array(self.calibration.gripper_from_camera)
+        return posed_cameras(self.capture, others, cameras, self.views, self.reconstruction.image_index, own)
 
 
 def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
@@ -245,7 +320,11 @@ def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], N
 
 
 def _ros2(run: Run, path: Path) -> None:
-    write_text(path, ros.ros2_launch(run.mount))
+    write_text(path, ros.ros2_launch(run.mount, *run.others))
+
+
+def _urdf(run: Run, path: Path) -> None:
+    write_text(path, ros.urdf(run.mount, *run.others))
 
 
 def _easy_handeye2(run: Run, path: Path) -> None:
@@ -305,13 +384,14 @@ def _nerfstudio(run: Run, path: Path) -> None:
     from jcr.export.views import write_nerfstudio
 
     options = run.arguments.undistort, run.arguments.link_images
-    write_nerfstudio(path, run.views, run.cloud, run.provenance, *options)
+    write_nerfstudio(path, run.views, run.cloud, run.provenance, *options, others=run.other_views)
 
 
 def _colmap(run: Run, path: Path) -> None:
     from jcr.export.views import write_colmap
 
-    write_colmap(path, run.views, run.provenance, run.arguments.undistort, run.arguments.link_images)
+    options = run.arguments.undistort, run.arguments.link_images
+    write_colmap(path, run.views, run.provenance, *options, others=run.other_views)
 
 
 def _rerun(run: Run, path: Path) -> None:
@@ -330,7 +410,7 @@ FORMATS = (
         "launch file as MoveIt Calibration saves it",
         _of_mount(ros.moveit_launch),
     ),
-    Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _of_mount(ros.urdf)),
+    Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _urdf),
     Format("xacro", "hand_eye.xacro", "macro that adds the camera link and joint", _of_mount(ros.xacro)),
     Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
     Format(

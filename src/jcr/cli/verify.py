@@ -28,12 +28,16 @@ class Arguments:
     examples:
       jcr verify out/table captures/this-morning
       jcr verify out/table captures/this-morning --tolerance 1 0.1 --json
+      jcr verify out/table overhead_today.png --camera overhead
     """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the run that calibrated the camera."""
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (docs/captures.md)."""
+    camera: str | None = None
+    """A fixed camera of the run, to be held against a picture of the same scene by it, in place of CAPTURE: has it
+    moved?"""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     output: Output = field(default_factory=Output)
@@ -41,11 +45,19 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Verify and say what to do."""
-    from jcr.errors import InputError, NotTrustedError
+    from jcr.errors import InputError
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
-    from jcr.verify import verify
+    from jcr.verify import verify, verify_camera
 
+    if arguments.camera is not None:
+        with progress_bars() as progress:
+            return _told(
+                verify_camera(
+                    arguments.out, arguments.camera, [arguments.capture], arguments.verify, progress
+                ),
+                arguments.output,
+            )
     with (
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress, at_least=1) as new,
@@ -53,7 +65,14 @@ def main(arguments: Arguments) -> int:
         if isinstance(new, PosePairs):
             raise InputError(f"{arguments.capture}: gives poses and no images, which verify needs")
         found = verify(arguments.out, new, arguments.verify, progress)
-    arguments.output.result(_as_text(found), _as_json(found))
+    return _told(found, arguments.output)
+
+
+def _told(found: "Verification", output: Output) -> int:
+    """Print it; NotTrustedError where something has moved."""
+    from jcr.errors import NotTrustedError
+
+    output.result(_as_text(found), _as_json(found))
     for note in found.notes:
         sys.stderr.write(f"warning: {note}\n")
     if found.moved:
@@ -65,9 +84,10 @@ def _as_text(found: "Verification") -> str:
     drift = f"{1e3 * found.drift_m:.2f} mm and {np.degrees(found.drift_rad):.3f}°"
     offset, std = _spaced(1e3 * found.offset[:3], 2), _spaced(1e3 * found.std[:3], 2)
     angle, angle_std = _spaced(np.degrees(found.offset[3:]), 3), _spaced(np.degrees(found.std[3:]), 3)
+    parent = "gripper" if found.fixed is None else "base"
     return (
         f"{found.verdict}: {drift} from the calibration, p = {found.p_value:.2g}\n"
-        f"  drift in gripper axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
+        f"  drift in {parent} axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
         f"  {len(found.images)} images, {found.how}; a drift of {1e3 * found.detectable[0]:.1f} mm or "
         f"{np.degrees(found.detectable[1]):.2f}° would be noticed 9 times in 10\n"
     )

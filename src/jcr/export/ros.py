@@ -106,25 +106,29 @@ def urdf_origin(parent_from_child: Float[ndarray, "4 4"]) -> str:
     return f'<origin xyz="{" ".join(map(_number, xyz))}" rpy="{" ".join(map(_number, rpy))}"/>'
 
 
-def ros2_launch(mount: CameraMount) -> str:
-    """A ROS 2 launch file (XML) that publishes the transform."""
-    arguments = " ".join(_publisher_arguments(mount.parent, mount.child, mount.parent_from_child))
-    return f"""<launch>
-{_xml_comment(mount)}
-  <node pkg="tf2_ros" exec="static_transform_publisher" name="hand_eye_publisher" args="{arguments}"/>
-</launch>
-"""
+def ros2_launch(mount: CameraMount, *others: CameraMount) -> str:
+    """A ROS 2 launch file (XML) that publishes the transform, and those of further cameras and arms."""
+    nodes = []
+    for k, one in enumerate((mount, *others)):
+        arguments = " ".join(_publisher_arguments(one.parent, one.child, one.parent_from_child))
+        name = "hand_eye_publisher" if k == 0 else f"{re.sub('[^A-Za-z0-9_]', '_', one.child)}_publisher"
+        nodes.append(
+            f"{_xml_comment(one)}\n"
+            f'  <node pkg="tf2_ros" exec="static_transform_publisher" name="{name}" args="{arguments}"/>\n'
+        )
+    return f"<launch>\n{''.join(nodes)}</launch>\n"
 
 
 def moveit_launch(mount: CameraMount) -> str:
     """A ROS 2 launch file (Python), laid out as MoveIt Calibration saves its own."""
+    kind = "EYE-TO-HAND" if mount.parent == mount.base else "EYE-IN-HAND"
     arguments = _publisher_arguments(mount.parent, mount.child, mount.parent_from_child)
     rows = "\n".join(
         f'                "{name}", "{value}",'
         for name, value in zip(arguments[::2], arguments[1::2], strict=True)
     )
     return f'''{_comments(mount)}
-"""EYE-IN-HAND: {mount.parent} -> {mount.child}"""
+"""{kind}: {mount.parent} -> {mount.child}"""
 from launch import LaunchDescription
 from launch_ros.actions import Node
 
@@ -144,19 +148,22 @@ def generate_launch_description() -> LaunchDescription:
 '''
 
 
-def urdf(mount: CameraMount) -> str:
-    """A URDF of the two links and the fixed joint between them."""
+def urdf(mount: CameraMount, *others: CameraMount) -> str:
+    """A URDF of the two links and the fixed joint between them, and of further cameras and arms."""
+    every, parts = (mount, *others), []
+    links = dict.fromkeys(name for one in every for name in (one.parent, one.child))
+    for one in every:
+        parts.append(f"""{_xml_comment(one)}
+  <joint name="{one.child}_joint" type="fixed">
+    <parent link="{one.parent}"/>
+    <child link="{one.child}"/>
+    {urdf_origin(one.parent_from_child)}
+  </joint>
+""")
+    named = "".join(f'  <link name="{name}"/>\n' for name in links)
     return f"""<?xml version="1.0"?>
 <robot name="hand_eye">
-{_xml_comment(mount)}
-  <link name="{mount.parent}"/>
-  <link name="{mount.child}"/>
-  <joint name="{mount.child}_joint" type="fixed">
-    <parent link="{mount.parent}"/>
-    <child link="{mount.child}"/>
-    {urdf_origin(mount.parent_from_child)}
-  </joint>
-</robot>
+{named}{"".join(parts)}</robot>
 """
 
 
@@ -182,9 +189,9 @@ def easy_handeye2(mount: CameraMount, name: str) -> str:
     content = {
         "parameters": {
             "name": name,
-            "calibration_type": "eye_in_hand",
+            "calibration_type": "eye_on_base" if mount.parent == mount.base else "eye_in_hand",
             "robot_base_frame": mount.base,
-            "robot_effector_frame": mount.parent,
+            "robot_effector_frame": PARENT if mount.parent == mount.base else mount.parent,
             "tracking_base_frame": mount.child,
             "tracking_marker_frame": "none",
             "freehand_robot_movement": True,

@@ -3,7 +3,7 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,36 +62,43 @@ def posed_images(
 
 
 def write_nerfstudio(
-    folder: Path, views: PosedImages, cloud: PointCloud, provenance: Provenance, undistorted: bool, link: bool
+    folder: Path,
+    views: PosedImages,
+    cloud: PointCloud,
+    provenance: Provenance,
+    undistorted: bool,
+    link: bool,
+    others: Sequence[PosedImages] = (),
 ) -> None:
     """Write transforms.json, images/ and points.ply (where a splat starts from) into a new folder.
+
+    `others` are pictures of further cameras; every frame then has intrinsics of its own.
 
     Cameras are camera-to-world with OpenGL's axes (x right, y up, z backward). nerfstudio turns, shifts and scales
     the scene unless told not to: `--orientation-method none --center-method none --auto-scale-poses False`.
     """
     with _new_folder(folder) as made:
-        names, lens = _place_images(made / "images", views, undistorted, link)
-        if lens.model == "rational":
-            raise InputError("nerfstudio knows no rational distortion; export with --undistort")
-        plain = lens.model == "pinhole" and not any(lens.distortion)
-        content = {
-            "camera_model": "PINHOLE" if plain else "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV",
-            "fl_x": lens.fx,
-            "fl_y": lens.fy,
-            # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.
-            "cx": lens.cx + 0.5,
-            "cy": lens.cy + 0.5,
-            "w": lens.width,
-            "h": lens.height,
-            **({} if plain else dict(zip(COEFFICIENTS[lens.model], lens.distortion, strict=True))),
-            "ply_file_path": "points.ply",
-            "frames": [
+        (made / "images").mkdir()
+        frames, lenses = [], []
+        for k, one in enumerate((views, *others)):
+            below = "images" if k == 0 else f"images/{k}"
+            names, lens = _place_images(made / below, one, undistorted, link)
+            lenses.append(lens)
+            frames += [
                 {
-                    "file_path": f"images/{name}",
+                    "file_path": f"{below}/{name}",
                     "transform_matrix": (base_from_camera @ _OPENGL_FROM_OPENCV).tolist(),
+                    **(_nerfstudio_lens(lens) if others else {}),
                 }
-                for name, base_from_camera in zip(names, views.base_from_camera, strict=True)
-            ],
+                for name, base_from_camera in zip(names, one.base_from_camera, strict=True)
+            ]
+        if len({_nerfstudio_model(lens) for lens in lenses}) > 1:
+            raise InputError("nerfstudio has one kind of lens for all cameras; export with --undistort")
+        content = {
+            "camera_model": _nerfstudio_model(lenses[0]),
+            **_nerfstudio_lens(lenses[0]),
+            "ply_file_path": "points.ply",
+            "frames": frames,
             "about": provenance.notes
             | {"axes": "camera x right, y up, z backward; world as the robot's base"},
         }
@@ -99,13 +106,46 @@ def write_nerfstudio(
         write_cloud(made / "points.ply", cloud, provenance.notes)
 
 
+def _nerfstudio_model(lens: Intrinsics) -> str:
+    if lens.model == "rational":
+        raise InputError("nerfstudio knows no rational distortion; export with --undistort")
+    plain = lens.model == "pinhole" and not any(lens.distortion)
+    return "PINHOLE" if plain else "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV"
+
+
+def _nerfstudio_lens(lens: Intrinsics) -> dict[str, float]:
+    plain = lens.model == "pinhole" and not any(lens.distortion)
+    return {
+        "fl_x": lens.fx,
+        "fl_y": lens.fy,
+        # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.
+        "cx": lens.cx + 0.5,
+        "cy": lens.cy + 0.5,
+        "w": lens.width,
+        "h": lens.height,
+        **({} if plain else dict(zip(COEFFICIENTS[lens.model], lens.distortion, strict=True))),
+    }
+
+
 def write_colmap(
-    folder: Path, views: PosedImages, provenance: Provenance, undistorted: bool, link: bool
+    folder: Path,
+    views: PosedImages,
+    provenance: Provenance,
+    undistorted: bool,
+    link: bool,
+    others: Sequence[PosedImages] = (),
 ) -> None:
-    """Write images/ and sparse/0, as binary and as text, with every track into a new folder."""
+    """Write images/ and sparse/0, as binary and as text, with every track into a new folder.
+
+    `others` are pictures of further cameras, which see no tracks.
+    """
     with _new_folder(folder) as made:
+        (made / "images").mkdir()
         names, lens = _place_images(made / "images", views, undistorted, link)
         model = _colmap_model(views, names, lens)
+        for k, one in enumerate(others, start=1):
+            theirs, lens = _place_images(made / "images" / str(k), one, undistorted, link)
+            _add_camera(model, k + 1, lens, [f"{k}/{name}" for name in theirs], one.base_from_camera)
         model.extract_colors_for_all_images(str(made / "images"))
         sparse = made / "sparse" / "0"
         sparse.mkdir(parents=True)
@@ -138,6 +178,23 @@ def _colmap_model(views: PosedImages, names: list[str], lens: Intrinsics) -> pyc
     return model
 
 
+def _add_camera(
+    model: pycolmap.Reconstruction,
+    number: int,
+    lens: Intrinsics,
+    names: list[str],
+    base_from_camera: Float[ndarray, "k 4 4"],
+) -> None:
+    camera = camera_of(lens, known=True)
+    camera.camera_id = number
+    model.add_camera_with_trivial_rig(camera)
+    for name, camera_from_base in zip(names, inverse(base_from_camera), strict=True):
+        image = pycolmap.Image(
+            name=name, keypoints=np.zeros((0, 2)), camera_id=number, image_id=model.num_images() + 1
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_base[:3]))
+
+
 def _undistorted_px(
     x_px: Float[ndarray, "k 2"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Float[ndarray, "k 2"]:
@@ -148,7 +205,7 @@ def _place_images(
     folder: Path, views: PosedImages, undistorted: bool, link: bool
 ) -> tuple[list[str], Intrinsics]:
     """Copy, link or undistort the images into a folder; their names there, and the lens that then holds."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):
         names = [image.replace("/", "_") for image in views.images]
