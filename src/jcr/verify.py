@@ -178,24 +178,27 @@ def verify_camera(
     folder = RunFolder(out)
     _, reconstruction = folder.calibrated()
     capture, made_with, cameras = folder.capture(), folder.options(), folder.cameras()
-    others = (*capture.others, *read_added_cameras(folder.path, capture))
-    then = next((camera for camera in others if camera.name == name), None)
-    fixed = (
-        []
-        if cameras is None
-        else [one.name for one in cameras.cameras if one.converged and one.mount == "base"]
-    )
-    if then is None or name not in fixed or then.watches_gripper:
-        raise InputError(
-            f"--camera {name}: {out} has placed no fixed camera of that name; there are {fixed or 'none'}"
-        )
+    others = {camera.name: camera for camera in (*capture.others, *read_added_cameras(folder.path, capture))}
+    placed = {
+        one.name: one.intrinsics.record()
+        for one in ([] if cameras is None else cameras.cameras)
+        if one.converged and one.mount == "base" and one.intrinsics is not None and one.name in others
+        if not others[one.name].watches_gripper
+    }
+    if name not in placed:
+        there = ", ".join(placed) or "none"
+        raise InputError(f"--camera {name}: {out} has placed no fixed camera of that name; there are {there}")
+    # One lens took both: what is wrong with it moves both places alike.
+    lens = placed[name]
+    exact = np.zeros(4 + len(lens.distortion))
+    then = replace(others[name], intrinsics=lens, intrinsics_std=exact)
     now = camera_of(f"{name}_now", pictures, None, ())
     if now.image_size != then.image_size:
         raise InputError(
             f"{pictures[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
             f"{then.image_size[0]}x{then.image_size[1]}; take it with the same camera and resolution"
         )
-    now = replace(now, intrinsics=then.intrinsics, intrinsics_std=then.intrinsics_std)
+    now = replace(now, intrinsics=lens, intrinsics_std=exact)
     hand_eye = calibrate(capture, reconstruction, made_with.calibrate)
     found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
     for camera in found.cameras:
