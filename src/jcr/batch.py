@@ -154,7 +154,7 @@ def _falls_short(content: CalibrationFile) -> bool:
 
 def _finished(task: Task, made_from: str) -> Row | None:
     try:
-        state = json.loads((task.out / STATE).read_text())
+        state = json.loads((task.out / STATE).read_text("utf-8"))
         row = Row(**state["row"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

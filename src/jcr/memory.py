@@ -23,7 +23,7 @@ MAP = 300_000_000
 def resident() -> int:
     """Bytes of the resident set now; where the system does not tell, at its peak."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        pages = int(Path("/proc/self/statm").read_text("utf-8").split()[1])
     except OSError:
         unit = 1 if sys.platform == "darwin" else 1024
         return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

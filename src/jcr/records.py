@@ -341,7 +341,7 @@ class DepthCheck:
     images: int
     features: int
 
-    def std_m(self, depth: Float[ndarray, "*any"]) -> Float[ndarray, "*any"]:
+    def std_m(self, depth: Float[ndarray, "*any"] | float) -> Float[ndarray, "*any"] | float:
         """One sigma (m) of corrected depths (m), what is unknown of the scale included."""
         common = 0.01 * self.std_percent * depth
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)

@@ -231,7 +231,7 @@ def held(path: Path) -> Iterator[RunFolder]:
     new = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
-        lock = (path / LOCK).open("w")
+        lock = (path / LOCK).open("w", encoding="utf-8")
     except (FileExistsError, NotADirectoryError):
         raise InputError(f"{path}: is a file; name a folder for the results") from None
     except OSError as error:

@@ -212,12 +212,13 @@ def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: 
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert content["converged"] is False and content["gripper_from_camera"] is None
     report = (tmp_path / "out" / "report.html").read_text()
-    assert "No calibration" in report and html.escape(content["warnings"][0]) in report
+    assert "No calibration" in report and "the pictures show one colour and no edges" in report
+    assert all(html.escape(attempt["why_not"]) in report for attempt in content["attempts"])
 
 
 def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["calibrate", "--help"]) == 0
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split()).partition("positional arguments")[2]
     assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 8.0)" in text
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
     assert "--no-bundle-adjustment Use the camera poses alone" in text

@@ -49,11 +49,13 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
     return {name: list(map(str, line)) for name, line in lines.items()}
 
 
+def _arguments(name: str) -> type:
+    return import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_takes_json_and_quiet(name: str):
-    assert isinstance(
-        import_module(f"jcr.cli.{name}").Arguments.__dataclass_fields__["output"].default_factory(), Output
-    )
+    assert isinstance(_arguments(name).__dataclass_fields__["output"].default_factory(), Output)
 
 
 def test_json_is_one_object_and_quiet_is_silence(
@@ -86,7 +88,7 @@ def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.Capt
     assert dispatch([name, "--help"]) == 0
     told = capsys.readouterr().out
     listed = set(re.findall(r"^. (?:-h, )?(--[a-z][a-z0-9-]*)", told, re.MULTILINE))
-    offered = {argument.flag for argument in arguments_of(import_module(f"jcr.cli.{name}").Arguments)}
+    offered = {argument.flag for argument in arguments_of(_arguments(name))}
     assert listed == (offered | {"--help"}) - {None}
     # Arguments are told by their own names, and None is no word of a command line.
     assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]

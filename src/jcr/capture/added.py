@@ -98,7 +98,7 @@ def read_pose(path: Path) -> Float[ndarray, "4 4"]:
             value = read_json(path)
             value = value["base_from_gripper"] if isinstance(value, dict) else value
         else:
-            value = np.array(path.read_text().replace(",", " ").split(), float)
+            value = np.array(path.read_text("utf-8").replace(",", " ").split(), float)
             value = value.reshape(4, 4) if value.size == 16 else value
     except InputError:
         raise

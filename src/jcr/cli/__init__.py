@@ -195,7 +195,8 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
         return _fail(2, f"{_flatten(complaint.getvalue())} ({program} --help)")
     with contextlib.ExitStack() as silence:
         if parsed.output.quiet:
-            silence.enter_context(contextlib.redirect_stderr(silence.enter_context(open(os.devnull, "w"))))
+            nowhere = silence.enter_context(open(os.devnull, "w", encoding="utf-8"))
+            silence.enter_context(contextlib.redirect_stderr(nowhere))
         return command.main(parsed)
 
 

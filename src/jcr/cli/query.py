@@ -107,7 +107,9 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
 
 
 def _read_csv(path: Path) -> ndarray:
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [
+        line for line in path.read_text("utf-8").splitlines() if line.strip() and not line.startswith("#")
+    ]
     if not lines:
         return np.zeros((0, 3))
     try:

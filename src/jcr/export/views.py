@@ -102,7 +102,7 @@ def write_nerfstudio(
             "about": provenance.notes
             | {"axes": "camera x right, y up, z backward; world as the robot's base"},
         }
-        (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n")
+        (made / "transforms.json").write_text(json.dumps(content, indent=2) + "\n", "utf-8")
         write_cloud(made / "points.ply", cloud, provenance.notes)
 
 

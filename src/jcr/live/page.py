@@ -39,8 +39,8 @@ def write_page(
 ) -> None:
     """Write live.html, and live/state.js by which an open page learns of it."""
     body = _body(live, found, headline, wanted)
-    text = Template(TEMPLATE.read_text()).substitute(
-        style=STYLE.read_text(), title=escape(str(live.folder)), body=body
+    text = Template(TEMPLATE.read_text("utf-8")).substitute(
+        style=STYLE.read_text("utf-8"), title=escape(str(live.folder)), body=body
     )
     write_text(live.folder / "live.html", text)
     write_text(live.folder / "live" / "state.js", f"show({json.dumps(body)});\n")

@@ -42,7 +42,7 @@ class SiftMatcher:
         """Matched by COLMAP, on all cores."""
         asked = set(pairs)
         lines = "".join(f"{i:05d}.png {j:05d}.png\n" for i, j in pairs)
-        with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8", suffix=".txt") as listed:
             listed.write(lines)
             listed.flush()
             pairing = pycolmap.ImportedPairingOptions()

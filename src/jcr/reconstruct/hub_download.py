@@ -86,7 +86,7 @@ def download(
 def pins() -> dict[str, Any]:
     """What was downloaded before, by hub id: revision, checksums, and licences accepted."""
     try:
-        return json.loads(_pins_path().read_text())
+        return json.loads(_pins_path().read_text("utf-8"))
     except (OSError, ValueError):
         return {}
 

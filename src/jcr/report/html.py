@@ -180,12 +180,12 @@ def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -
         "page.html",
         name=escape(source.resolve().name),
         about=f"{len(calibration.images)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
-        style=(PAGE / "page.css").read_text(),
+        style=(PAGE / "page.css").read_text("utf-8"),
         sections="\n".join(sections),
         links=_links(sections),
-        scene3d=(PAGE / "scene3d.js").read_text(),
-        copy=(PAGE / "copy.js").read_text(),
-        large=(PAGE / "large.js").read_text(),
+        scene3d=(PAGE / "scene3d.js").read_text("utf-8"),
+        copy=(PAGE / "copy.js").read_text("utf-8"),
+        large=(PAGE / "large.js").read_text("utf-8"),
     )
 
 

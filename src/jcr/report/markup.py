@@ -8,4 +8,4 @@ PAGE = resources.files("jcr.report") / "page"
 
 def filled(template: str, **parts: str) -> str:
     """The template with its placeholders replaced by markup; text from files must come escaped."""
-    return Template((PAGE / template).read_text()).substitute(parts)
+    return Template((PAGE / template).read_text("utf-8")).substitute(parts)

@@ -81,7 +81,7 @@ def _read_names(path: Path) -> dict[int, str]:
     if not path.is_file():
         return {}
     try:
-        named = json.loads(path.read_text()).items()
+        named = json.loads(path.read_text("utf-8")).items()
         # One line each: the header of cloud.ply names them.
         return {int(label): " ".join(str(name).split()) or label for label, name in named}
     except (ValueError, AttributeError, RecursionError):

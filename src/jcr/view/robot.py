@@ -47,7 +47,7 @@ def read_joints(path: Path, robot: "yourdfpy.URDF", images: int) -> Float[ndarra
         if path.suffix == ".npy":
             values = read_npy(path)
         else:
-            lines = [line for line in path.read_text().splitlines() if line.strip()]
+            lines = [line for line in path.read_text("utf-8").splitlines() if line.strip()]
             header = int(any(word.strip() in names for word in lines[0].split(",")))
             values = np.array([[float(word) for word in line.split(",")] for line in lines[header:]])
     except (OSError, ValueError, IndexError) as error:

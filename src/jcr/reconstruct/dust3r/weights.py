@@ -111,7 +111,7 @@ def _read_safetensors(path: Path) -> tuple[dict[str, object], dict[str, Tensor]]
 
     config_path = path.parent / HUB_FILES[0]
     try:
-        config = json.loads(config_path.read_text())
+        config = json.loads(config_path.read_text("utf-8"))
     except FileNotFoundError:
         raise InputError(
             f"{config_path}: no such file; the weights' config.json belongs beside them"

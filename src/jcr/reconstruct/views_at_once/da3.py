@@ -51,7 +51,7 @@ def load(weights: Path, device: str) -> Predict:
     from safetensors.torch import load_file
 
     try:
-        name = json.loads((weights / "config.json").read_text())["model_name"]
+        name = json.loads((weights / "config.json").read_text("utf-8"))["model_name"]
         state = load_file(weights / "model.safetensors")
         network = build(name)
         network.load_state_dict({key.removeprefix("model."): state[key] for key in state})
