@@ -52,7 +52,10 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_takes_json_and_quiet(name: str):
     assert isinstance(
-        import_module(f"jcr.cli.{name}").Arguments.__dataclass_fields__["output"].default_factory(), Output
+        import_module(f"jcr.cli.{name.replace('-', '_')}")
+        .Arguments.__dataclass_fields__["output"]
+        .default_factory(),
+        Output,
     )
 
 
@@ -86,7 +89,10 @@ def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.Capt
     assert dispatch([name, "--help"]) == 0
     told = capsys.readouterr().out
     listed = set(re.findall(r"^. (?:-h, )?(--[a-z][a-z0-9-]*)", told, re.MULTILINE))
-    offered = {argument.flag for argument in arguments_of(import_module(f"jcr.cli.{name}").Arguments)}
+    offered = {
+        argument.flag
+        for argument in arguments_of(import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments)
+    }
     assert listed == (offered | {"--help"}) - {None}
     # Arguments are told by their own names, and None is no word of a command line.
     assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]
