@@ -88,7 +88,9 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
     folders = sorted(path.parent for path in captures.glob("*/capture.json"))
     if not folders:
         raise InputError(f"{captures}: no folder below it holds a capture.json")
-    drawn = {(kind, preset): _drawn(kind, preset) for kind in get_args(Kind) for preset in PRESET_NAMES}
+    drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]] = {
+        (kind, preset): _drawn(kind, preset) for kind in get_args(Kind) for preset in PRESET_NAMES
+    }
     real = [line for folder in folders for line in _withheld(folder)]
     return _page(drawn, real)
 

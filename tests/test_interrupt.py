@@ -23,7 +23,10 @@ def test_an_interrupted_run_says_so_in_one_line_and_resumes(small_capture: Path,
         "--quiet",
         "--json",
     ]
-    for seconds in (0.3, 1.0):  # after the folder is there: while it imports, and while COLMAP works
+    for seconds in (
+        0.1,
+        0.5,
+    ):  # after the folder is there: while it imports, and while COLMAP works; all takes 1.5
         running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         deadline = time.monotonic() + 60
         while not (tmp_path / "out" / ".lock").exists() and time.monotonic() < deadline:
