@@ -16,7 +16,6 @@ from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of, read_added_cameras
-from jcr.cell.stage import place_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
@@ -175,6 +174,8 @@ def verify_camera(
     InputError where the run has placed no fixed camera of that name, or the pictures cannot be its; NotTrustedError
     where they show too little of the scene.
     """
+    from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
+
     folder = RunFolder(out)
     _, reconstruction = folder.calibrated()
     capture, made_with, cameras = folder.capture(), folder.options(), folder.cameras()

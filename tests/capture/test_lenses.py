@@ -56,9 +56,9 @@ def test_a_lens_survives_colmap(lens: Intrinsics, tmp_path: Path):
 @pytest.mark.parametrize(
     ("model", "count", "words"),
     [
-        ("thin_prism", 12, "thin_prism with 12 coefficients; jcr knows plumb_bob"),
+        ("thin_prism", 12, "'thin_prism' with 12 coefficients; jcr knows plumb_bob"),
         ("rational_polynomial", 12, "with 12 coefficients"),
-        ("plumb_bob", 8, "plumb_bob with 8"),
+        ("plumb_bob", 8, "'plumb_bob' with 8"),
     ],
 )
 def test_other_lenses_are_refused_by_name(model: str, count: int, words: str):

@@ -304,7 +304,7 @@ FAULTS = {
             (f.parent / "camera_info.yaml").read_text().replace("plumb_bob", "equidistant")
         ),
         {},
-        "distortion model equidistant",
+        "distortion model 'equidistant'",
     ),
     "YAML that makes objects": (
         lambda f: (f.parent / "camera_info.yaml").write_text("!!python/object/apply:os.system [echo]"),
