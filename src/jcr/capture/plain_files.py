@@ -43,13 +43,18 @@ def read_yaml(file: Path) -> Any:
     """The content of a YAML file, plain data alone; InputError when it is none."""
     import yaml
 
+    try:
+        from yaml import CSafeLoader as SafeLoader
+    except ImportError:
+        from yaml import SafeLoader
+
     text = read_text(file)
     if len(text) > MAX_YAML:
         raise InputError(
             f"{file}: {len(text) / 1e6:.0f} MB of YAML; {MAX_YAML // 1_000_000} MB at most, which hold 1000 samples"
         )
     try:
-        return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return yaml.load(text, Loader=SafeLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}" if mark else ""
