@@ -217,8 +217,8 @@ def _verdict(calibration: CalibrationFile) -> str:
         believe = f"Its leave-one-out error of {miss} is no comfort: {no_comfort}."
     else:
         believe = (
-            f"Beside it the leave-one-out error: {miss} ({escape(held_out.how)}). It is of one pose, with the robot's "
-            "own noise in it, and so mostly larger than the error of the transform, which all images have a part in."
+            f"Beside it the leave-one-out error: {miss} ({escape(held_out.how)}). It is of one pose, with the "
+            "robot's noise in it, and blind to what all images share, such as intrinsics that are a little wrong."
         )
     if calibration.uncertainty is not None:
         believe += f" Least certain is the translation {escape(calibration.uncertainty.worst)} (one σ)."
