@@ -12,7 +12,7 @@ from typing import Any
 from jcr import __version__
 from jcr.attempts import Choice, NothingFoundError, again, choose, timings_of
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
-from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
 from jcr.calibration.words import shortfall
@@ -49,6 +49,7 @@ def run(
     camera poses are found (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
+    check_options(options.calibrate)
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         return calibrate(capture, out, options, progress=progress)
     if options.map is None:
@@ -74,6 +75,7 @@ def calibrate(
     There is no dense depth: only a map needs it, and `build_map` makes it where it is missing.
     """
     options = _with_dense(_with_backend(options, backend, capture), False)
+    check_options(options.calibrate)
     with held(Path(out)) as folder:
         capture = folder.keep_capture(capture)
         if capture.mount == "base":

@@ -193,7 +193,7 @@ def verify_camera(
     lens = placed[name]
     exact = np.zeros(4 + len(lens.distortion))
     then = replace(others[name], intrinsics=lens, intrinsics_std=exact)
-    now = camera_of(f"{name}_now", pictures, None, ())
+    now = camera_of(f"{name[:60]}_now", pictures, None, ())
     if now.image_size != then.image_size:
         raise InputError(
             f"{pictures[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
@@ -210,20 +210,9 @@ def verify_camera(
     j = found.answer.derivative(after) - found.answer.derivative(before)
     covariance = j @ found.answer.covariance @ j.T
     offset = step_between(before(found.answer.placed), after(found.answer.placed))
-    p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
-    return Verification(
-        _is_moved(offset, p_value, options),
-        "camera",
-        offset,
-        np.sqrt(np.diag(covariance)),
-        p_value,
-        None,
-        detectable(covariance, options.alpha),
-        tuple(str(picture) for picture in pictures),
-        tuple(text for camera in found.cameras for text in camera.warnings),
-        "in the mapped scene",
-        fixed=name,
-    )
+    notes = tuple(text for camera in found.cameras for text in camera.warnings)
+    images = tuple(str(picture) for picture in pictures)
+    return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
 
 
 def fitted(
@@ -310,6 +299,21 @@ def _by_recalibration(
     before = np.array(calibration.gripper_from_camera)
     offset = step_between(before, hand_eye.gripper_from_camera)
     covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]
+    images = tuple(new.images[row] for row in reconstruction.image_index[hand_eye.inliers])
+    return _of_two(
+        offset, covariance, options, images, (), "against a calibration of its own in another scene"
+    )
+
+
+def _of_two(
+    offset: Float[ndarray, "6"],
+    covariance: Float[ndarray, "6 6"],
+    options: VerifyOptions,
+    images: tuple[str, ...],
+    notes: tuple[str, ...],
+    how: str,
+) -> Verification:
+    """The verdict on two places of the camera that are so far apart."""
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     return Verification(
         _is_moved(offset, p_value, options),
@@ -319,7 +323,7 @@ def _by_recalibration(
         p_value,
         None,
         detectable(covariance, options.alpha),
-        tuple(new.images[row] for row in reconstruction.image_index[hand_eye.inliers]),
-        (),
-        "against a calibration of its own in another scene",
+        images,
+        notes,
+        how,
     )

@@ -5,18 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jcr import pipeline
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.requirement import GRASPING, advised, within_95
 from jcr.calibration.stage import calibrate_poses
 from jcr.calibration.words import shortfall, summary
+from jcr.capture.read import read_capture
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between, transform
 from jcr.records import HandEye, PosePairs
 from jcr.report.html import poses_report_html
-from jcr.results import PosesResult
+from jcr.results import PosesResult, RunOptions
 from jcr.simulate.problem import hand_eye_problem
 
 NOISE = (5e-4, np.radians(0.1))
@@ -128,3 +130,25 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
 def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
     with pytest.raises(InputError, match="--require"):
         calibrate_poses(pairs(1, 6)[0], CalibrateOptions(require=asked))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (CalibrateOptions(require=(-1.0, 2.0)), "--require -1 2: give two positive numbers"),
+        (
+            CalibrateOptions(robot_noise=(0.5, float("nan"))),
+            "--robot-noise 0.5 nan: give two positive numbers",
+        ),
+        (CalibrateOptions(scale=0.0), "--scale 0: give a positive number"),
+        (CalibrateOptions(known_height=float("inf")), "--known-height inf: give millimetres"),
+        (CalibrateOptions(robot="ur99"), "robot ur99: not known"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_before_any_work(
+    options: CalibrateOptions, says: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pipeline, "choose", lambda *_: pytest.fail("images were reconstructed"))
+    with pytest.raises(InputError, match=says):
+        pipeline.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
+    assert not (tmp_path / "out").exists()

@@ -274,3 +274,6 @@ def test_pictures_of_two_sizes_are_not_one_camera(folder: Path):
         camera_of("a", [folder / "0.png", folder / "7.png"], None, ())
     with pytest.raises(jcr.InputError, match="choose another"):
         camera_of("a", [folder / "0.png"], None, ("a",))
+    for name in ("../a", "", "a/b", "1"):  # it becomes the name of a folder
+        with pytest.raises(jcr.InputError, match="begins with a letter"):
+            camera_of(name, [folder / "0.png"], None, ())

@@ -1,9 +1,12 @@
 """How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
 
 from dataclasses import dataclass
+from math import inf, isfinite
 from typing import Annotated, Literal
 
 import tyro
+
+from jcr.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -34,3 +37,18 @@ class CalibrateOptions:
         bool, tyro.conf.arg(help="Use the camera poses alone; skip the refinement by image points.")
     ] = True
     """Refine by the points that images share."""
+
+
+def check_options(options: CalibrateOptions) -> None:
+    """InputError, before any work, where a number or a name is none that can be."""
+    from jcr.handeye.arms import arm_named
+
+    for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):
+        if pair is not None and not all(0 < value < inf for value in pair):
+            raise InputError(f"{flag} {pair[0]:g} {pair[1]:g}: give two positive numbers, mm and degrees")
+    if options.scale is not None and not 0 < options.scale < inf:
+        raise InputError(f"--scale {options.scale:g}: give a positive number, metres per unit")
+    if options.known_height is not None and not isfinite(options.known_height):
+        raise InputError(f"--known-height {options.known_height:g}: give millimetres")
+    if options.robot is not None:
+        arm_named(options.robot)

@@ -8,7 +8,6 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.errors import InputError
 from jcr.geometry import skew
 from jcr.handeye.equation import ASSUMED_NOISE, PRIOR_STD, pose_information
 from jcr.handeye.next_poses import looked_at, next_poses
@@ -33,7 +32,7 @@ def advised(
     """With what the motions show of each direction, the requirement, and the gripper poses to add.
 
     `gripper` are the poses that the solver was given, in its order; `scale_std` is how well the scale was
-    known beforehand (relative). Raises InputError where the requirement is none.
+    known beforehand (relative).
     """
     used = gripper[hand_eye.inliers]
     required = _required(hand_eye, used, options)
@@ -66,9 +65,6 @@ def within_95(covariance: Float[ndarray, "3 3"]) -> float:
 
 
 def _required(hand_eye: HandEye, used: Float[ndarray, "k 4 4"], options: CalibrateOptions) -> Requirement:
-    if options.require is not None and not (np.isfinite(options.require).all() and min(options.require) > 0):
-        millimetres, degrees = options.require
-        raise InputError(f"--require {millimetres} {degrees}: give two positive numbers, mm and degrees")
     distance = 0.0
     if options.require_at == "scene":
         distance = float(np.median(looked_at(used @ hand_eye.gripper_from_camera)[1]))

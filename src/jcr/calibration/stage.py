@@ -14,7 +14,7 @@ from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
 from jcr.calibration.intrinsics_prior import IntrinsicsPrior, prior_about
-from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined
 from jcr.calibration.sequence import sequence_fault
@@ -56,10 +56,11 @@ def calibrate(
 
     Camera poses that come with their covariance are weighed with it, and that is all. Else bundle adjustment
     follows on correspondences found in the images; on those between pointmaps, whose errors neighbours share,
-    its result stands only where it misses images left out by less. Raises NotTrustedError with fewer than two registered
-    images.
+    its result stands only where it misses images left out by less. Raises InputError for options that cannot be, and
+    NotTrustedError with fewer than two registered images.
     """
-    systematic, posed_arm, unused = robot_errors(capture, options := options or CalibrateOptions())
+    check_options(options := options or CalibrateOptions())
+    systematic, posed_arm, unused = robot_errors(capture, options)
     systematic = of_poses(systematic, reconstruction.image_index)
     hand_eye = _calibrated(capture, reconstruction, options, systematic)
     if posed_arm is not None:
@@ -305,7 +306,7 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
     that do not show a scale are helped by taking it as 1.
     """
-    options = options or CalibrateOptions()
+    check_options(options := options or CalibrateOptions())
     hand_eye = _calibrated_poses(pairs, options)
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
     return advised(hand_eye, pairs.base_from_gripper, options, SCALE_STD if is_known else None)

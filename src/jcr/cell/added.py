@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from jcr.capture.cell_cameras import cameras_as_json, with_cameras
+from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
 from jcr.capture.images import read_image
 from jcr.capture.lens_json import read_lens_of_these
 from jcr.capture.plain_files import read_json
@@ -34,6 +34,8 @@ def camera_of(
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
     that other cameras have.
     """
+    if not NAME.fullmatch(name):
+        raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
     if name in taken:
         raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
     sizes = [read_image(picture).shape[1::-1] for picture in pictures]

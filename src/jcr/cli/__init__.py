@@ -145,9 +145,8 @@ def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str])
             raise
         if error.filename is None:
             _write_no_more()
-        named = (
-            error.filename2 or error.filename or "the output"
-        )  # of a renaming, what it would have replaced
+        # Of a renaming the second name is what it would have replaced.
+        named = error.filename2 or error.filename or "the output"
         return _fail(2, f"{named}: {error.strerror}; {_DISK[error.errno]}")
     except BaseException as error:
         if not _interrupted(error):

@@ -53,6 +53,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
+    from jcr.calibration.options import CalibrateOptions, check_options
     from jcr.check import check
     from jcr.errors import InputError, NotTrustedError
     from jcr.progress import progress_bars
@@ -60,8 +61,7 @@ def main(arguments: Arguments) -> int:
     if arguments.suggest < 0:
         raise InputError(f"--suggest {arguments.suggest}: give how many poses to propose, 0 or more")
     noise = arguments.robot_noise
-    if noise is not None and min(noise) <= 0:
-        raise InputError(f"--robot-noise {noise[0]} {noise[1]}: give two positive numbers, mm and degrees")
+    check_options(CalibrateOptions(robot_noise=noise))
     with (
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress) as capture,
