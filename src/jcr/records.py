@@ -402,6 +402,8 @@ class HandEye:
     """Per pose: median reprojection error after bundle adjustment; NaN where it took no part."""
     scale_check: ScaleCheck | None = None
     """None where the reconstruction's unit is not meant to be the metre."""
+    scale_from_robot_alone: bool = False
+    """No length that is known otherwise, and no depth camera, had a say."""
     lens_shift: Float[ndarray, "7"] | None = None
     """How far the lens that the pictures show, in place of the one given, would move the answer; in COVARIANCE_ORDER,
     and in the covariance. None where nothing speaks against the lens."""

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
+from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
+from jcr.calibration.words import SCALE_FROM_ROBOT
 from jcr.geometry import retract, step_between
-from jcr.simulate.faults import LENS, Faults
+from jcr.simulate.faults import LENS, Faults, faulty_capture
 
 pytestmark = pytest.mark.slow
 
@@ -93,3 +95,16 @@ def test_one_wrong_pose_among_right_ones_is_no_slip():
     hand_eye = calibrate(capture, reconstruction)
     assert hand_eye.converged and np.flatnonzero(~hand_eye.inliers).tolist() == [5]
     assert not any("moved on the gripper" in text for text in hand_eye.warnings)
+
+
+def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_and_a_known_length_contradicts_them():
+    found = faulty_capture(np.random.default_rng(5), 12, Faults(pose_scale=1.05))
+    capture, reconstruction = reconstructed(found, False)
+    unknown = calibrate(capture, reconstruction)
+    assert unknown.converged and not unknown.warnings
+    file = calibration_file(capture, reconstruction, unknown, {}, "")
+    assert SCALE_FROM_ROBOT in file.notes
+    # Simulated observations are metric as the scene is; the robot's positions are not.
+    metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
+    assert "4.8 ± 0.2 % larger than told" in metric.warnings[0]
+    assert SCALE_FROM_ROBOT not in calibration_file(capture, reconstruction, metric, {}, "").notes

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from jcr.calibration.words import SCALE_FROM_ROBOT
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -322,7 +323,7 @@ def calibration_file(
         ),
         intrinsics=_lens(hand_eye.intrinsics, hand_eye.intrinsics_covariance),
         warnings=[*hand_eye.warnings, *told],
-        notes=list(reconstruction.notes),
+        notes=[*reconstruction.notes, *([SCALE_FROM_ROBOT] if hand_eye.scale_from_robot_alone else [])],
         timings_s=timings_s,
         version=version,
         next_poses=[

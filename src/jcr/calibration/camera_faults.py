@@ -22,6 +22,8 @@ LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
 MATERIAL = 0.5
 """Standard deviations that the answer would move by on an axis: what does less is nobody's worry."""
+OF_FIRST_STEP = 0.2
+"""Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
 AT_ONCE = 2
 """Faults named of one capture."""
 CAMERA_FAULT = "p = "
@@ -133,6 +135,9 @@ def camera_faults(
             break
         before = adjusted
         alone = tested(equations, best.both, _all(found, equations))
+        if not (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * std).any():
+            dismissed.append(best)
+            continue
         moved = adjusted, equations, total
         adjusted, equations, total = _settled(
             adjusted, equations, total, [*found, best], tracks, readjust, used

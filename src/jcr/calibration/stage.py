@@ -83,6 +83,9 @@ def calibrate(
         hand_eye = _scale_checked(hand_eye)
     if hand_eye.converged:
         hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    known = options.known_height is not None or options.known_length is not None
+    alone = reconstruction.metric_std is None and hand_eye.depth_check is None and not known
+    hand_eye = replace(hand_eye, scale_from_robot_alone=alone)
     gripper = capture.base_from_gripper[reconstruction.image_index]
     return advised(hand_eye, gripper, options, reconstruction.metric_std)
 

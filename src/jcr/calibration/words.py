@@ -23,6 +23,10 @@ NOTABLE_RATIO = 0.003
 NOTABLE_ERRORS = 0.03, 0.003
 """mm, degrees; real arms err by more, and of less nobody need hear."""
 SHORT = "not as exact as needed"
+SCALE_FROM_ROBOT = (
+    "the scale comes from the robot's positions alone: were all of them too long by one factor, no image would show it, "
+    "and ± does not hold it; the size of a board or --known-length would show it"
+)
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
 
