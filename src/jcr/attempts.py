@@ -10,7 +10,14 @@ from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, plan_depth, reconstruct, tries, with_depth_of
+from jcr.reconstruct.backends import (
+    BACKENDS,
+    ReconstructOptions,
+    plan_depth,
+    reconstruct,
+    tries,
+    with_depth_of,
+)
 from jcr.records import Attempt, Capture, HandEye, Reconstruction
 
 

@@ -72,7 +72,7 @@ def with_pointmaps(
     backend: str,
     planes: Float[ndarray, "m d 3"] | None = None,
 ) -> Reconstruction:
-    """The record of a sparse model, with pointmaps of its images, which are given row by row; `planes` as `with_depth`."""
+    """The record of a sparse model, with pointmaps of its images, row by row; `planes` as `with_depth` takes them."""
     pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
     colors = np.stack([undistort_image(image, sparse.lens, pinhole) for image in images])
     nothing = np.zeros(colors.shape[:3], np.float32)
@@ -100,7 +100,7 @@ def with_depth(
     report: Progress,
     planes: Float[ndarray, "m d 3"] | None = None,
 ) -> Reconstruction:
-    """The record of cameras, pictures and tracks with pointmaps; `planes` where the tracks do not span what is in view."""
+    """The record of cameras and tracks with pointmaps; `planes` where the tracks do not span what is in view."""
     cameras, tracks = reconstruction.recon_from_camera, reconstruction.tracks
     dense = dense_pointmaps(
         reconstruction.colors,
