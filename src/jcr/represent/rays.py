@@ -132,7 +132,7 @@ def workspace_box(
 
 
 def frees(cloud: PointCloud) -> Bool[ndarray, " n"]:
-    """Whether the way from the camera to each point counts as seen: not to what rests on a prior, nor to doubtful matches."""
+    """Whether the way from the camera to each point counts as seen: not to priors, nor to doubtful matches."""
     if cloud.reason is None:
         return np.ones(len(cloud.points_in_base), bool)
     alone = cloud.reason == MATCHED
