@@ -178,6 +178,26 @@ def test_windows_lie_on_slopes() -> None:
     assert (np.abs(inverse_depth * np.stack(depths) - 1)[middle] < 0.005).mean() > 0.95
 
 
+def test_only_a_confirmed_depth_sees_through_a_point() -> None:
+    """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
+    from jcr.reconstruct.depth.consistency import agreement
+    from jcr.reconstruct.depth.matched import grid, relative
+
+    poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
+    inverse_depth = np.ones((4, PINHOLE.height, PINHOLE.width), np.float32)
+    inverse_depth[3] = 0.5
+    known = np.ones(inverse_depth.shape, bool)
+    chance = known & (np.arange(4) != 3)[:, None, None]
+    view = relative(0, np.arange(1, 4), poses, PINHOLE)
+    for trusted, seeing in ((chance, 0), (known, 1)):
+        rest = (view.others, view.a, view.b, view.centre, grid(PINHOLE), 0.01)
+        mean, count, through, information = agreement(0, inverse_depth, known, trusted, *rest)
+        middle = np.s_[10:-10, 10:-10]
+        assert (count[middle] == 2).all() and (through[middle] == seeing).all()
+        np.testing.assert_allclose(mean[middle], 1.0, rtol=1e-6)
+        np.testing.assert_allclose(information[middle], 2 * (0.02 * PINHOLE.fx) ** 2, rtol=1e-4)
+
+
 def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene, dense: "DenseDepth") -> None:
     without = _dense(scene, scene.recon_from_camera, scene.tracks, priors=False)
     assert not np.isin(without.reason, (PRIOR, BOTH)).any()
