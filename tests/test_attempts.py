@@ -273,6 +273,43 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     assert made == ["colmap", "colmap"]
 
 
+def test_dense_depth_is_made_for_the_attempt_that_is_kept_alone(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good = problem.recon_from_camera
+    answers = {"colmap": good[np.random.default_rng(4).permutation(8)], "direct": good}
+    asked, deepened = [], []
+
+    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        asked.append((options.backend, options.dense))
+        return reconstruction(options.backend, answers[options.backend])
+
+    def deeper(capture: Capture, made: Reconstruction, options: object, progress: object) -> Reconstruction:
+        deepened.append(made.backend)
+        return replace(made, confidence=made.confidence + 1)
+
+    monkeypatch.setattr(attempts, "reconstruct", door)
+    monkeypatch.setattr(attempts, "with_depth_of", deeper)
+    names = tuple(f"{k:02d}.png" for k in range(8))
+    capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    chosen = []
+    choice = attempts.choose(
+        capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)
+    )
+    assert asked == [("colmap", False), ("direct", False)] and deepened == ["direct"]
+    assert choice.reconstruction.confidence.all() and chosen == [choice.reconstruction]
+    deepened.clear()
+    attempts.choose(capture, ReconstructOptions(dense=False), CalibrateOptions())
+    assert not deepened
+    # A known length is read from the depth, in each attempt that is calibrated.
+    asked.clear()
+    with pytest.raises(InputError, match="nowhere"):
+        lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
+        attempts.choose(capture, ReconstructOptions(), lost)
+    assert asked == [("colmap", True)]
+
+
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):

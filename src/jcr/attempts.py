@@ -10,7 +10,14 @@ from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
-from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
+from jcr.reconstruct.backends import (
+    BACKENDS,
+    ReconstructOptions,
+    plan_depth,
+    reconstruct,
+    tries,
+    with_depth_of,
+)
 from jcr.records import Attempt, Capture, HandEye, Reconstruction
 
 
@@ -45,14 +52,20 @@ def choose(
 
     `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long as
     the ones before gave nothing or a calibration that is not to be trusted for another reason than the motion. Of two
-    results a trusted one is kept, else the one with the smaller held-out error. `chosen` is told the reconstruction as
-    soon as it is sure that the run goes on with it. Raises InputError as the back end does, NothingFoundError where none
+    results a trusted one is kept, else the one with the smaller held-out error; dense depth is made for the one that is
+    kept, unless a known length is read from it. `chosen` is told the reconstruction as soon as it is sure that the run
+    goes on with it. Raises InputError as the back end does, NothingFoundError where none
     gave anything.
     """
     made = tries(options)
     if len(made) == 1:
         only = _tried(capture, made[0], calibrate_options, progress, chosen)
         return _choice(only, (only.attempt(),))
+    depth_later = options.dense and calibrate_options.known_length is None
+    if depth_later:
+        if not BACKENDS[made[0].backend].hub_id:
+            plan_depth(capture, options)
+        made = [replace(one, dense=False) for one in made]
     kept = _tried(capture, made[0], calibrate_options, progress)
     if isinstance(kept.failure, InputError) and options.weights is not None:
         raise kept.failure
@@ -67,6 +80,8 @@ def choose(
         attempts.append(of_other)
         if kept.name == other.name:
             at = len(attempts) - 1
+    if depth_later:
+        kept, attempts[at] = kept.with_depth(capture, options, attempts[at], progress)
     choice = _choice(kept, tuple(attempts))
     chosen(choice.reconstruction)
     return choice
@@ -133,6 +148,19 @@ class _Tried:
         return replace(
             self, reconstruction=replace(self.reconstruction, notes=(note, *self.reconstruction.notes))
         )
+
+    def with_depth(
+        self, capture: Capture, options: ReconstructOptions, account: Attempt, progress: Progress | None
+    ) -> "tuple[_Tried, Attempt]":
+        """The same with dense depth, and the account of it with the time that took."""
+        if self.reconstruction is None or self.hand_eye is None:
+            return self, account
+        start = time.perf_counter()
+        made = with_depth_of(capture, self.reconstruction, options, progress)
+        give_back()
+        seconds = self.reconstruct_s + time.perf_counter() - start
+        tried = replace(self, reconstruction=made, reconstruct_s=seconds)
+        return tried, replace(account, reconstruct_s=round(seconds, 3))
 
     def attempt(self, why_not: str | None = None) -> Attempt:
         """The account of it; what failed has its own reason."""

@@ -53,7 +53,7 @@ def run(
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         return calibrate(capture, out, options, progress=progress)
     if options.map is None:
-        options = _with_dense(options, False)
+        options = _with_dense(options, options.calibrate.known_length is not None)
     else:
         require_map(options.reconstruct)
     with held(Path(out)) as folder:
@@ -72,9 +72,10 @@ def calibrate(
 ) -> RunResult:
     """Reconstruction, calibration and report of a capture in the folder `out`; raises as `run` does.
 
-    There is no dense depth: only a map needs it, and `build_map` makes it where it is missing.
+    There is no dense depth: only a map and a known length need it, and `build_map` makes it where it is missing.
     """
-    options = _with_dense(_with_backend(options, backend, capture), False)
+    options = _with_backend(options, backend, capture)
+    options = _with_dense(options, options.calibrate.known_length is not None)
     check_options(options.calibrate)
     with held(Path(out)) as folder:
         capture = folder.keep_capture(capture)

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
-from jcr.progress import Progress
+from jcr.progress import Progress, silent
 from jcr.reconstruct.hub import HUB_FILES, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
@@ -416,8 +416,7 @@ def reconstruct(
                 else ", or choose another"
             )
         )
-    # By name, so that the order of the frames changes nothing.
-    order = np.argsort(np.array(capture.images), kind="stable")
+    order = _by_name(capture)
     if row.keeps_order:
         order = np.arange(len(capture))
     by_name = replace(
@@ -426,6 +425,43 @@ def reconstruct(
         base_from_gripper=capture.base_from_gripper[order],
     )
     return _of_capture(row.reconstruct(by_name, replace(options, backend=row.name), progress), order)
+
+
+def plan_depth(capture: Capture, options: ReconstructOptions) -> None:
+    """Say what memory a reconstruction with dense depth will take, and see that it can be made, before anything is.
+
+    Raises InputError where it cannot.
+    """
+    from jcr.reconstruct.depth.dense import DenseOptions, plan_memory
+
+    plan_memory(len(capture), capture.image_size, DenseOptions(**_dense(options)))
+
+
+def with_depth_of(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    options: ReconstructOptions,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """A reconstruction made with `dense` off, with the dense depth that `reconstruct` would have given it.
+
+    What a network predicted is as it was.
+    """
+    if reconstruction.reason is None or reconstruction.reason.any():
+        return reconstruction
+    from jcr.reconstruct.depth.dense import DenseOptions, with_depth
+
+    place = np.argsort(_by_name(capture))
+    by_name = np.argsort(place[reconstruction.image_index])
+    rows = np.argsort(by_name)
+    turned = _of_capture(replace(reconstruction, image_index=rows), np.arange(len(rows)))
+    made = with_depth(turned, DenseOptions(**_dense(options)), progress or silent)
+    return replace(_of_capture(made, by_name), image_index=reconstruction.image_index)
+
+
+def _by_name(capture: Capture) -> Int[ndarray, " n"]:
+    """Rows of the capture in the order of their names, so that the order of the frames changes nothing."""
+    return np.argsort(np.array(capture.images), kind="stable")
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:

@@ -1,6 +1,7 @@
 """Dense depth on a scene whose depth is known: a box on a table, drawn by casting rays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +12,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.reconstruct.backends import ReconstructOptions, with_depth_of
 from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
-from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics, Tracks
+from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
 
 if TYPE_CHECKING:
     from jcr.reconstruct.depth.dense import DenseDepth
@@ -176,6 +178,26 @@ def test_windows_lie_on_slopes() -> None:
     assert (np.abs(inverse_depth * np.stack(depths) - 1)[middle] < 0.005).mean() > 0.95
 
 
+def test_only_a_confirmed_depth_sees_through_a_point() -> None:
+    """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
+    from jcr.reconstruct.depth.consistency import agreement
+    from jcr.reconstruct.depth.matched import grid, relative
+
+    poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
+    inverse_depth = np.ones((4, PINHOLE.height, PINHOLE.width), np.float32)
+    inverse_depth[3] = 0.5
+    known = np.ones(inverse_depth.shape, bool)
+    chance = known & (np.arange(4) != 3)[:, None, None]
+    view = relative(0, np.arange(1, 4), poses, PINHOLE)
+    for trusted, seeing in ((chance, 0), (known, 1)):
+        rest = (view.others, view.a, view.b, view.centre, grid(PINHOLE), 0.01)
+        mean, count, through, information = agreement(0, inverse_depth, known, trusted, *rest)
+        middle = np.s_[10:-10, 10:-10]
+        assert (count[middle] == 2).all() and (through[middle] == seeing).all()
+        np.testing.assert_allclose(mean[middle], 1.0, rtol=1e-6)
+        np.testing.assert_allclose(information[middle], 2 * (0.02 * PINHOLE.fx) ** 2, rtol=1e-4)
+
+
 def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene, dense: "DenseDepth") -> None:
     without = _dense(scene, scene.recon_from_camera, scene.tracks, priors=False)
     assert not np.isin(without.reason, (PRIOR, BOTH)).any()
@@ -236,6 +258,35 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: "DenseDepth
     ratio = _z(scene, other, moved) / scale / _z(scene, dense)
     assert np.quantile(np.abs(ratio - 1)[both], 0.95) < 1e-3
     assert np.median(np.abs(other.depth_std[both] / scale / dense.depth_std[both] - 1)) < 1e-2
+
+
+def test_depth_made_later_is_what_it_would_have_been(scene: Scene, dense: "DenseDepth") -> None:
+    """Of a record in the capture's order, whose names sort otherwise; and what has depth is left as it is."""
+    order = np.array([3, 0, 6, 1, 5, 2, 4])  # row k of the capture is row order[k] by name
+    names = tuple(f"{k}.png" for k in order)
+    capture = Capture(Path(), names, scene.recon_from_camera[order], (PINHOLE.width, PINHOLE.height))
+    nothing = np.zeros(scene.depth.shape, np.float32)
+    by_name = np.argsort(order)
+    sparse = Reconstruction(
+        image_index=np.arange(7),
+        recon_from_camera=scene.recon_from_camera[order],
+        intrinsics=PINHOLE,
+        pointmap_intrinsics=PINHOLE,
+        points_in_recon=np.zeros(scene.images.shape, np.float32),
+        confidence=nothing,
+        colors=scene.images[order],
+        tracks=replace(scene.tracks, image=by_name[scene.tracks.image]),
+        backend="colmap",
+        reason=nothing.astype(np.uint8),
+        depth_std=nothing,
+    )
+    made = with_depth_of(capture, sparse, ReconstructOptions())
+    np.testing.assert_array_equal(made.image_index, sparse.image_index)
+    np.testing.assert_array_equal(made.recon_from_camera, sparse.recon_from_camera)
+    np.testing.assert_array_equal(made.tracks.image, sparse.tracks.image)
+    for name in ("points_in_recon", "confidence", "reason", "depth_std"):
+        np.testing.assert_array_equal(getattr(made, name)[by_name], getattr(dense, name))
+    assert with_depth_of(capture, made, ReconstructOptions()) is made
 
 
 def test_planes_take_the_slope_of_the_table(scene: Scene) -> None:

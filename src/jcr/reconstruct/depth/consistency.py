@@ -13,11 +13,12 @@ table often gets the object's depth; the neighbours that look past the object th
 
 @compiled
 @no_type_check
-def agreement(i, inverse_depth, known, others, a, b, centre, k, tolerance):
+def agreement(i, inverse_depth, known, trusted, others, a, b, centre, k, tolerance):
     """Mean inverse depth (h,w) of image i with the images that agree at each pixel, how many do, how many see through.
 
     The fourth map is the information of those that agree: the sum of squares of how far (px) the point moves in them
-    per inverse depth. `a` (n,3,3) is K R and `b` (n,3) K t to each other image; `centre` (n) its camera's z in image i.
+    per inverse depth. An image sees through only where it is `trusted` (m,h,w). `a` (n,3,3) is K R and `b` (n,3) K t to
+    each other image; `centre` (n) its camera's z in image i.
     """
     h, w = inverse_depth.shape[1:]
     mean = np.zeros((h, w), np.float32)
@@ -64,7 +65,7 @@ def agreement(i, inverse_depth, known, others, a, b, centre, k, tolerance):
                     count[v, u] += 1
                     moves_x, moves_y = (b[n, 0] - x * b[n, 2]) / z, (b[n, 1] - y * b[n, 2]) / z
                     information[v, u] += moves_x * moves_x + moves_y * moves_y
-                elif ratio < 1 - SEEN_THROUGH:
+                elif ratio < 1 - SEEN_THROUGH and trusted[j, ny, nx]:
                     through[v, u] += 1
             mean[v, u] = total / (1 + count[v, u])
     return mean, count, through, information

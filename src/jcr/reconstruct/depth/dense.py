@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -72,40 +72,52 @@ def with_pointmaps(
     backend: str,
     planes: Float[ndarray, "m d 3"] | None = None,
 ) -> Reconstruction:
-    """The record of a sparse model, with pointmaps of its images, which are given row by row.
-
-    `planes` where the tracks do not span what is in view.
-    """
+    """The record of a sparse model, with pointmaps of its images, row by row; `planes` as `with_depth` takes them."""
     pinhole = pinhole_inside(sparse.lens, options.pointmap_size_px)
     colors = np.stack([undistort_image(image, sparse.lens, pinhole) for image in images])
-    if options.dense:
-        dense = dense_pointmaps(
-            colors,
-            sparse.recon_from_camera,
-            pinhole,
-            choose_neighbours(sparse.tracks, sparse.recon_from_camera, options.neighbours),
-            sweep_planes(sparse.tracks, sparse.recon_from_camera) if planes is None else planes,
-            report,
-            priors=options.priors,
-            memory_gb=options.memory_gb,
-        )
-    else:
-        nothing = np.zeros(colors.shape[:3], np.float32)
-        dense = DenseDepth(np.zeros(colors.shape, np.float32), nothing, nothing.astype(np.uint8), nothing)
-    return Reconstruction(
+    nothing = np.zeros(colors.shape[:3], np.float32)
+    without = Reconstruction(
         image_index=sparse.rows,
         recon_from_camera=sparse.recon_from_camera,
         intrinsics=sparse.lens,
         pointmap_intrinsics=pinhole,
-        points_in_recon=dense.points_in_recon,
-        confidence=dense.confidence,
-        reason=dense.reason,
-        depth_std=dense.depth_std,
+        points_in_recon=np.zeros(colors.shape, np.float32),
+        confidence=nothing,
+        reason=nothing.astype(np.uint8),
+        depth_std=nothing,
         colors=colors,
         tracks=sparse.tracks,
         backend=backend,
         notes=sparse.notes,
         warnings=sparse.warnings,
+    )
+    return with_depth(without, options, report, planes) if options.dense else without
+
+
+def with_depth(
+    reconstruction: Reconstruction,
+    options: DenseOptions,
+    report: Progress,
+    planes: Float[ndarray, "m d 3"] | None = None,
+) -> Reconstruction:
+    """The record of cameras and tracks with pointmaps; `planes` where the tracks do not span what is in view."""
+    cameras, tracks = reconstruction.recon_from_camera, reconstruction.tracks
+    dense = dense_pointmaps(
+        reconstruction.colors,
+        cameras,
+        reconstruction.pointmap_intrinsics,
+        choose_neighbours(tracks, cameras, options.neighbours),
+        sweep_planes(tracks, cameras) if planes is None else planes,
+        report,
+        priors=options.priors,
+        memory_gb=options.memory_gb,
+    )
+    return replace(
+        reconstruction,
+        points_in_recon=dense.points_in_recon,
+        confidence=dense.confidence,
+        reason=dense.reason,
+        depth_std=dense.depth_std,
     )
 
 

@@ -64,7 +64,8 @@ def fused_depth(
     """The depths that views agree on, and with `priors` those of planes that nothing seen contradicts.
 
     A matched depth needs two images that agree (one, if there are no more than two) and, but for `changing` scenes, more
-    than twice as many as see through it.
+    than twice as many as see through it. To see through, an image's own depth must have as many that agree: what is
+    found where nothing matches is as often behind a surface as before it.
     """
     m = len(colors)
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
@@ -72,18 +73,25 @@ def fused_depth(
     with ThreadPoolExecutor(threads) as pool:
 
         def check(
-            depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], tolerance: float
+            depth: Float[ndarray, "m h w"],
+            known: Bool[ndarray, "m h w"],
+            trusted: Bool[ndarray, "m h w"],
+            tolerance: float,
         ) -> list[ndarray]:
             def one(i: int) -> tuple[ndarray, ...]:
                 v = views[i]
-                return agreement(i, depth, known, v.others, v.a, v.b, v.centre, grid(pinhole), tolerance)
+                return agreement(
+                    i, depth, known, trusted, v.others, v.a, v.b, v.centre, grid(pinhole), tolerance
+                )
 
             return [np.stack(maps) for maps in zip(*pool.map(one, range(m)), strict=True)]
 
         known = score >= LEAST_CORRELATION
         count = through = information = np.zeros(0)
+        trusted = known
         for tolerance in AGREEMENT:
-            inverse_depth, count, through, information = check(inverse_depth, known, tolerance)
+            inverse_depth, count, through, information = check(inverse_depth, known, trusted, tolerance)
+            trusted = known & (count >= needed)
         report(0.2)
         matched = known & (count >= needed)
         if not changing:
@@ -112,9 +120,9 @@ def fused_depth(
 
         found = list(pool.map(prior, range(m)))
         report(0.8)
-        of_plane, holds, confirms, shown, contradicts, plane_std = (
+        of_plane, holds, confirms, agreeing, contradicts, plane_std = (
             np.stack([getattr(one, name) for one in found])
-            for name in ("inverse_depth", "holds", "confirms", "shown", "contradicts", "std")
+            for name in ("inverse_depth", "holds", "confirms", "agreeing", "contradicts", "std")
         )
         plane_std = np.hypot(plane_std, PRIOR_FLOOR)
         on_plane = np.abs(of_plane / inverse_depth - 1) < ON_PLANE
@@ -123,8 +131,12 @@ def fused_depth(
         both = matched & confirms & on_plane
         filled = holds & ~matched
         inverse_depth = np.where(filled, of_plane, inverse_depth)
-        _, count, through, _ = check(inverse_depth, matched | filled, ON_PLANE)
-        filled &= (count >= np.minimum(needed, shown)) & (count > 2 * through)
+        there = matched | filled
+        _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
+        filled &= (count >= np.minimum(needed, agreeing)) & (count > 2 * through)
+        # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it knows better.
+        through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
+        matched &= both | (through == 0)
         report(1.0)
     reason = np.select([both, matched, filled], [BOTH, MATCHED, PRIOR], NO_DEPTH).astype(np.uint8)
     confidences = [BOTH_CONFIDENCE * confidence, confidence, PRIOR_CONFIDENCE * count]

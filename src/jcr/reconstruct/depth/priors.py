@@ -55,8 +55,9 @@ class Prior:
     """Colours agree with it and nothing sees through it."""
     confirms: Bool[ndarray, "h w"]
     """It holds, or the one other image that looks there agrees: enough where the pixel's own match lies on it."""
-    shown: UInt8[ndarray, "h w"]
-    """Images that show the plane's point in the pixel's colour."""
+    agreeing: UInt8[ndarray, "h w"]
+    """Images that show the plane's point in the pixel's colour; of the support plane one is enough. No more of them
+    than that need to agree."""
     contradicts: Bool[ndarray, "h w"]
     """Matched pixels that a well-carried plane shows to be wrong."""
     std: Float[ndarray, "h w"]
@@ -190,7 +191,7 @@ def planar_prior(
         inverse_depth=predicted,
         holds=holds,
         confirms=holds | alone,
-        shown=same,
+        agreeing=np.where(on_support[label], np.minimum(same, 1), same).astype(np.uint8),
         contradicts=strong & matched[i] & off,
         std=(rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))).astype(
             np.float32
