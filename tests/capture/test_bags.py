@@ -100,7 +100,7 @@ def test_further_cameras_of_a_bag_are_told_by_tf_or_by_name(tmp_path: Path, capt
     ):
         jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
     own, other, fixed = (f"/{name}/image_raw/compressed" for name in ("camera", "second", "top"))
-    named = replace(FRAMES, camera_topic=own, cameras=(other, f"{fixed}=base"))
+    named = replace(FRAMES, camera_topic=own, further_cameras=(other, f"{fixed}=base"))
     got = jcr.read_capture(bag, named, into=tmp_path / "frames")
     assert [(camera.name, camera.mount) for camera in got.others] == [("second", "gripper"), ("top", "base")]
     assert got.others[0].frame is not None and got.others[0].frame.tolist() == list(range(len(got)))
@@ -114,10 +114,10 @@ def test_further_cameras_of_a_bag_are_told_by_tf_or_by_name(tmp_path: Path, capt
     for cameras, words in (
         ((f"{fixed}=lid",), "write /top/image_raw/compressed=gripper for a camera on"),
         (("/nose",), "no images on /nose"),
-        ((own, fixed), "all are named by --cameras"),
+        ((own, fixed), "all are named by --further-cameras"),
     ):
         with pytest.raises(jcr.InputError, match=words):
-            jcr.read_capture(bag, replace(FRAMES, cameras=cameras), into=tmp_path / "none")
+            jcr.read_capture(bag, replace(FRAMES, further_cameras=cameras), into=tmp_path / "none")
 
 
 def test_depth_messages_are_read_in_every_encoding():

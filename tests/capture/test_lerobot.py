@@ -115,7 +115,7 @@ def test_further_cameras_of_a_set_come_with_it(tmp_path: Path, tabletop: Path, p
         tmp_path / "set", [episode], "v3.0", DROID, XYZRPY, codec=None, further=mirrored
     )
     top, left = mirrored
-    options = ReadOptions(frames=6, cameras=(f"{top}=base", f"{left}=gripper"))
+    options = ReadOptions(frames=6, further_cameras=(f"{top}=base", f"{left}=gripper"))
     got = jcr.read_capture(path, options, into=tmp_path / "frames")
     assert_paired(got, problem.base_from_gripper[:6])
     assert got.camera_name == "wrist" and [camera.name for camera in got.others] == ["top", "left"]
@@ -127,11 +127,11 @@ def test_further_cameras_of_a_set_come_with_it(tmp_path: Path, tabletop: Path, p
     for cameras, words in (
         ((top, left), "does not tell what carries observation.images.top; write"),
         ((f"{top}=table",), "=gripper for a camera on the gripper"),
-        (("observation.images.nose=base",), "--cameras observation.images.nose: there are"),
+        (("observation.images.nose=base",), "--further-cameras observation.images.nose: there are"),
         ((f"{top}=base",), "choose the wrist's camera"),
     ):
         with pytest.raises(jcr.InputError, match=words):
-            jcr.read_capture(path, ReadOptions(cameras=cameras), into=tmp_path / "more")
+            jcr.read_capture(path, ReadOptions(further_cameras=cameras), into=tmp_path / "more")
 
 
 def test_joint_states_in_degrees_go_through_the_urdf(tmp_path: Path, tabletop: Path):
@@ -181,7 +181,7 @@ def small(tmp_path_factory: pytest.TempPathFactory, tabletop: Path, problem: Han
         ({"episode": (3,)}, "no episode 3; there are 1, counted from 0"),
         (
             {"camera_topic": "front"},
-            "choose the wrist's camera with --camera-topic, .* --cameras: observation.images.wrist",
+            "choose the wrist's camera with --camera-topic, .* --further-cameras: observation.images.wrist",
         ),
         (
             {"joint_topic": "state"},

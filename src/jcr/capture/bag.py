@@ -70,12 +70,11 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         arm = None if options.urdf is None else _joint_track(joint_states, options, path)
         poses_at = tree.poses_at(options.base_frame, options.gripper_frame, path) if arm is None else arm.at
         frames = options.base_frame, options.gripper_frame
-        mounts: dict[str, Mount | None] = {
-            topic: tree.mount_of(recorded[topic].frame, *frames, recorded[topic].some(), path)
-            if len(topics) > 1
-            else None
-            for topic in topics
-        } | {topic: mount for topic, mount in asked.items() if mount is not None}
+        mounts = dict[str, Mount | None].fromkeys(topics)
+        if len(topics) > 1:
+            for name in topics:
+                mounts[name] = tree.mount_of(recorded[name].frame, *frames, recorded[name].some(), path)
+        mounts.update((name, mount) for name, mount in asked.items() if mount is not None)
         topic, *others = _chosen(topics, options, asked, mounts, path)
         stamps = recorded[topic].sorted()[0]
         poses, gap_ns = poses_at(stamps)
@@ -280,7 +279,7 @@ def _camera_topics(reader: Any, options: ReadOptions, asked: list[str], path: Pa
     """Topics whose images may be wanted: those that were asked for, or all with colour images."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
     if options.camera_topic in asked:
-        raise InputError(f"{path}: --cameras {options.camera_topic}: is the wrist's camera already")
+        raise InputError(f"{path}: --further-cameras {options.camera_topic}: is the wrist's camera already")
     for topic in (options.camera_topic, *asked):
         if topic is not None and topic not in topics:
             raise InputError(
@@ -325,8 +324,8 @@ def _chosen(
             words = {"gripper": "moves with the gripper", "base": "stands still", None: "tf does not tell"}
             listed = ", ".join(f"{topic} ({words[mounts[topic]]})" for topic in left)
             raise InputError(
-                f"{path}: {len(left)} topics with images; choose one with --camera-topic, further ones with --cameras: "
-                f"{listed or 'all are named by --cameras'}"
+                f"{path}: {len(left)} topics with images; choose one with --camera-topic, further ones with "
+                f"--further-cameras: {listed or 'all are named by --further-cameras'}"
             )
         own = on_gripper[0]
         if not asked:
@@ -334,8 +333,8 @@ def _chosen(
     for topic in asked:
         if mounts[topic] is None:
             raise InputError(
-                f"{path}: tf does not tell what carries the camera of {topic}; write --cameras {topic}=base for a fixed "
-                f"one, {topic}=gripper for one on the gripper"
+                f"{path}: tf does not tell what carries the camera of {topic}; write --further-cameras {topic}=base for "
+                f"a fixed one, {topic}=gripper for one on the gripper"
             )
     return [own, *asked]
 

@@ -75,8 +75,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     for name, (other, mount) in zip(further, asked.items(), strict=True):
         if mount is None:
             raise InputError(
-                f"{path}: a data set does not tell what carries {other}; write --cameras {other}=base for a fixed "
-                f"camera, {other}=gripper for one on the gripper"
+                f"{path}: a data set does not tell what carries {other}; write --further-cameras {other}=base for a "
+                f"fixed camera, {other}=gripper for one on the gripper"
             )
         theirs = [read_episode(path, info, other, key, index) for index in options.episode]
         others.append(RecordedCamera(name, mount, pictures_of(other, theirs), lambda _: None))
@@ -102,15 +102,15 @@ def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str]
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
     listed = ", ".join(cameras) or "no videos or pictures"
     if unknown := [key for key in asked if key not in cameras]:
-        raise InputError(f"{path}: --cameras {unknown[0]}: there are {listed}")
+        raise InputError(f"{path}: --further-cameras {unknown[0]}: there are {listed}")
     if options.camera_topic in asked:
-        raise InputError(f"{path}: --cameras {options.camera_topic}: is the wrist's camera already")
+        raise InputError(f"{path}: --further-cameras {options.camera_topic}: is the wrist's camera already")
     left = [key for key in cameras if key not in asked]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
     if options.camera_topic is not None or len(left) != 1:
         raise InputError(
-            f"{path}: choose the wrist's camera with --camera-topic, further ones with --cameras: {listed}"
+            f"{path}: choose the wrist's camera with --camera-topic, further ones with --further-cameras: {listed}"
         )
     return left[0]
 

@@ -42,17 +42,19 @@ class RecordedCamera:
 
 
 def asked_cameras(options: ReadOptions) -> dict[str, Mount | None]:
-    """What --cameras names: by topic or key what carries the camera, None where the recording is to tell."""
+    """What --further-cameras names: by topic or key what carries the camera, None where the recording is to tell."""
     asked: dict[str, Mount | None] = {}
-    for text in options.cameras:
+    for text in options.further_cameras:
         key, _, said = text.partition("=")
-        mount = next((mount for mount in MOUNTS if mount == said), None)
+        mount: Mount | None = None
+        for known in MOUNTS:
+            mount = known if said == known else mount
         if said and mount is None:
             raise InputError(
-                f"--cameras {text}: write {key}=gripper for a camera on the gripper, {key}=base for a fixed one"
+                f"--further-cameras {text}: write {key}=gripper for a camera on the gripper, {key}=base for a fixed one"
             )
         if key in asked:
-            raise InputError(f"--cameras {text}: names {key} twice")
+            raise InputError(f"--further-cameras {text}: names {key} twice")
         asked[key] = mount
     return asked
 

@@ -77,8 +77,9 @@ class TfTree:
         known = self.frames()
         if frame not in known or base not in known or gripper not in known:
             return None
-        for mount, parent in (("gripper", gripper), ("base", base)):
-            if self._to_root(parent)[-1] != self._to_root(frame)[-1]:
+        pairs: tuple[tuple[Mount, str | None], ...] = (("gripper", gripper), ("base", base))
+        for mount, parent in pairs:
+            if parent is None or self._to_root(parent)[-1] != self._to_root(frame)[-1]:
                 continue
             poses, gap = self.poses_at(parent, frame, source)(stamp_ns)
             poses = poses[gap < NEVER]

@@ -37,6 +37,9 @@ def posed_cameras(
         ):
             continue
         used = [k for k, picture in enumerate(found.pictures) if picture.used]
+        beside = None
+        if camera.frame is not None:
+            beside = tuple(int(np.flatnonzero(rows == camera.frame[k])[0]) for k in used)
         poses = np.stack([_pose(camera, found, k, grippers, bases) for k in used])
         out.append(
             PosedImages(
@@ -46,6 +49,7 @@ def posed_cameras(
                 found.intrinsics.record(),
                 NOTHING,
                 np.zeros((0, 3)),
+                beside,
             )
         )
     return out
