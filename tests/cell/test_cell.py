@@ -10,15 +10,21 @@ import pytest
 
 import jcr
 from jcr.calibration.intrinsics_prior import HELD, prior_of
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.capture_json import read, write
+from jcr.cell import alone
 from jcr.cell.added import camera_of
 from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
+from jcr.cell.found import CameraFound, PictureFound
 from jcr.cell.stage import place_cameras
 from jcr.cell.ties import Answer, Tie, tied
+from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.handeye.systematic import smooth_errors
+from jcr.progress import silent
+from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
@@ -194,6 +200,55 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert "it is not fixed" in found.cameras[1].warnings[0]
     untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
     assert "not to be trusted" in untrusted.cameras[0].warnings[0]
+
+
+def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictures(
+    calibrated, monkeypatch, tabletop: Path
+):
+    """Its reconstruction has a frame and a unit of its own; two of its pictures were left out."""
+    old, reconstruction, hand_eye = calibrated
+    frame = np.array([0, 1, 3, 4, 5, 7, 8])
+    second = CellCamera(
+        "second", "gripper", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+    )
+    move = transform(rotation_exp(np.array([1.0, 0.2, -0.4])), np.array([0.5, 0.0, 2.0]))
+    its_own = scale_translation(move @ reconstruction.recon_from_camera[frame], 2.5)
+    whole = replace(
+        reconstruction,
+        image_index=np.arange(len(frame)),
+        recon_from_camera=its_own,
+        points_in_recon=reconstruction.points_in_recon[frame],
+        confidence=reconstruction.confidence[frame],
+        colors=reconstruction.colors[frame],
+        tracks=replace(reconstruction.tracks, points_in_recon=apply(its_own[0], np.eye(3) + 1.0)),
+    )
+    asked: list[Capture] = []
+
+    def reconstruct(capture: Capture, *_: object) -> Reconstruction:
+        asked.append(capture)
+        return whole
+
+    monkeypatch.setattr(alone, "reconstruct", reconstruct)
+    nothing = CameraFound(
+        "second", "gripper", None, tuple(PictureFound(i, False, 3, None, "few") for i in second.images)
+    )
+    assert alone.sees_another_scene(second, nothing)
+    assert not alone.sees_another_scene(replace(second, mount="base"), nothing)
+    found = alone.calibrated_elsewhere(old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent)
+    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    assert (asked[0].base_from_gripper == old.base_from_gripper[frame]).all() and asked[0].mount == "gripper"
+    assert found.converged and found.parent_from_camera is not None
+    assert np.abs(step_between(found.parent_from_camera, x)).max() < 1e-3
+    assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.pictures) == len(frame)
+
+    def refuse(*_: object) -> Reconstruction:
+        raise NotTrustedError("2 of 7 images could be registered")
+
+    monkeypatch.setattr(alone, "reconstruct", refuse)
+    refused = alone.calibrated_elsewhere(
+        old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent
+    )
+    assert not refused.converged and refused.warnings[0].endswith("2 of 7 images could be registered")
 
 
 @pytest.fixture

@@ -36,7 +36,13 @@ def posed_cameras(
             or camera.watches_gripper
         ):
             continue
-        used = [k for k, picture in enumerate(found.pictures) if picture.used]
+        used = [
+            k
+            for k, picture in enumerate(found.pictures)
+            if picture.used and (camera.frame is None or int(camera.frame[k]) in grippers)
+        ]
+        if not used:
+            continue
         beside = None
         if camera.frame is not None:
             beside = tuple(int(np.flatnonzero(rows == camera.frame[k])[0]) for k in used)
