@@ -1,6 +1,7 @@
 """Further cameras of a cell: the truth of simulated cells within sigma, pictures placed or refused with the reason."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from jcr.calibration.intrinsics_prior import HELD, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
+from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
 from jcr.cell import alone
-from jcr.cell.added import camera_of
+from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
+from jcr.cell.cameras_json import read_cameras
 from jcr.cell.found import CameraFound, PictureFound
 from jcr.cell.stage import place_cameras
 from jcr.cell.ties import Answer, Tie, tied
@@ -332,3 +335,32 @@ def test_pictures_of_two_sizes_are_not_one_camera(folder: Path):
     for name in ("../a", "", "a/b", "1"):  # it becomes the name of a folder
         with pytest.raises(jcr.InputError, match="begins with a letter"):
             camera_of(name, [folder / "0.png"], None, ())
+
+
+@pytest.mark.parametrize("name", ["added/added.json", "cameras/cameras.json", "cameras.json"])
+@pytest.mark.parametrize("fault", ["pipe", "folder", "link", "text", "number", "parent"])
+def test_what_has_the_name_of_a_file_of_the_run_is_not_taken_for_none(
+    folder: Path, tmp_path: Path, name: str, fault: str
+):
+    (folder / "capture.json").write_text(json.dumps(content()))
+    capture, run = read(folder), tmp_path / "run"
+    readers = {
+        "added/added.json": lambda: read_added(run, capture),
+        "cameras/cameras.json": lambda: read_added_cameras(run, capture),
+        "cameras.json": lambda: read_cameras(run),
+    }
+    nothing = readers[name]()
+    assert not nothing
+    file = run / name
+    if fault == "parent":
+        file.parent.parent.mkdir(parents=True, exist_ok=True)
+        file.parent.write_text("")
+    else:
+        file.parent.mkdir(parents=True)
+    if fault in ("text", "number"):
+        file.write_text({"text": "{", "number": "7"}[fault])
+    elif fault != "parent":
+        {"pipe": os.mkfifo, "folder": os.mkdir, "link": lambda f: os.symlink("nowhere", f)}[fault](file)
+    with pytest.raises(jcr.InputError) as refusal:
+        readers[name]()
+    assert "\n" not in str(refusal.value) and "run" in str(refusal.value)
