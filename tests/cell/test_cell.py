@@ -16,7 +16,7 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
-from jcr.cell import alone
+from jcr.cell import alone, carried
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
 from jcr.cell.cameras_json import read_cameras
@@ -197,10 +197,11 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     cv2.imwrite(str(tmp_path / "other.png"), cv2.resize(noise, old.image_size, interpolation=cv2.INTER_CUBIC))
     another = replace(fixed(old, "other.png"), name="other", folder=tmp_path)
     moving = fixed(old, old.images[2], old.images[5])
-    found = place_cameras(old, [another, moving], reconstruction, hand_eye)
-    assert [camera.converged for camera in found.cameras] == [False, False]
+    unknown = replace(moving, name="unknown", intrinsics=None)
+    found = place_cameras(old, [another, moving, unknown], reconstruction, hand_eye)
+    assert [camera.converged for camera in found.cameras] == [False, False, False]
     assert "must see the same scene" in found.cameras[0].warnings[0]
-    assert "it is not fixed" in found.cameras[1].warnings[0]
+    assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
     untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
     assert "not to be trusted" in untrusted.cameras[0].warnings[0]
 
@@ -252,6 +253,37 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent
     )
     assert not refused.converged and refused.warnings[0].endswith("2 of 7 images could be registered")
+
+
+def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera(
+    calibrated, monkeypatch, tmp_path: Path
+):
+    """One capture has both: of eight of its nine poses there is a picture of what the gripper carries."""
+    old, reconstruction, _ = calibrated
+    frame = np.array([0, 1, 2, 3, 5, 6, 7, 8])
+    front = CellCamera(
+        "front", "base", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+    )
+    base_from_camera = transform(rotation_exp(np.array([-1.9, 0.2, 0.3])), np.array([1.2, 0.1, 0.5]))
+    gripper_from_object = transform(rotation_exp(np.array([0.2, 0.5, 1.0])), np.array([0.0, 0.02, 0.15]))
+    seen_from = inverse(old.base_from_gripper[frame] @ gripper_from_object) @ base_from_camera
+    whole = replace(
+        reconstruction,
+        image_index=np.arange(len(frame)),
+        recon_from_camera=scale_translation(seen_from, 1 / SCALE),
+        points_in_recon=reconstruction.points_in_recon[frame],
+        confidence=reconstruction.confidence[frame],
+        colors=reconstruction.colors[frame],
+        tracks=replace(reconstruction.tracks, points_in_recon=0.05 * np.eye(3)),
+    )
+    monkeypatch.setattr(carried, "reconstruct", lambda *_: whole)
+    monkeypatch.setattr(carried, "write_moving_parts", lambda *_: None)
+    found = carried.calibrated_alone(old, front, tmp_path, ReconstructOptions(), CalibrateOptions(), silent)
+    assert found.converged and found.mount == "base" and found.parent_from_camera is not None
+    assert np.abs(step_between(found.parent_from_camera, base_from_camera)).max() < 1e-3
+    away = np.linalg.norm(old.base_from_gripper[frame, :3, 3] - base_from_camera[:3, 3], axis=1)
+    assert found.scene_distance is not None and 0 < found.scene_distance < away.max() + 0.3
+    assert [picture.image for picture in found.pictures] == list(front.images)
 
 
 @pytest.fixture

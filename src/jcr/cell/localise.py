@@ -2,29 +2,39 @@
 
 Features that it shares with two or more images of known pose become points; the picture's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures.
+bundle adjustment of all pictures. Where SIFT finds few, points of the map's dense depth are added that one image of
+known pose shows, then learned features if they are installed.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import project
+from jcr.camera import project, unproject
 from jcr.geometry import apply, inverse, transform
 from jcr.match.verify import HALF_PIXEL
+from jcr.match.weights import LIGHTERGLUE, XFEAT
 from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, matches, triangulated
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
+
+if TYPE_CHECKING:
+    from jcr.match.learned import LearnedFeatures
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera of which nothing is known: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
+FEW = 120
+"""Points below which more are looked for, of dense depth and by networks."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,73 @@ class Known:
     lens: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
     found: tuple[Features, ...]
+    surface: "Surface | None" = None
+    learned: "Learned | None" = None
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Pointmaps of the images of known pose."""
+
+    points_in_recon: Float[ndarray, "m h w 3"]
+    valid: Bool[ndarray, "m h w"]
+    pinhole: Intrinsics
+    """Their pixels."""
+
+    def at(
+        self, row: Int[ndarray, " c"], rays: Float[ndarray, "c 2"]
+    ) -> tuple[Float[ndarray, "c 3"], Bool[ndarray, " c"]]:
+        """What each ray (x/z, y/z) of an image meets, and whether that is known."""
+        h, w = self.valid.shape[1:]
+        pinhole = self.pinhole
+        u = np.rint(pinhole.fx * rays[:, 0] + pinhole.cx).astype(int)
+        v = np.rint(pinhole.fy * rays[:, 1] + pinhole.cy).astype(int)
+        inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+        u, v = np.clip(u, 0, w - 1), np.clip(v, 0, h - 1)
+        return self.points_in_recon[row, v, u].astype(float), inside & self.valid[row, v, u]
+
+
+class Learned:
+    """Matches by a network between the images of known pose, turned alike, and a picture."""
+
+    def __init__(
+        self, images: Sequence[UInt8[ndarray, "h w 3"]], recon_from_camera: Float[ndarray, "m 4 4"]
+    ) -> None:
+        self._images = images
+        # The networks take little turning: one direction of the scene is turned to the right in all of them.
+        self._right = recon_from_camera[0, :3, 0]
+        self._rolls = [self._roll(pose) for pose in recon_from_camera]
+        self._features: LearnedFeatures | None = None
+
+    def _roll(self, recon_from_camera: Float[ndarray, "4 4"]) -> float:
+        x, y, _ = recon_from_camera[:3, :3].T @ self._right
+        return -math.atan2(y, x)
+
+    def matched(
+        self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"] | None
+    ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
+        """Keypoints of a picture (px), and for each image of known pose which of them it shows, and where.
+
+        `near` is the picture's recon_from_camera, where something is known of it.
+        """
+        from jcr.match.learned import LearnedFeatures
+
+        if self._features is None:  # the networks are loaded where they are needed
+            self._features = LearnedFeatures("xfeat", self._images)
+        features, last = self._features, self._features.add(picture)
+
+        def of(image: int, roll: float) -> Int[ndarray, "c 2"]:
+            return features.match(image, last, self._rolls[image], roll)
+
+        if near is None:
+            tried = {0, len(self._images) // 2, len(self._images) - 1}
+            rolls = [quarter * math.pi / 2 for quarter in range(4)]
+            roll = max(rolls, key=lambda roll: sum(len(of(image, roll)) for image in tried))
+        else:
+            roll = self._roll(near)
+        rows = [of(image, roll) for image in range(len(self._images))]
+        pairs = [(theirs[:, 1], features.x_px[k][theirs[:, 0]]) for k, theirs in enumerate(rows)]
+        return features.x_px[last], pairs
 
 
 @dataclass(frozen=True)
@@ -52,10 +129,16 @@ class Shared:
 
 
 def known_images(
-    images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics, recon_from_camera: Float[ndarray, "m 4 4"]
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    lens: Intrinsics,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    surface: Surface | None = None,
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
-    return Known(lens, recon_from_camera, tuple(features(image, lens) for image in images))
+    installed = XFEAT.found() and LIGHTERGLUE.found() and find_spec("torch")
+    learned = Learned(images, recon_from_camera) if installed else None
+    found = tuple(features(image, lens) for image in images)
+    return Known(lens, recon_from_camera, found, surface, learned)
 
 
 def guessed_lens(size: tuple[int, int]) -> Intrinsics:
@@ -70,19 +153,69 @@ def localised(
 ) -> Shared | int:
     """The picture's place, or how few points it shares with the known images where these do not show it."""
     found = features(picture, lens)
-    pairs = [matches(found.descriptors, other.descriptors) for other in known.found]
-    feature = np.concatenate([mine for mine, _ in pairs])
-    row = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
-    rays, seen = (
-        np.concatenate([getattr(known.found[k], of)[theirs] for k, (_, theirs) in enumerate(pairs)])
-        for of in ("rays", "x_px")
+    of_image = [matches(found.descriptors, other.descriptors) for other in known.found]
+    seen = _Matched(
+        found.x_px,
+        np.concatenate([mine for mine, _ in of_image]),
+        np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
+        np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
     )
+    best = _located(known, seen, lens, lens_is_known, seed)
+    if _count(best) < FEW and known.surface is not None:
+        best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
+    if _count(best) < FEW and known.learned is not None:
+        near = None if isinstance(best, int) else best.recon_from_camera
+        seen = seen.and_those(*known.learned.matched(picture, near))
+        best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
+    return best
+
+
+def _count(found: Shared | int) -> int:
+    return found if isinstance(found, int) else len(found.x_px)
+
+
+@dataclass(frozen=True)
+class _Matched:
+    """Keypoints of a picture, and which image of known pose shows which of them where."""
+
+    x_px: Float[ndarray, "n 2"]
+    feature: Int[ndarray, " c"]
+    row: Int[ndarray, " c"]
+    row_x_px: Float[ndarray, "c 2"]
+
+    def and_those(
+        self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]
+    ) -> "_Matched":
+        """With the keypoints and matches of another kind of features."""
+        return _Matched(
+            np.concatenate([self.x_px, x_px]),
+            np.concatenate([self.feature, *(len(self.x_px) + mine for mine, _ in pairs)]),
+            np.concatenate([self.row, *(np.full(len(mine), k) for k, (mine, _) in enumerate(pairs))]),
+            np.concatenate([self.row_x_px, *(theirs for _, theirs in pairs)]),
+        )
+
+
+def _located(
+    known: Known,
+    seen: _Matched,
+    lens: Intrinsics,
+    lens_is_known: bool,
+    seed: int,
+    surface: Surface | None = None,
+) -> Shared | int:
+    """As `localised`, of what was matched; with a surface also by what one image alone shows."""
+    feature, row, count = seen.feature, seen.row, len(seen.x_px)
+    rays = unproject(known.lens, seen.row_x_px)[:, :2]
     gate = GATE_PX / known.lens.fx
-    points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, len(found.x_px))
+    points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, count)
+    if surface is not None:
+        on_surface, valid = surface.at(row, rays)
+        lone = np.flatnonzero(valid & ~good[feature])
+        points[feature[lone]], good[feature[lone]] = on_surface[lone], True
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     candidate = np.flatnonzero(good)
-    placed = _placed(found.x_px[candidate], points[candidate], lens, lens_is_known, seed)
+    placed = _placed(seen.x_px[candidate], points[candidate], lens, lens_is_known, seed)
     if placed is None:
         return 0
     recon_from_camera, lens, inlier = placed
@@ -97,17 +230,17 @@ def localised(
     )
     ahead = in_camera[:, 2] > 1e-6
     miss = np.full(len(row), np.inf)
-    miss[ahead] = np.linalg.norm(project(known.lens, in_camera[ahead]) - seen[ahead], axis=1)
+    miss[ahead] = np.linalg.norm(project(known.lens, in_camera[ahead]) - seen.row_x_px[ahead], axis=1)
     kept = (miss < GATE_PX) & np.isin(feature, agreed)
-    number = np.zeros(len(found.x_px), int)
+    number = np.zeros(count, int)
     number[agreed] = np.arange(len(agreed))
     return Shared(
         recon_from_camera,
         lens,
         points[agreed],
-        found.x_px[agreed],
+        seen.x_px[agreed],
         row[kept],
-        seen[kept],
+        seen.row_x_px[kept],
         number[feature[kept]],
     )
 
