@@ -2,8 +2,8 @@
 
 Features that it shares with two or more images of known pose become points; the picture's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures. Where SIFT finds few, points of the map's dense depth are added that one image of
-known pose shows, then learned features if they are installed.
+bundle adjustment of all pictures. Where SIFT finds few, learned features are added if they are installed, then points of
+the map's dense depth that one image of known pose shows.
 """
 
 import math
@@ -34,7 +34,11 @@ LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
 FEW = 120
-"""Points below which more are looked for, of dense depth and by networks."""
+"""Points below which more are looked for, by networks and of dense depth."""
+
+
+LEAST_BY_SIFT = 10
+"""Points with which a place by learned features must agree: to a network a board of the same kind is the same board."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +163,14 @@ def localised(
         np.concatenate([mine for mine, _ in of_image]),
         np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
         np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
+        len(found.x_px),
     )
     best = _located(known, seen, lens, lens_is_known, seed)
-    if _count(best) < FEW and known.surface is not None:
-        best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
     if _count(best) < FEW and known.learned is not None:
         near = None if isinstance(best, int) else best.recon_from_camera
         seen = seen.and_those(*known.learned.matched(picture, near))
+        best = max(best, _located(known, seen, lens, lens_is_known, seed), key=_count)
+    if _count(best) < FEW and known.surface is not None:
         best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
     return best
 
@@ -182,6 +187,8 @@ class _Matched:
     feature: Int[ndarray, " c"]
     row: Int[ndarray, " c"]
     row_x_px: Float[ndarray, "c 2"]
+    by_sift: int
+    """How many of the keypoints, the first, are of SIFT."""
 
     def and_those(
         self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]
@@ -192,6 +199,7 @@ class _Matched:
             np.concatenate([self.feature, *(len(self.x_px) + mine for mine, _ in pairs)]),
             np.concatenate([self.row, *(np.full(len(mine), k) for k, (mine, _) in enumerate(pairs))]),
             np.concatenate([self.row_x_px, *(theirs for _, theirs in pairs)]),
+            self.by_sift,
         )
 
 
@@ -208,6 +216,7 @@ def _located(
     rays = unproject(known.lens, seen.row_x_px)[:, :2]
     gate = GATE_PX / known.lens.fx
     points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, count)
+    by_sift = np.flatnonzero(good[: seen.by_sift])
     if surface is not None:
         on_surface, valid = surface.at(row, rays)
         lone = np.flatnonzero(valid & ~good[feature])
@@ -222,6 +231,8 @@ def _located(
     if inlier.sum() < MIN_POINTS:
         return int(inlier.sum())
     agreed = candidate[inlier]
+    if (borne_out := int(np.isin(by_sift, agreed).sum())) < LEAST_BY_SIFT:
+        return borne_out
     # Of the known images' observations those that the point meets.
     in_camera = np.einsum(
         "cji,cj->ci",
