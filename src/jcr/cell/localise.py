@@ -2,8 +2,9 @@
 
 Features that it shares with two or more images of known pose become points; the picture's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures. Where SIFT finds few, learned features are added if they are installed, then points of
-the map's dense depth that one image of known pose shows.
+bundle adjustment of all pictures. Where SIFT finds few, learned features are added if they are installed; where there is
+no place yet, points of the map's dense depth that one image of known pose shows. (Beside enough others these made it no
+better: two views of a point do not hold its depth.)
 """
 
 import math
@@ -34,7 +35,7 @@ LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
 FEW = 120
-"""Points below which more are looked for, by networks and of dense depth."""
+"""Points by SIFT below which networks look for more."""
 
 
 LEAST_BY_SIFT = 10
@@ -170,7 +171,7 @@ def localised(
         near = None if isinstance(best, int) else best.recon_from_camera
         seen = seen.and_those(*known.learned.matched(picture, near))
         best = max(best, _located(known, seen, lens, lens_is_known, seed), key=_count)
-    if _count(best) < FEW and known.surface is not None:
+    if isinstance(best, int) and known.surface is not None:
         best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
     return best
 
