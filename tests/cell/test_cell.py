@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ import jcr
 from jcr.calibration.intrinsics_prior import HELD, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.camera import parameters, project, with_parameters
+from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
 from jcr.cell import alone, carried, localise
@@ -28,6 +29,7 @@ from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_b
 from jcr.handeye.systematic import smooth_errors
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.relocate import Features
 from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
@@ -286,38 +288,37 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
     assert [picture.image for picture in found.pictures] == list(front.images)
 
 
-def test_dense_depth_and_networks_help_where_sift_finds_few():
-    """Of 60 points one image of known pose each shows what the picture does; of 20 more both do."""
+@pytest.mark.parametrize("turned", [False, True])
+def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, turned: bool):
+    """Of a picture 40 points by SIFT are shared; a network finds 60 more, or the same board turned by half a turn."""
     rng = np.random.default_rng(3)
     lens = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
-    ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (80, 3))
+    ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))
     poses = np.stack([np.eye(4), transform(rotation_exp(np.array([0, 0.1, 0])), np.array([-0.1, 0, 0]))])
     place = transform(rotation_exp(np.array([0.0, -0.1, 0.3])), np.array([0.1, 0.02, 0.05]))
-    both = np.arange(60, 80)
-    feature = np.concatenate([np.arange(80), both])
-    row = np.concatenate([np.arange(80) % 2, 1 - both % 2])
-    row_x_px = np.stack(
-        [project(lens, apply(inverse(poses[r]), ahead[[f]]))[0] for f, r in zip(feature, row, strict=True)]
-    )
     shown = project(lens, apply(inverse(place), ahead))
-    seen = localise._Matched(shown, feature, row, row_x_px, 80)
-    grid = np.full((2, 480, 640), False)
-    maps = np.zeros((2, 480, 640, 3), np.float32)
-    for f, r, (u, v) in zip(feature, row, np.rint(row_x_px).astype(int), strict=True):
-        grid[r, v, u], maps[r, v, u] = True, ahead[f]
-    known = localise.Known(lens, poses, ())
-    assert localise._located(known, seen, lens, True, 0) == 20
-    surface = localise.Surface(maps, grid, lens)
-    found = localise._located(known, seen, lens, True, 0, surface)
-    assert isinstance(found, localise.Shared) and len(found.x_px) >= 75
-    assert np.abs(step_between(found.recon_from_camera, place)).max() < 1e-3
-    # What only a network matched, and SIFT nowhere bears out, may be a thing that looks alike.
-    by_network = replace(seen, by_sift=0)
-    assert localise._located(known, by_network, lens, True, 0, surface) == 0
-    more = replace(seen, feature=feature[:0], row=row[:0], row_x_px=row_x_px[:0]).and_those(
-        shown, [(feature[row == r], row_x_px[row == r]) for r in range(2)]
+    in_rows = [project(lens, apply(inverse(pose), ahead)) for pose in poses]
+
+    def by_sift(x_px: np.ndarray) -> Features:
+        return Features(x_px[:40], unproject(lens, x_px[:40])[:, :2], np.eye(128, dtype=np.float32)[:40])
+
+    half_turn = [lens.cx, lens.cy] - (shown[40:] - [lens.cx, lens.cy])
+    learned = SimpleNamespace(
+        matched=lambda *_: (
+            half_turn if turned else shown[40:],
+            [(np.arange(60), x_px[40:]) for x_px in in_rows],
+        )
     )
-    assert more.feature.min() == 80 and len(more.x_px) == 160 and more.by_sift == 80
+    monkeypatch.setattr(localise, "features", lambda *_: by_sift(shown))
+    known = localise.Known(lens, poses, tuple(map(by_sift, in_rows)), learned)  # type: ignore[arg-type]
+    found = localise.localised(known, np.zeros((480, 640, 3), np.uint8), lens, True)
+    assert isinstance(found, localise.Shared) and len(found.x_px) == (40 if turned else 100)
+    assert np.abs(step_between(found.recon_from_camera, place)).max() < 1e-6
+    # Without a place by SIFT there is none, whatever the network finds.
+    few = replace(
+        known, found=tuple(Features(f.x_px[:9], f.rays[:9], f.descriptors[:9]) for f in known.found)
+    )
+    assert localise.localised(few, np.zeros((480, 640, 3), np.uint8), lens, True) == 9
 
 
 @pytest.fixture

@@ -2,9 +2,9 @@
 
 Features that it shares with two or more images of known pose become points; the picture's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures. Where SIFT finds few, learned features are added if they are installed; where there is
-no place yet, points of the map's dense depth that one image of known pose shows. (Beside enough others these made it no
-better: two views of a point do not hold its depth.)
+bundle adjustment of all pictures. A place that rests on few points by SIFT is refined with learned features, where these
+are installed. They alone place nothing: to a network another board of the same kind is the same board, and so is a board
+turned by half a turn (docs/cameras.md).
 """
 
 import math
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import project, unproject
-from jcr.geometry import apply, inverse, transform
+from jcr.geometry import apply, inverse, step_between, transform
 from jcr.match.verify import HALF_PIXEL
 from jcr.match.weights import LIGHTERGLUE, XFEAT
 from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, matches, triangulated
@@ -36,10 +36,8 @@ LEAST_SPREAD = 0.05
 TRIALS = 20_000
 FEW = 120
 """Points by SIFT below which networks look for more."""
-
-
-LEAST_BY_SIFT = 10
-"""Points with which a place by learned features must agree: to a network a board of the same kind is the same board."""
+SAME_VIEW = np.radians(5.0)
+"""By which the place with these may be turned against that without."""
 
 
 @dataclass(frozen=True)
@@ -49,30 +47,7 @@ class Known:
     lens: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
     found: tuple[Features, ...]
-    surface: "Surface | None" = None
     learned: "Learned | None" = None
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Pointmaps of the images of known pose."""
-
-    points_in_recon: Float[ndarray, "m h w 3"]
-    valid: Bool[ndarray, "m h w"]
-    pinhole: Intrinsics
-    """Their pixels."""
-
-    def at(
-        self, row: Int[ndarray, " c"], rays: Float[ndarray, "c 2"]
-    ) -> tuple[Float[ndarray, "c 3"], Bool[ndarray, " c"]]:
-        """What each ray (x/z, y/z) of an image meets, and whether that is known."""
-        h, w = self.valid.shape[1:]
-        pinhole = self.pinhole
-        u = np.rint(pinhole.fx * rays[:, 0] + pinhole.cx).astype(int)
-        v = np.rint(pinhole.fy * rays[:, 1] + pinhole.cy).astype(int)
-        inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-        u, v = np.clip(u, 0, w - 1), np.clip(v, 0, h - 1)
-        return self.points_in_recon[row, v, u].astype(float), inside & self.valid[row, v, u]
 
 
 class Learned:
@@ -92,11 +67,11 @@ class Learned:
         return -math.atan2(y, x)
 
     def matched(
-        self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"] | None
+        self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
     ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
         """Keypoints of a picture (px), and for each image of known pose which of them it shows, and where.
 
-        `near` is the picture's recon_from_camera, where something is known of it.
+        `near` is about its recon_from_camera.
         """
         from jcr.match.learned import LearnedFeatures
 
@@ -104,16 +79,8 @@ class Learned:
             self._features = LearnedFeatures("xfeat", self._images)
         features, last = self._features, self._features.add(picture)
 
-        def of(image: int, roll: float) -> Int[ndarray, "c 2"]:
-            return features.match(image, last, self._rolls[image], roll)
-
-        if near is None:
-            tried = {0, len(self._images) // 2, len(self._images) - 1}
-            rolls = [quarter * math.pi / 2 for quarter in range(4)]
-            roll = max(rolls, key=lambda roll: sum(len(of(image, roll)) for image in tried))
-        else:
-            roll = self._roll(near)
-        rows = [of(image, roll) for image in range(len(self._images))]
+        roll = self._roll(near)
+        rows = [features.match(image, last, self._rolls[image], roll) for image in range(len(self._images))]
         pairs = [(theirs[:, 1], features.x_px[k][theirs[:, 0]]) for k, theirs in enumerate(rows)]
         return features.x_px[last], pairs
 
@@ -137,13 +104,12 @@ def known_images(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     lens: Intrinsics,
     recon_from_camera: Float[ndarray, "m 4 4"],
-    surface: Surface | None = None,
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
     installed = XFEAT.found() and LIGHTERGLUE.found() and find_spec("torch")
     learned = Learned(images, recon_from_camera) if installed else None
     found = tuple(features(image, lens) for image in images)
-    return Known(lens, recon_from_camera, found, surface, learned)
+    return Known(lens, recon_from_camera, found, learned)
 
 
 def guessed_lens(size: tuple[int, int]) -> Intrinsics:
@@ -164,20 +130,16 @@ def localised(
         np.concatenate([mine for mine, _ in of_image]),
         np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
         np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
-        len(found.x_px),
     )
     best = _located(known, seen, lens, lens_is_known, seed)
-    if _count(best) < FEW and known.learned is not None:
-        near = None if isinstance(best, int) else best.recon_from_camera
-        seen = seen.and_those(*known.learned.matched(picture, near))
-        best = max(best, _located(known, seen, lens, lens_is_known, seed), key=_count)
-    if isinstance(best, int) and known.surface is not None:
-        best = max(best, _located(known, seen, lens, lens_is_known, seed, known.surface), key=_count)
-    return best
-
-
-def _count(found: Shared | int) -> int:
-    return found if isinstance(found, int) else len(found.x_px)
+    if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None:
+        return best
+    seen = seen.and_those(*known.learned.matched(picture, best.recon_from_camera))
+    more = _located(known, seen, lens, lens_is_known, seed)
+    if isinstance(more, int) or len(more.x_px) <= len(best.x_px):
+        return best
+    turned = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
+    return more if turned < SAME_VIEW else best
 
 
 @dataclass(frozen=True)
@@ -188,8 +150,6 @@ class _Matched:
     feature: Int[ndarray, " c"]
     row: Int[ndarray, " c"]
     row_x_px: Float[ndarray, "c 2"]
-    by_sift: int
-    """How many of the keypoints, the first, are of SIFT."""
 
     def and_those(
         self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]
@@ -200,7 +160,6 @@ class _Matched:
             np.concatenate([self.feature, *(len(self.x_px) + mine for mine, _ in pairs)]),
             np.concatenate([self.row, *(np.full(len(mine), k) for k, (mine, _) in enumerate(pairs))]),
             np.concatenate([self.row_x_px, *(theirs for _, theirs in pairs)]),
-            self.by_sift,
         )
 
 
@@ -210,18 +169,12 @@ def _located(
     lens: Intrinsics,
     lens_is_known: bool,
     seed: int,
-    surface: Surface | None = None,
 ) -> Shared | int:
-    """As `localised`, of what was matched; with a surface also by what one image alone shows."""
+    """As `localised`, of what was matched."""
     feature, row, count = seen.feature, seen.row, len(seen.x_px)
     rays = unproject(known.lens, seen.row_x_px)[:, :2]
     gate = GATE_PX / known.lens.fx
     points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, count)
-    by_sift = np.flatnonzero(good[: seen.by_sift])
-    if surface is not None:
-        on_surface, valid = surface.at(row, rays)
-        lone = np.flatnonzero(valid & ~good[feature])
-        points[feature[lone]], good[feature[lone]] = on_surface[lone], True
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     candidate = np.flatnonzero(good)
@@ -232,8 +185,6 @@ def _located(
     if inlier.sum() < MIN_POINTS:
         return int(inlier.sum())
     agreed = candidate[inlier]
-    if (borne_out := int(np.isin(by_sift, agreed).sum())) < LEAST_BY_SIFT:
-        return borne_out
     # Of the known images' observations those that the point meets.
     in_camera = np.einsum(
         "cji,cj->ci",

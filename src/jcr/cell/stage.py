@@ -24,7 +24,6 @@ from jcr.cell.localise import (
     LEAST_SPREAD,
     Known,
     Shared,
-    Surface,
     distance,
     guessed_lens,
     known_images,
@@ -83,9 +82,7 @@ def place_cameras(
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
     own = scale_translation(reconstruction.recon_from_camera[used], hand_eye.scale)
     images = [read_image(capture.folder / capture.images[row]) for row in rows]
-    known = known_images(
-        images, reconstruction.intrinsics, own, _surface(reconstruction, used, hand_eye.scale)
-    )
+    known = known_images(images, reconstruction.intrinsics, own)
     found: dict[str, list[Shared | int]] = {camera.name: [] for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress, "other cameras", todo):
@@ -120,14 +117,6 @@ def place_cameras(
         transform, covariance = answer.transform(lambda p, k=k: p.z[0] @ inverse(p.z[k]))
         arms.append(ArmFound(arm, transform, covariance))
     return CellFound(tuple(cameras[camera.name] for camera in others), tuple(arms), answer, of)
-
-
-def _surface(reconstruction: Reconstruction, used: Int[ndarray, " m"], scale: float) -> Surface | None:
-    """The dense depth of the images that are used, in metres; None where there is none."""
-    valid = reconstruction.confidence[used] > 0
-    if not valid.any():
-        return None
-    return Surface(scale * reconstruction.points_in_recon[used], valid, reconstruction.pointmap_intrinsics)
 
 
 @dataclass(frozen=True)
