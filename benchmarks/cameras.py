@@ -235,7 +235,9 @@ def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Seq
         "Simulated: arms of UR5e kinematics, white: random errors of 0.5 mm and 0.1°; typical: joint offsets of 0.1° "
         "and link errors of 0.3 mm, the truth then the effective transform. Points of a table (of a box of "
         f"{_box()} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
-        "length, 0.5 % of the width). No pictures: what bundle adjustment and the robots make of them.",
+        "length, 0.5 % of the width). No pictures: what bundle adjustment and the robots make of them. σ also counts "
+        "what features of real pictures leave wrong in the intrinsics, and systematic errors of any arm: why squared "
+        "distance / 6 is below 1 here is in docs/cameras.md.",
         "",
         "| cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ | "
         "squared distance / 6 |",

@@ -277,10 +277,11 @@ def write_lerobot(
     names: list[str],
     fps: int = 10,
     codec: str | None = "libsvtav1",
+    further: dict[str, list[np.ndarray]] | None = None,
 ) -> Path:
     """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video.
 
-    Without a codec the pictures are in the table, as PNG files.
+    Without a codec the pictures are in the table, as PNG files; there may then be `further` cameras, for all frames.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -295,6 +296,7 @@ def write_lerobot(
         key: {"dtype": "float32", "shape": [len(names)], "names": {"axes": names}},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
+    features |= {name: features[camera] for name in further or {}}
     info = {"codebase_version": version, "robot_type": "arm", "fps": fps, "features": features}
     info |= {"total_episodes": len(episodes), "chunks_size": 1000}
     v3 = version.startswith("v3")
@@ -318,6 +320,10 @@ def write_lerobot(
                 {"bytes": encode_png(picture), "path": f"{index}_{k}.png"}
                 for index, _ in rows
                 for k, picture in enumerate(episodes[index][0])
+            ]
+        for name, pictures in (further or {}).items():
+            columns[name] = [
+                {"bytes": encode_png(np.ascontiguousarray(picture)), "path": "x.png"} for picture in pictures
             ]
         return pa.table(columns)
 

@@ -251,6 +251,7 @@ def _cameras(
     progress: Progress,
     folder: RunFolder,
 ) -> CamerasFile | None:
+    from jcr.cell.alone import calibrated_elsewhere, sees_another_scene
     from jcr.cell.stage import place_cameras
 
     others = (*result.capture.others, *added)
@@ -261,6 +262,17 @@ def _cameras(
         result.capture, of_scene, result.reconstruction, result.hand_eye, options.calibrate, progress
     )
     by_name = {camera.name: camera for camera in found.cameras}
+    for camera in of_scene:
+        shared = by_name[camera.name]
+        if result.hand_eye.converged and sees_another_scene(camera, shared):
+            by_name[camera.name] = calibrated_elsewhere(
+                result.capture,
+                camera,
+                shared,
+                _with_dense(options, False).reconstruct,
+                options.calibrate,
+                progress,
+            )
     by_name |= {
         camera.name: _watching(result.capture, camera, folder, options, progress)
         for camera in others

@@ -1,8 +1,10 @@
 """Further cameras of a cell: the truth of simulated cells within sigma, pictures placed or refused with the reason."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,16 +12,25 @@ import pytest
 
 import jcr
 from jcr.calibration.intrinsics_prior import HELD, prior_of
+from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.camera import parameters, with_parameters
+from jcr.camera import parameters, project, unproject, with_parameters
+from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
-from jcr.cell.added import camera_of
+from jcr.cell import alone, carried, localise
+from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
+from jcr.cell.cameras_json import read_cameras
+from jcr.cell.found import CameraFound, PictureFound
 from jcr.cell.stage import place_cameras
 from jcr.cell.ties import Answer, Tie, tied
+from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.handeye.systematic import smooth_errors
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction, Tracks
+from jcr.progress import silent
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.relocate import Features
+from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8
@@ -188,12 +199,126 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     cv2.imwrite(str(tmp_path / "other.png"), cv2.resize(noise, old.image_size, interpolation=cv2.INTER_CUBIC))
     another = replace(fixed(old, "other.png"), name="other", folder=tmp_path)
     moving = fixed(old, old.images[2], old.images[5])
-    found = place_cameras(old, [another, moving], reconstruction, hand_eye)
-    assert [camera.converged for camera in found.cameras] == [False, False]
+    unknown = replace(moving, name="unknown", intrinsics=None)
+    found = place_cameras(old, [another, moving, unknown], reconstruction, hand_eye)
+    assert [camera.converged for camera in found.cameras] == [False, False, False]
     assert "must see the same scene" in found.cameras[0].warnings[0]
-    assert "it is not fixed" in found.cameras[1].warnings[0]
+    assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
     untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
     assert "not to be trusted" in untrusted.cameras[0].warnings[0]
+
+
+def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictures(
+    calibrated, monkeypatch, tabletop: Path
+):
+    """Its reconstruction has a frame and a unit of its own; two of its pictures were left out."""
+    old, reconstruction, hand_eye = calibrated
+    frame = np.array([0, 1, 3, 4, 5, 7, 8])
+    second = CellCamera(
+        "second", "gripper", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+    )
+    move = transform(rotation_exp(np.array([1.0, 0.2, -0.4])), np.array([0.5, 0.0, 2.0]))
+    its_own = scale_translation(move @ reconstruction.recon_from_camera[frame], 2.5)
+    whole = replace(
+        reconstruction,
+        image_index=np.arange(len(frame)),
+        recon_from_camera=its_own,
+        points_in_recon=reconstruction.points_in_recon[frame],
+        confidence=reconstruction.confidence[frame],
+        colors=reconstruction.colors[frame],
+        tracks=replace(reconstruction.tracks, points_in_recon=apply(its_own[0], np.eye(3) + 1.0)),
+    )
+    asked: list[Capture] = []
+
+    def reconstruct(capture: Capture, *_: object) -> Reconstruction:
+        asked.append(capture)
+        return whole
+
+    monkeypatch.setattr(alone, "reconstruct", reconstruct)
+    nothing = CameraFound(
+        "second", "gripper", None, tuple(PictureFound(i, False, 3, None, "few") for i in second.images)
+    )
+    assert alone.sees_another_scene(second, nothing)
+    assert not alone.sees_another_scene(replace(second, mount="base"), nothing)
+    found = alone.calibrated_elsewhere(old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent)
+    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    assert (asked[0].base_from_gripper == old.base_from_gripper[frame]).all() and asked[0].mount == "gripper"
+    assert found.converged and found.parent_from_camera is not None
+    assert np.abs(step_between(found.parent_from_camera, x)).max() < 1e-3
+    assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.pictures) == len(frame)
+
+    def refuse(*_: object) -> Reconstruction:
+        raise NotTrustedError("2 of 7 images could be registered")
+
+    monkeypatch.setattr(alone, "reconstruct", refuse)
+    refused = alone.calibrated_elsewhere(
+        old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent
+    )
+    assert not refused.converged and refused.warnings[0].endswith("2 of 7 images could be registered")
+
+
+def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera(
+    calibrated, monkeypatch, tmp_path: Path
+):
+    """One capture has both: of eight of its nine poses there is a picture of what the gripper carries."""
+    old, reconstruction, _ = calibrated
+    frame = np.array([0, 1, 2, 3, 5, 6, 7, 8])
+    front = CellCamera(
+        "front", "base", tuple(old.images[k] for k in frame), old.image_size, old.intrinsics, frame=frame
+    )
+    base_from_camera = transform(rotation_exp(np.array([-1.9, 0.2, 0.3])), np.array([1.2, 0.1, 0.5]))
+    gripper_from_object = transform(rotation_exp(np.array([0.2, 0.5, 1.0])), np.array([0.0, 0.02, 0.15]))
+    seen_from = inverse(old.base_from_gripper[frame] @ gripper_from_object) @ base_from_camera
+    whole = replace(
+        reconstruction,
+        image_index=np.arange(len(frame)),
+        recon_from_camera=scale_translation(seen_from, 1 / SCALE),
+        points_in_recon=reconstruction.points_in_recon[frame],
+        confidence=reconstruction.confidence[frame],
+        colors=reconstruction.colors[frame],
+        tracks=replace(reconstruction.tracks, points_in_recon=0.05 * np.eye(3)),
+    )
+    monkeypatch.setattr(carried, "reconstruct", lambda *_: whole)
+    monkeypatch.setattr(carried, "write_moving_parts", lambda *_: None)
+    found = carried.calibrated_alone(old, front, tmp_path, ReconstructOptions(), CalibrateOptions(), silent)
+    assert found.converged and found.mount == "base" and found.parent_from_camera is not None
+    assert np.abs(step_between(found.parent_from_camera, base_from_camera)).max() < 1e-3
+    away = np.linalg.norm(old.base_from_gripper[frame, :3, 3] - base_from_camera[:3, 3], axis=1)
+    assert found.scene_distance is not None and 0 < found.scene_distance < away.max() + 0.3
+    assert [picture.image for picture in found.pictures] == list(front.images)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, turned: bool):
+    """Of a picture 40 points by SIFT are shared; a network finds 60 more, or the same board turned by half a turn."""
+    rng = np.random.default_rng(3)
+    lens = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+    ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))
+    poses = np.stack([np.eye(4), transform(rotation_exp(np.array([0, 0.1, 0])), np.array([-0.1, 0, 0]))])
+    place = transform(rotation_exp(np.array([0.0, -0.1, 0.3])), np.array([0.1, 0.02, 0.05]))
+    shown = project(lens, apply(inverse(place), ahead))
+    in_rows = [project(lens, apply(inverse(pose), ahead)) for pose in poses]
+
+    def by_sift(x_px: np.ndarray) -> Features:
+        return Features(x_px[:40], unproject(lens, x_px[:40])[:, :2], np.eye(128, dtype=np.float32)[:40])
+
+    half_turn = [lens.cx, lens.cy] - (shown[40:] - [lens.cx, lens.cy])
+    learned = SimpleNamespace(
+        matched=lambda *_: (
+            half_turn if turned else shown[40:],
+            [(np.arange(60), x_px[40:]) for x_px in in_rows],
+        )
+    )
+    monkeypatch.setattr(localise, "features", lambda *_: by_sift(shown))
+    known = localise.Known(lens, poses, tuple(map(by_sift, in_rows)), learned)  # type: ignore[arg-type]
+    found = localise.localised(known, np.zeros((480, 640, 3), np.uint8), lens, True)
+    assert isinstance(found, localise.Shared) and len(found.x_px) == (40 if turned else 100)
+    assert np.abs(step_between(found.recon_from_camera, place)).max() < 1e-6
+    # Without a place by SIFT there is none, whatever the network finds.
+    few = replace(
+        known, found=tuple(Features(f.x_px[:9], f.rays[:9], f.descriptors[:9]) for f in known.found)
+    )
+    assert localise.localised(few, np.zeros((480, 640, 3), np.uint8), lens, True) == 9
 
 
 @pytest.fixture
@@ -277,3 +402,32 @@ def test_pictures_of_two_sizes_are_not_one_camera(folder: Path):
     for name in ("../a", "", "a/b", "1"):  # it becomes the name of a folder
         with pytest.raises(jcr.InputError, match="begins with a letter"):
             camera_of(name, [folder / "0.png"], None, ())
+
+
+@pytest.mark.parametrize("name", ["added/added.json", "cameras/cameras.json", "cameras.json"])
+@pytest.mark.parametrize("fault", ["pipe", "folder", "link", "text", "number", "parent"])
+def test_what_has_the_name_of_a_file_of_the_run_is_not_taken_for_none(
+    folder: Path, tmp_path: Path, name: str, fault: str
+):
+    (folder / "capture.json").write_text(json.dumps(content()))
+    capture, run = read(folder), tmp_path / "run"
+    readers = {
+        "added/added.json": lambda: read_added(run, capture),
+        "cameras/cameras.json": lambda: read_added_cameras(run, capture),
+        "cameras.json": lambda: read_cameras(run),
+    }
+    nothing = readers[name]()
+    assert not nothing
+    file = run / name
+    if fault == "parent":
+        file.parent.parent.mkdir(parents=True, exist_ok=True)
+        file.parent.write_text("")
+    else:
+        file.parent.mkdir(parents=True)
+    if fault in ("text", "number"):
+        file.write_text({"text": "{", "number": "7"}[fault])
+    elif fault != "parent":
+        {"pipe": os.mkfifo, "folder": os.mkdir, "link": lambda f: os.symlink("nowhere", f)}[fault](file)
+    with pytest.raises(jcr.InputError) as refusal:
+        readers[name]()
+    assert "\n" not in str(refusal.value) and "run" in str(refusal.value)

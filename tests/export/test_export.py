@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -21,11 +22,13 @@ from scipy.spatial.transform import Rotation
 import jcr
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
+from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
 from jcr.cli.export import FORMATS
 from jcr.errors import InputError
 from jcr.export import ros
 from jcr.export.provenance import Provenance
+from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
@@ -325,6 +328,75 @@ def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
         np.testing.assert_allclose(seen, x_px + 0.5, atol=1e-6)
     first = trimesh.load(out / content["ply_file_path"])
     np.testing.assert_allclose(np.asarray(first.vertices), views.points_in_base, atol=1e-6)  # pyright: ignore
+
+
+@pytest.fixture
+def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
+    """A fixed camera of two pictures, and a second one on the gripper at the first and the last image."""
+    from jcr.export.views import PosedImages
+
+    second = transform(rotation_exp(np.array([0.05, 0.1, -0.2])), np.array([0.06, 0.01, 0.0]))
+    poses = (
+        np.repeat(views.base_from_camera[:1] @ second @ second, 2, axis=0),
+        (views.base_from_camera[[0, 2]] @ second),
+    )
+    nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    lens = replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0, 0.0))
+    images = []
+    for name in ("fixed", "second"):
+        images.append(tuple(f"{name}/{k}.png" for k in range(2)))
+        for image in images[-1]:
+            write_bytes(tmp_path / image, (views.folder / views.images[0]).read_bytes())
+    return [
+        PosedImages(tmp_path, of, pose, lens, nothing, np.zeros((0, 3)), beside)
+        for of, pose, beside in zip(images, poses, (None, (0, 2)), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_exports_of_several_cameras_come_back(
+    kind: str, views: "PosedImages", with_others: "list[PosedImages]", tmp_path: Path
+):
+    from jcr.capture import colmap_model, transforms_json
+    from jcr.export.views import write_colmap, write_nerfstudio
+
+    out, about, n = tmp_path / "out", Provenance("base_link"), len(views.points_in_base)
+    if kind == "colmap":
+        write_colmap(out, views, about, undistorted=False, link=False, others=with_others)
+        names, poses = colmap_model.read_cameras(out / "sparse" / "0")
+    else:
+        zeros, ones = np.zeros(n, int), np.ones(n)
+        cloud = PointCloud(
+            views.points_in_base, np.full((n, 3), 90, np.uint8), ones, ones, zeros, zeros, np.zeros((1, 3))
+        )
+        write_nerfstudio(out, views, cloud, about, False, link=False, others=with_others)
+        names, poses = transforms_json.read_cameras(out / "transforms.json")
+    of = {"/".join(Path(name).parts[-2:]): pose for name, pose in zip(names, poses, strict=True)}
+    for k, one in enumerate(with_others, start=1):
+        for j, pose in enumerate(one.base_from_camera):
+            np.testing.assert_allclose(of[f"{k}/{j}.png"], pose, atol=1e-9)
+    placed = [image.replace("/", "_") for image in views.images]  # of two folders, alike in name
+    lines = [
+        ",".join(map(str, [name, *pose.ravel()]))
+        for name, pose in zip(placed, views.base_from_camera, strict=True)
+    ]
+    (out / "poses.csv").write_text(
+        "\n".join(["image," + ",".join(f"m{i}{j}" for i in range(4) for j in range(4)), *lines])
+    )
+    got = jcr.read_capture(out, ReadOptions(pose_convention="matrix"))
+    assert (
+        len(got) == 3
+        and got.intrinsics is not None
+        and got.intrinsics.distortion == pytest.approx(LENS.distortion)
+    )
+    by_mount = {camera.mount: camera for camera in got.others}
+    assert by_mount["base"].intrinsics is not None and len(by_mount["base"].images) == 2
+    assert by_mount["base"].intrinsics.distortion[0] == pytest.approx(0.02)
+    if kind == "colmap":
+        assert by_mount["gripper"].frame is not None and len(by_mount["gripper"].images) == 2
+        assert [got.images[k] for k in by_mount["gripper"].frame] == [f"images/{placed[k]}" for k in (0, 2)]
+    else:
+        assert any("neither of one place nor of a rig" in note for note in got.notes)
 
 
 def test_pictures_turned_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):

@@ -21,11 +21,13 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log
 from jcr.capture.images import read_image
+from jcr.cell.cameras_json import cameras_file
+from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
-from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Intrinsics, Reconstruction, Tracks
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -259,6 +261,36 @@ def test_page_is_one_small_file(page: str):
     policy = next(a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy")
     assert "default-src 'none'" in policy
     assert "$" not in elements.text
+
+
+def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
+    """A fixed one, one on the gripper of whose pictures two were used, one on another arm; each where it was."""
+    size, poses = run.capture.image_size, run.capture.base_from_gripper
+    mount, base = transform(np.eye(3), np.array([0.0, 0.1, 0.0])), transform(np.eye(3), np.array([1.0, 0, 0]))
+    others = (
+        CellCamera("second", "gripper", ("a", "b", "c"), size, frame=np.array([0, 2, UNREGISTERED])),
+        CellCamera("other", "gripper", ("a",), size, arm="right", base_from_gripper=poses[:1]),
+    )
+    found = [
+        CameraFound(name, kind, arm, pictures, mount, 1e-6 * np.eye(6), 1.0, run.lens, converged=True)
+        for name, kind, arm, pictures in (
+            ("top", "base", None, (PictureFound("t", True, 90, 0.3, None),)),
+            ("second", "gripper", None, tuple(PictureFound(i, i != "b", 90, 0.3, None) for i in "abc")),
+            ("other", "gripper", "right", (PictureFound("a", True, 90, 0.3, None),)),
+        )
+    ]
+    content = cameras_file(CellFound(tuple(found), (ArmFound("right", base, 1e-6 * np.eye(6)),), None), "0.0")
+    capture = replace(run.capture, others=others)
+    page = report_html(replace(run, capture=capture, cloud=None, scene=None, cameras=content))
+    scene = json.loads(Elements(page).scripts[0])
+    drawn = {camera["name"]: np.array(camera["cameras"]) for camera in scene["others"]}
+    assert {name: len(places) for name, places in drawn.items()} == {"top": 1, "second": 1, "other": 1}
+    assert np.allclose(drawn["top"][0], mount[:3], atol=1e-6)
+    assert np.allclose(drawn["other"][0], (base @ poses[0] @ mount)[:3], atol=1e-6)
+    camera = np.array(scene["views"][0]["camera"] + [[0, 0, 0, 1]])
+    expected = camera @ inverse(run.hand_eye.gripper_from_camera) @ mount
+    assert np.allclose(drawn["second"][0], expected[:3], atol=1e-5)
+    assert scene["bases"][0]["name"] == "base of right"
 
 
 def test_sections_without_a_record_are_left_out(run: RunResult):

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.capture.checks import check_metres, read_rigid
 from jcr.capture.images import read_image
-from jcr.capture.plain_files import contained, read_json, read_npy, shown
+from jcr.capture.plain_files import contained, is_written, read_json, read_npy, shown
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture
@@ -26,7 +26,7 @@ def read_added(run_folder: Path, capture: Capture) -> Capture:
     """
     folder = run_folder / FOLDER
     file = folder / FILE
-    if not file.is_file():
+    if not is_written(file):
         return replace(capture, folder=folder, images=(), base_from_gripper=np.zeros((0, 4, 4)), joints=None)
     content = read_json(file)
     try:

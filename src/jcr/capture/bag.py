@@ -1,7 +1,8 @@
-"""ROS 1 bags, ROS 2 sqlite3 and MCAP: the images of one topic, with poses from tf or from joint states."""
+"""ROS 1 bags, ROS 2 sqlite3 and MCAP: images of one topic or more, with poses from tf or from joint states."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,13 +15,15 @@ from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_fault, read_yaml
 from jcr.capture.pose_track import speed
+from jcr.capture.recorded_cameras import Lens, Pictures, RecordedCamera, asked_cameras, camera_names
 from jcr.capture.recording import capture_of_recording
 from jcr.capture.ros_image import depth_of, picture_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
 from jcr.extras import extra
+from jcr.geometry import inverse, motion_length
 from jcr.progress import Progress
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, Intrinsics, Mount
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO, JOINTS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
@@ -29,6 +32,10 @@ ALIGNED = "aligned_depth"
 """In the names of topics whose depth has the pixels of the colour image (realsense2_camera: aligned_depth_to_color)."""
 SAME_MOMENT_NS = 20_000_000
 """Colour and depth of one exposure have stamps nearer than this."""
+SAME_POSE = 1e-3
+"""m, turning counted at ARM: by which the arm may move between the exposures of two cameras on it."""
+LOOKED_AT = 50
+"""Images of a topic at whose stamps tf is asked what carries their camera."""
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -38,80 +45,150 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     Raises InputError with the topics or frames that there are where those of the options are not, and for images
     whose poses are stale.
     """
+    asked = asked_cameras(options)
     with _opened(path) as reader:
-        topic = _camera_topic(reader, options, path)
-        info_topics = (f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2))
-        infos = [
-            c for name in info_topics for c in reader.connections if c.topic == name and c.msgtype == INFO
-        ]
-        cameras = [c for c in reader.connections if c.topic == topic]
+        topics = _camera_topics(reader, options, list(asked), path)
+        infos = {topic: info for topic in topics if (info := _info_of(reader, topic)) is not None}
+        cameras = [c for c in reader.connections if c.topic in topics]
         pose_connections = _pose_connections(reader, options, path)
-        _refuse_other_definitions(reader, [*cameras, *infos[:1], *pose_connections], path)
-        log_ns, stamp_ns, info = [], [], None
+        wanted = [*cameras, *{info.topic: info for info in infos.values()}.values(), *pose_connections]
+        _refuse_other_definitions(reader, wanted, path)
+        recorded, lenses = {topic: _Recorded() for topic in topics}, {}
         tree, joint_states = TfTree(), []
         span = max(reader.end_time - reader.start_time, 1)
-        for connection, at, message in _messages(reader, [*cameras, *infos[:1], *pose_connections], path):
+        for connection, at, message in _messages(reader, wanted, path):
             if connection.msgtype in TF:
                 tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
             elif connection.msgtype == JOINTS:
                 joint_states.append((_stamp(message, at), message.name, message.position))
             elif connection.msgtype == INFO:
-                info = info or message
+                lenses.setdefault(connection.topic, message)
             else:
-                log_ns.append(at)
-                stamp_ns.append(_stamp(message, at))
+                recorded[connection.topic].add(_stamp(message, at), at, message.header.frame_id)
                 report("frames", 0.1 * (at - reader.start_time) / span)
-        if not stamp_ns:
-            raise InputError(f"{path}: topic {topic} has no images")
-        order = np.unique(stamp_ns, return_index=True)[1]
-        stamps, logs = np.array(stamp_ns)[order], np.array(log_ns)[order]
+        topics = _with_images(topics, recorded, (options.camera_topic, *asked), path)
         arm = None if options.urdf is None else _joint_track(joint_states, options, path)
         poses_at = tree.poses_at(options.base_frame, options.gripper_frame, path) if arm is None else arm.at
+        frames = options.base_frame, options.gripper_frame
+        mounts = dict[str, Mount | None].fromkeys(topics)
+        if len(topics) > 1:
+            for name in topics:
+                mounts[name] = tree.mount_of(recorded[name].frame, *frames, recorded[name].some(), path)
+        mounts.update((name, mount) for name, mount in asked.items() if mount is not None)
+        topic, *others = _chosen(topics, options, asked, mounts, path)
+        stamps = recorded[topic].sorted()[0]
         poses, gap_ns = poses_at(stamps)
         joints = None if arm is None else arm.angles(stamps)
 
-        def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
-            for row in rows.tolist():
-                at = int(logs[row])
-                for _, _, message in _messages(reader, cameras, path, start=at, stop=at + 1):
-                    if _stamp(message, at) == stamps[row]:
-                        yield row, *picture_of(message, f"{path}: {topic}")
-                        break
+        def pictures_of(topic: str) -> Pictures:
+            of_topic = [c for c in cameras if c.topic == topic]
+            all_stamps, all_logs = recorded[topic].sorted()
+
+            def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
+                nearest = _nearest(all_stamps, stamps[rows])
+                there, gaps = poses_at(all_stamps[nearest])
+                moved = motion_length(inverse(poses[rows]) @ there)
+                apart = np.abs(all_stamps[nearest] - stamps[rows])
+                same = (apart == 0) | (gaps <= 1e6 * options.max_gap_ms) & (moved < SAME_POSE)
+                for row, k, usable in zip(rows.tolist(), nearest.tolist(), same.tolist(), strict=True):
+                    if not usable and mounts[topic] != "base":
+                        continue
+                    at = int(all_logs[k])
+                    for _, _, message in _messages(reader, of_topic, path, start=at, stop=at + 1):
+                        if _stamp(message, at) == all_stamps[k]:
+                            yield row, *picture_of(message, f"{path}: {topic}")
+                            break
+
+            return pictures
 
         aligned = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
         _refuse_other_definitions(reader, aligned, path)
 
         def depth_at(row: int) -> UInt16[np.ndarray, "h w"] | None:
             """Of the exposure nearest to the frame's; None where it has none."""
-            at = int(logs[row])
+            at = int(recorded[topic].sorted()[1][row])
             found, off = None, SAME_MOMENT_NS
             near = {"start": at - 5 * SAME_MOMENT_NS, "stop": at + 5 * SAME_MOMENT_NS}
-            for connection, recorded, message in _messages(reader, aligned, path, **near):
-                if (apart := abs(_stamp(message, recorded) - int(stamps[row]))) <= off:
+            for connection, logged, message in _messages(reader, aligned, path, **near):
+                if (apart := abs(_stamp(message, logged) - int(stamps[row]))) <= off:
                     found, off = depth_of(message, f"{path}: {connection.topic}"), apart
             return found
+
+        def lens_of(topic: str) -> Lens:
+            def lens(size: tuple[int, int]) -> Intrinsics | None:
+                name = infos[topic].topic if topic in infos else ""
+                return _lens(lenses[name], topic, size, f"{path}: {name}") if name in lenses else None
+
+            return lens
 
         def lens(size: tuple[int, int]) -> Intrinsics | None:
             if options.camera_info is not None:
                 return read_camera_info(options.camera_info, size)
-            return None if info is None else _lens(info, topic, size, f"{path}: {infos[0].topic}")
+            return lens_of(topic)(size)
 
-        names = [str(stamp) for stamp in stamps]
-        motion = speed(poses_at, stamps)
+        own, *further = camera_names([topic, *others])
         return capture_of_recording(
             path,
-            names,
+            [str(stamp) for stamp in stamps],
             poses,
-            motion,
+            speed(poses_at, stamps),
             gap_ns,
-            pictures,
+            pictures_of(topic),
             lens,
             options,
             into,
             report,
             joints,
             depth_at if aligned else None,
+            own,
+            [
+                RecordedCamera(name, mount, pictures_of(other), lens_of(other))
+                for name, other in zip(further, others, strict=True)
+                if (mount := mounts[other]) is not None
+            ],
         )
+
+
+@dataclass
+class _Recorded:
+    """When the images of one topic were true and were recorded, and the frame that they name."""
+
+    stamp_ns: list[int] = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    frame: str = ""
+
+    def add(self, stamp: int, log: int, frame: str) -> None:
+        self.stamp_ns.append(stamp)
+        self.log_ns.append(log)
+        self.frame = frame.lstrip("/")
+
+    def sorted(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+        """Both, in order of the stamps; of those with the same stamp the first."""
+        stamps, order = np.unique(self.stamp_ns, return_index=True)
+        return stamps, np.array(self.log_ns)[order]
+
+    def some(self) -> Int[np.ndarray, " n"]:
+        """Stamps through the whole recording."""
+        stamps, _ = self.sorted()
+        return stamps[np.linspace(0, len(stamps) - 1, min(len(stamps), LOOKED_AT)).round().astype(int)]
+
+
+def _with_images(
+    topics: list[str], recorded: dict[str, _Recorded], named: tuple[str | None, ...], path: Path
+) -> list[str]:
+    """The topics on which something was recorded; InputError for one that was asked for, or where nothing was."""
+    empty = [topic for topic in topics if not recorded[topic].stamp_ns]
+    if refused := [topic for topic in empty if topic in named or len(empty) == len(topics)]:
+        raise InputError(f"{path}: topic {refused[0]} has no images")
+    return [topic for topic in topics if topic not in empty]
+
+
+def _nearest(sample_ns: Int[np.ndarray, " n"], at_ns: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+    """Rows of ascending samples."""
+    after = np.searchsorted(sample_ns, at_ns).clip(1, max(len(sample_ns) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(sample_ns) - 1)
+    return np.where(np.abs(sample_ns[after] - at_ns) < np.abs(sample_ns[before] - at_ns), after, before)
 
 
 @contextmanager
@@ -198,21 +275,75 @@ def _messages(reader: Any, connections: list[Any], path: Path, **span: int) -> I
         yield connection, at, message
 
 
-def _camera_topic(reader: Any, options: ReadOptions, path: Path) -> str:
-    """The topic that was asked for, or the only one with colour images."""
+def _camera_topics(reader: Any, options: ReadOptions, asked: list[str], path: Path) -> list[str]:
+    """Topics whose images may be wanted: those that were asked for, or all with colour images."""
     topics = sorted({c.topic for c in reader.connections if c.msgtype in IMAGES})
-    if options.camera_topic is not None:
-        if options.camera_topic not in topics:
+    if options.camera_topic in asked:
+        raise InputError(f"{path}: --further-cameras {options.camera_topic}: is the wrist's camera already")
+    for topic in (options.camera_topic, *asked):
+        if topic is not None and topic not in topics:
             raise InputError(
-                f"{path}: no images on {options.camera_topic}; topics with images: {', '.join(topics) or 'none'}"
+                f"{path}: no images on {topic}; topics with images: {', '.join(topics) or 'none'}"
             )
-        return options.camera_topic
+    if options.camera_topic is not None:
+        return [options.camera_topic, *asked]
     colour = [topic for topic in topics if "depth" not in topic.lower()]
-    if len(colour) != 1:
+    # The same images, once more in a smaller form.
+    colour = [
+        topic
+        for topic in colour
+        if topic in asked or topic.removesuffix("/compressed") not in {*colour} - {topic}
+    ]
+    if not colour:
         raise InputError(
-            f"{path}: {len(colour)} topics with images; choose one with --camera-topic: {', '.join(topics) or 'none'}"
+            f"{path}: 0 topics with images; choose one with --camera-topic: {', '.join(topics) or 'none'}"
         )
-    return colour[0]
+    return colour
+
+
+def _chosen(
+    topics: list[str],
+    options: ReadOptions,
+    asked: dict[str, Mount | None],
+    mounts: dict[str, Mount | None],
+    path: Path,
+) -> list[str]:
+    """The topic of the wrist's camera, then those of further ones; InputError where tf does not tell which is which.
+
+    Unless topics are named, the only one that moves with the gripper is the wrist's, and fixed ones come with it.
+    """
+    own = options.camera_topic
+    if own is None:
+        left = [topic for topic in topics if topic not in asked]
+        on_gripper = [topic for topic in left if mounts[topic] == "gripper"]
+        if len(left) == 1:
+            on_gripper = left
+        elif any(mounts[topic] is None for topic in left):
+            on_gripper = []
+        if len(on_gripper) != 1:
+            words = {"gripper": "moves with the gripper", "base": "stands still", None: "tf does not tell"}
+            listed = ", ".join(f"{topic} ({words[mounts[topic]]})" for topic in left)
+            raise InputError(
+                f"{path}: {len(left)} topics with images; choose one with --camera-topic, further ones with "
+                f"--further-cameras: {listed or 'all are named by --further-cameras'}"
+            )
+        own = on_gripper[0]
+        if not asked:
+            return [own, *(topic for topic in left if topic != own and mounts[topic] == "base")]
+    for topic in asked:
+        if mounts[topic] is None:
+            raise InputError(
+                f"{path}: tf does not tell what carries the camera of {topic}; write --further-cameras {topic}=base for "
+                f"a fixed one, {topic}=gripper for one on the gripper"
+            )
+    return [own, *asked]
+
+
+def _info_of(reader: Any, topic: str) -> Any | None:
+    """The connection with the intrinsics of a topic's images."""
+    names = [f"{topic.rsplit('/', k)[0]}/camera_info" for k in (1, 2)]
+    found = [c for name in names for c in reader.connections if c.topic == name and c.msgtype == INFO]
+    return found[0] if found else None
 
 
 def _pose_connections(reader: Any, options: ReadOptions, path: Path) -> list[Any]:

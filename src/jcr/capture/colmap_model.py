@@ -4,7 +4,7 @@ COLMAP has the centre of the top-left pixel at (0.5, 0.5) and stores camera from
 """
 
 import struct
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,10 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_capture, checked_lens
+from jcr.capture.checks import checked_lens
+from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
-from jcr.capture.table import gripper_poses
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
@@ -52,16 +52,52 @@ def read(path: Path, options: ReadOptions) -> Capture:
     if folder is None:
         raise InputError(f"{path}: holds no COLMAP model (cameras.bin or .txt, images, points3D)")
     root = next((parent for parent in (path, *folder.parents[:3]) if (parent / "images").is_dir()), path)
-    names, _ = read_cameras(folder)
-    beside = [f"images/{name}" for name in names]
-    located = [
-        place if contained(root, place, str(folder)).is_file() else name
-        for place, name in zip(beside, names, strict=True)
-    ]
-    known, poses, notes = gripper_poses(root, located, options)
-    capture = checked_capture(root, [located[k] for k in known], poses, str(folder))
-    lens = read_lens(folder, capture.image_size)
-    return replace(capture, intrinsics=lens, source=folder, cameras=folder, notes=notes)
+    return capture_of_cameras(root, _cameras(folder, root), options, folder)
+
+
+def _cameras(folder: Path, root: Path) -> list[ModelCamera]:
+    """The cameras of a model, first those that others of their rig refer to, those with most images before others."""
+    model = read_model(folder)
+    names, poses = _posed(model, folder)
+    pose_of = dict(zip(names, poses, strict=True))
+    of_camera: dict[int, list[pycolmap.Image]] = {}
+    images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
+    for image in images:
+        of_camera.setdefault(image.camera_id, []).append(image)
+    if one_each([len(images) for images in of_camera.values()]) and all(map(_is_ref, images)):
+        # COLMAP without --ImageReader.single_camera: they must be alike.
+        first = model.camera(images[0].camera_id)
+        read_lens(folder, (first.width, first.height))
+        of_camera = {images[0].camera_id: images}
+
+    def rank(number: int) -> tuple[bool, int, int]:
+        images = of_camera[number]
+        return not _is_ref(images[0]), -len(images), number
+
+    out = []
+    for number in sorted(of_camera, key=rank):
+        images = of_camera[number]
+        located = []
+        for image in images:
+            beside = f"images/{image.name}"
+            located.append(beside if contained(root, beside, str(folder)).is_file() else image.name)
+        parents = {Path(image.name).parent.name for image in images}
+        name = parents.pop() if len(parents) == 1 else ""
+        out.append(
+            ModelCamera(
+                name or f"camera_{number}",
+                tuple(located),
+                np.stack([pose_of[image.name] for image in images]),
+                tuple(image.frame_id for image in images),
+                partial(_lens, model.camera(number), folder),
+            )
+        )
+    return out
+
+
+def _is_ref(image: "pycolmap.Image") -> bool:
+    """Whether its camera is the one to which the others of the rig refer; a camera without a rig is."""
+    return image.is_ref_in_frame()
 
 
 def read_model(folder: Path) -> "pycolmap.Reconstruction":
@@ -113,7 +149,10 @@ def _check_end(data: bytes, at: int) -> None:
 
 def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
     """Names of the registered images, in order, and their recon_from_camera (n,4,4)."""
-    model = read_model(folder)
+    return _posed(read_model(folder), folder)
+
+
+def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
     images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
     if not images:
         raise InputError(f"{folder}: the COLMAP model has no registered image")
@@ -125,15 +164,19 @@ def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
 def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
     """The one lens of all images, of the given size; InputError when there are several, or a strange one."""
     found = read_model(folder)
-    cameras = {
-        (camera.model.name, camera.width, camera.height, *map(float, camera.params))
-        for camera in (found.camera(found.image(k).camera_id) for k in found.reg_image_ids())
+    cameras = [found.camera(found.image(k).camera_id) for k in found.reg_image_ids()]
+    kinds = {
+        (camera.model.name, camera.width, camera.height, *map(float, camera.params)) for camera in cameras
     }
-    if len(cameras) > 1:
+    if len(kinds) > 1:
         raise InputError(
-            f"{folder}: {len(cameras)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
+            f"{folder}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
         )
-    name, width, height, *params = cameras.pop()
+    return _lens(cameras[0], folder, size)
+
+
+def _lens(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Intrinsics:
+    name, width, height, params = camera.model.name, camera.width, camera.height, [*map(float, camera.params)]
     if name not in _COEFFICIENTS:
         raise InputError(
             f"{folder}: camera model {name}, which jcr does not know; run colmap image_undistorter"

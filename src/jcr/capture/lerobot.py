@@ -13,6 +13,7 @@ from jcr.capture.lerobot_files import Episode, Feature, pictures_in_table, read_
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
+from jcr.capture.recorded_cameras import Pictures, RecordedCamera, asked_cameras, camera_names
 from jcr.capture.recording import capture_of_recording
 from jcr.capture.robot_poses import CONVENTIONS
 from jcr.capture.video import frames_at
@@ -30,8 +31,9 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 
     Raises InputError listing the cameras, states or episodes that there are where those of the options are not.
     """
-    info = read_info(path)
-    camera, key = _camera(info.features, options, path), _state_key(info.features, options, path)
+    info, asked = read_info(path), asked_cameras(options)
+    camera = _camera(info.features, options, list(asked), path)
+    key = _state_key(info.features, options, path)
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     state = np.concatenate([episode.state for episode in episodes])
     poses, joints = _poses(state, key, info.features[key], options, path)
@@ -40,22 +42,24 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     motion = np.concatenate(
         [_speed(episode, poses[part]) for episode, part in zip(episodes, parts, strict=True)]
     )
-    tolerance_s = 0.5 / info.fps
 
-    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
-        for episode, part in zip(episodes, parts, strict=True):
-            mine = rows[np.isin(rows, part)]
-            if len(mine) == 0:
-                continue
-            if episode.video is None:
-                for row, file in zip(
-                    mine.tolist(), pictures_in_table(episode, camera, mine - part[0]), strict=True
-                ):
-                    yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
-                continue
-            times = episode.video_start_s + episode.time_s[mine - part[0]]
-            for row, rgb in zip(mine.tolist(), frames_at(episode.video, times, tolerance_s), strict=True):
-                yield row, rgb, ".png"
+    def pictures_of(key_of_camera: str, episodes: list[Episode]) -> Pictures:
+        def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
+            for episode, part in zip(episodes, parts, strict=True):
+                mine = rows[np.isin(rows, part)]
+                if len(mine) == 0:
+                    continue
+                if episode.video is None:
+                    files = pictures_in_table(episode, key_of_camera, mine - part[0])
+                    for row, file in zip(mine.tolist(), files, strict=True):
+                        yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+                    continue
+                times = episode.video_start_s + episode.time_s[mine - part[0]]
+                frames = frames_at(episode.video, times, 0.5 / info.fps)
+                for row, rgb in zip(mine.tolist(), frames, strict=True):
+                    yield row, rgb, ".png"
+
+        return pictures
 
     def lens(size: tuple[int, int]) -> Intrinsics | None:
         return None if options.camera_info is None else read_camera_info(options.camera_info, size)
@@ -66,20 +70,49 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         for k in range(len(episode.time_s))
     ]
     gap_ns = np.zeros(len(state), np.int64)  # a row is one instant: nothing is interpolated
+    own, *further = camera_names([camera, *asked])
+    others = []
+    for name, (other, mount) in zip(further, asked.items(), strict=True):
+        if mount is None:
+            raise InputError(
+                f"{path}: a data set does not tell what carries {other}; write --further-cameras {other}=base for a "
+                f"fixed camera, {other}=gripper for one on the gripper"
+            )
+        theirs = [read_episode(path, info, other, key, index) for index in options.episode]
+        others.append(RecordedCamera(name, mount, pictures_of(other, theirs), lambda _: None))
     return capture_of_recording(
-        path, names, poses, motion, gap_ns, pictures, lens, options, into, report, joints
+        path,
+        names,
+        poses,
+        motion,
+        gap_ns,
+        pictures_of(camera, episodes),
+        lens,
+        options,
+        into,
+        report,
+        joints,
+        camera_name=own,
+        others=others,
     )
 
 
-def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:
+def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str], path: Path) -> str:
+    """The key of the wrist's camera, where there are others too or not; InputError with the keys that there are."""
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
+    listed = ", ".join(cameras) or "no videos or pictures"
+    if unknown := [key for key in asked if key not in cameras]:
+        raise InputError(f"{path}: --further-cameras {unknown[0]}: there are {listed}")
+    if options.camera_topic in asked:
+        raise InputError(f"{path}: --further-cameras {options.camera_topic}: is the wrist's camera already")
+    left = [key for key in cameras if key not in asked]
     if options.camera_topic in cameras:
         return str(options.camera_topic)
-    if options.camera_topic is not None or len(cameras) != 1:
+    if options.camera_topic is not None or len(left) != 1:
         raise InputError(
-            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos or pictures'}"
+            f"{path}: choose the wrist's camera with --camera-topic, further ones with --further-cameras: {listed}"
         )
-    return cameras[0]
+    return left[0]
 
 
 def _state_key(features: dict[str, Feature], options: ReadOptions, path: Path) -> str:

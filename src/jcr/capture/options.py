@@ -68,6 +68,9 @@ class ReadOptions:
     """Recordings: tf frame or URDF link that the camera is bolted to."""
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
+    further_cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TOPIC[=base|=gripper] ...")] = ()
+    """Recordings: topics or keys of further cameras, fixed (=base) or on the same gripper (=gripper); a bag's tf tells
+    where neither is said."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the joint states, read when --urdf is given. LeRobot: key of the state."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -1,6 +1,7 @@
 """Text, YAML, JSON and arrays that others wrote: plain data from inside of the folder, or one line of what is wrong."""
 
 import json
+import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,20 @@ MAX_YAML = 4_000_000
 """Characters: more takes long to read, and is no capture."""
 LONGEST_SHOWN = 80
 """Characters of a value that a message quotes."""
+
+
+def is_written(file: Path) -> bool:
+    """Whether a file that jcr may have written is there; InputError where something else has its name."""
+    if not os.path.lexists(file) and (not os.path.lexists(file.parent) or file.parent.is_dir()):
+        return False
+    if not os.path.lexists(file):
+        raise InputError(f"{file.parent}: is no folder; remove it, or name another run")
+    if not file.is_file():
+        kind = (
+            "a folder" if file.is_dir() else "a link to nothing" if not file.exists() else "no regular file"
+        )
+        raise InputError(f"{file}: is {kind}; remove it, or name another run")
+    return True
 
 
 def read_text(file: Path) -> str:

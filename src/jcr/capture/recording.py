@@ -1,11 +1,11 @@
 """From a recording to a capture: the best frames are chosen, and put in a folder with a capture.json."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Float, Int, UInt16
 from numpy import ndarray
 
 from jcr.capture.best_frames import best_frames
@@ -13,13 +13,11 @@ from jcr.capture.checks import checked_capture
 from jcr.capture.depth_images import FOLDER as DEPTH
 from jcr.capture.images import encode_png, sharpness
 from jcr.capture.options import ReadOptions
+from jcr.capture.recorded_cameras import Lens, Pictures, RecordedCamera, kept_pictures
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.progress import Progress
-from jcr.records import Capture, Intrinsics
-
-Pictures = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
-"""Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
+from jcr.records import Capture
 
 
 def capture_of_recording(
@@ -29,16 +27,18 @@ def capture_of_recording(
     speed: Float[ndarray, " n"],
     gap_ns: Int[ndarray, " n"],
     pictures: Pictures,
-    lens_of_size: Callable[[tuple[int, int]], Intrinsics | None],
+    lens_of_size: Lens,
     options: ReadOptions,
     into: Path,
     report: Progress,
     joints: Float[ndarray, "n j"] | None = None,
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None,
+    camera_name: str | None = None,
+    others: Sequence[RecordedCamera] = (),
 ) -> Capture:
     """The best frames of a recording in the folder `into`; `names` are those of the frames, without ending.
     `joints` (rad) are those of the arm in `options.urdf`, where they are known; `depth_at` gives the depth (mm) aligned
-    with the frame of a row.
+    with the frame of a row. `others` are further cameras, for whose sake this one may need a name.
 
     Frames whose pose is interpolated over more than `options.max_gap_ms` are stale. Raises InputError when all
     are, or when too few are still and sharp.
@@ -88,4 +88,7 @@ def capture_of_recording(
         capture = replace(capture, joints=joints[rows], urdf=options.urdf)
     if any(depths):
         capture = replace(capture, depths=tuple(depths))
+    if others:
+        further = kept_pictures(others, rows, names, into, str(source))
+        capture = replace(capture, camera_name=camera_name or capture.camera_name, others=further)
     return replace(capture, intrinsics=lens_of_size(capture.image_size), notes=notes)

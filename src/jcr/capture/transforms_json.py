@@ -5,7 +5,7 @@ Its cameras have OpenGL's axes (y up, z backward) and pixels counted from the co
 
 import math
 import os
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_capture, checked_lens, read_rigid, require_frames
+from jcr.capture.checks import checked_lens, read_rigid, require_frames
+from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
-from jcr.capture.table import PICTURES, gripper_poses
+from jcr.capture.table import PICTURES
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
@@ -29,11 +30,30 @@ _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1"
 def read(path: Path, options: ReadOptions) -> Capture:
     """The images that a transforms.json and a table of gripper poses both know."""
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
-    names, _ = read_cameras(file)
-    known, poses, notes = gripper_poses(folder, names, options)
-    capture = checked_capture(folder, [names[k] for k in known], poses, str(file))
-    lens = read_lens(file, capture.image_size)
-    return replace(capture, intrinsics=lens, source=file, cameras=file, notes=notes)
+    return capture_of_cameras(folder, _cameras(file), options, file)
+
+
+def _cameras(file: Path) -> list[ModelCamera]:
+    """The cameras of a file, those with most images first: where frames have intrinsics of their own, by these and by
+    their folder."""
+    names, poses = read_cameras(file)
+    content = read_json(file)
+    groups: dict[object, list[int]] = {}
+    for k, (name, frame) in enumerate(zip(names, content["frames"], strict=True)):
+        own = tuple((key, str(frame[key])) for key in _LENS_KEYS if key in frame)
+        groups.setdefault((own, str(Path(name).parent)) if own else None, []).append(k)
+    if one_each([len(rows) for rows in groups.values()]):
+        groups = {None: list(range(len(names)))}
+    return [
+        ModelCamera(
+            Path(names[rows[0]]).parent.name,
+            tuple(names[k] for k in rows),
+            poses[rows],
+            tuple(rows),
+            partial(_lens, content | {"frames": [content["frames"][k] for k in rows]}, file),
+        )
+        for rows in sorted(groups.values(), key=lambda rows: (-len(rows), rows[0]))
+    ]
 
 
 def read_cameras(file: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
@@ -67,7 +87,10 @@ def _located(file: Path, name: str, k: int) -> str:
 
 def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
     """The one lens of all frames, of the given size; InputError when there are several, or a strange one."""
-    content: dict[str, Any] = read_json(file)
+    return _lens(read_json(file), file, size)
+
+
+def _lens(content: dict[str, Any], file: Path, size: tuple[int, int]) -> Intrinsics:
     lenses = [
         {key: source[key] for key in _LENS_KEYS if key in source}
         for source in (content | frame for frame in content["frames"])

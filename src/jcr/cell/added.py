@@ -8,7 +8,7 @@ from pathlib import Path
 from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
 from jcr.capture.images import read_image
 from jcr.capture.lens_json import read_lens_of_these
-from jcr.capture.plain_files import read_json
+from jcr.capture.plain_files import is_written, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.records import Capture, CellCamera
@@ -19,10 +19,15 @@ FOLDER, FILE = "cameras", "cameras.json"
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
     """The cameras added to a run so far; InputError where their file or a picture was damaged."""
     folder = run_folder / FOLDER
-    if not (folder / FILE).is_file():
+    if not is_written(folder / FILE):
         return ()
     alone = replace(capture, folder=folder, others=())
-    read = with_cameras(alone, read_json(folder / FILE), folder / FILE)
+    content = read_json(folder / FILE)
+    if not isinstance(content, dict) or not content:
+        raise InputError(
+            f"{folder / FILE}: damaged; remove {folder}, and add the cameras again (jcr add-camera)"
+        )
+    read = with_cameras(alone, content, folder / FILE)
     return tuple(replace(camera, folder=folder) for camera in read.others)
 
 

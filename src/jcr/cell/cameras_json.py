@@ -10,7 +10,7 @@ from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from jcr.calibration.calibration_json import Lens, Matrix, Spread, Spread3
-from jcr.capture.plain_files import first_fault, read_json
+from jcr.capture.plain_files import first_fault, is_written, read_json
 from jcr.cell.found import ArmFound, CameraFound, CellFound
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -176,7 +176,7 @@ def write_cameras(folder: Path, content: CamerasFile) -> None:
 def read_cameras(folder: Path) -> CamerasFile | None:
     """The cameras.json of a run folder, None where it has none; InputError where it was damaged."""
     file = folder / FILE
-    if not file.is_file():
+    if not is_written(file):
         return None
     read_json(file)  # says what is no JSON
     try:

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.calibration.calibration_json import image_verdicts
 from jcr.calibration.intrinsics_prior import prior_about
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import MIN_OBSERVATIONS, calibrate, of_images
+from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
 from jcr.cell.bundle import Freedom, Pictures, Scene, adjust_images
-from jcr.cell.found import CameraFound, PictureFound
+from jcr.cell.found import CameraFound
 from jcr.cell.ties import Tie, tied
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, scale_translation
@@ -44,25 +44,6 @@ def exchanged(capture: Capture) -> Capture:
     )
 
 
-def of_camera(capture: Capture, camera: CellCamera) -> Capture:
-    """The capture of a further camera that watches this gripper."""
-    assert camera.frame is not None
-    rows = camera.frame
-    return replace(
-        capture,
-        folder=camera.folder or capture.folder,
-        images=camera.images,
-        base_from_gripper=capture.base_from_gripper[rows],
-        image_size=camera.image_size,
-        intrinsics=camera.intrinsics,
-        intrinsics_std=camera.intrinsics_std,
-        joints=None if capture.joints is None else capture.joints[rows],
-        camera_name=camera.name,
-        mount="base",
-        others=(),
-    )
-
-
 def calibrated_alone(
     capture: Capture,
     camera: CellCamera,
@@ -79,32 +60,13 @@ def calibrated_alone(
         reconstruction = reconstruct(seen, replace(reconstruct_options, backend="auto"), progress)
         found = refined(own, reconstruction, calibrate(seen, reconstruction, options), options)
     except NotTrustedError as error:
-        pictures = tuple(PictureFound(image, False, 0, None, "not registered") for image in camera.images)
-        return CameraFound(camera.name, camera.mount, camera.arm, pictures, warnings=(str(error),))
-    pictures = []
-    for verdict, pixels in image_verdicts(own, reconstruction, found):
-        row = own.images.index(verdict.image)
-        points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
-        pictures.append(PictureFound(verdict.image, verdict.used, points, pixels, verdict.reason))
+        return not_registered(camera, str(error))
     middle = found.base_from_recon[:3, 3] + found.base_from_recon[:3, :3] @ (
         found.scale * np.median(reconstruction.tracks.points_in_recon, axis=0)
     )
     in_base = own.base_from_gripper[:, :3, :3] @ middle + own.base_from_gripper[:, :3, 3]
     away = float(np.median((in_base - found.gripper_from_camera[:3, 3]) @ found.gripper_from_camera[:3, 2]))
-    std = found.intrinsics_covariance
-    return CameraFound(
-        camera.name,
-        camera.mount,
-        camera.arm,
-        tuple(pictures),
-        found.gripper_from_camera,
-        found.covariance[:6, :6],
-        away,
-        found.intrinsics,
-        None if std is None else np.sqrt(np.diag(std)),
-        found.converged,
-        found.warnings,
-    )
+    return found_alone(own, camera, reconstruction, found, away)
 
 
 def refined(

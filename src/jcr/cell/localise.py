@@ -2,29 +2,42 @@
 
 Features that it shares with two or more images of known pose become points; the picture's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures.
+bundle adjustment of all pictures. A place that rests on few points by SIFT is refined with learned features, where these
+are installed. They alone place nothing: to a network another board of the same kind is the same board, and so is a board
+turned by half a turn (docs/cameras.md).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import project
-from jcr.geometry import apply, inverse, transform
+from jcr.camera import project, unproject
+from jcr.geometry import apply, inverse, step_between, transform
 from jcr.match.verify import HALF_PIXEL
+from jcr.match.weights import LIGHTERGLUE, XFEAT
 from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, matches, triangulated
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
+
+if TYPE_CHECKING:
+    from jcr.match.learned import LearnedFeatures
 
 FOCAL_OF_WIDTH = 0.9
 """Of a camera of which nothing is known: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
+FEW = 120
+"""Points by SIFT below which networks look for more."""
+SAME_VIEW = np.radians(5.0)
+"""By which the place with these may be turned against that without."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,42 @@ class Known:
     lens: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
     found: tuple[Features, ...]
+    learned: "Learned | None" = None
+
+
+class Learned:
+    """Matches by a network between the images of known pose, turned alike, and a picture."""
+
+    def __init__(
+        self, images: Sequence[UInt8[ndarray, "h w 3"]], recon_from_camera: Float[ndarray, "m 4 4"]
+    ) -> None:
+        self._images = images
+        # The networks take little turning: one direction of the scene is turned to the right in all of them.
+        self._right = recon_from_camera[0, :3, 0]
+        self._rolls = [self._roll(pose) for pose in recon_from_camera]
+        self._features: LearnedFeatures | None = None
+
+    def _roll(self, recon_from_camera: Float[ndarray, "4 4"]) -> float:
+        x, y, _ = recon_from_camera[:3, :3].T @ self._right
+        return -math.atan2(y, x)
+
+    def matched(
+        self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
+    ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
+        """Keypoints of a picture (px), and for each image of known pose which of them it shows, and where.
+
+        `near` is about its recon_from_camera.
+        """
+        from jcr.match.learned import LearnedFeatures
+
+        if self._features is None:  # the networks are loaded where they are needed
+            self._features = LearnedFeatures("xfeat", self._images)
+        features, last = self._features, self._features.add(picture)
+
+        roll = self._roll(near)
+        rows = [features.match(image, last, self._rolls[image], roll) for image in range(len(self._images))]
+        pairs = [(theirs[:, 1], features.x_px[k][theirs[:, 0]]) for k, theirs in enumerate(rows)]
+        return features.x_px[last], pairs
 
 
 @dataclass(frozen=True)
@@ -52,10 +101,15 @@ class Shared:
 
 
 def known_images(
-    images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics, recon_from_camera: Float[ndarray, "m 4 4"]
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    lens: Intrinsics,
+    recon_from_camera: Float[ndarray, "m 4 4"],
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
-    return Known(lens, recon_from_camera, tuple(features(image, lens) for image in images))
+    installed = XFEAT.found() and LIGHTERGLUE.found() and find_spec("torch")
+    learned = Learned(images, recon_from_camera) if installed else None
+    found = tuple(features(image, lens) for image in images)
+    return Known(lens, recon_from_camera, found, learned)
 
 
 def guessed_lens(size: tuple[int, int]) -> Intrinsics:
@@ -70,19 +124,61 @@ def localised(
 ) -> Shared | int:
     """The picture's place, or how few points it shares with the known images where these do not show it."""
     found = features(picture, lens)
-    pairs = [matches(found.descriptors, other.descriptors) for other in known.found]
-    feature = np.concatenate([mine for mine, _ in pairs])
-    row = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
-    rays, seen = (
-        np.concatenate([getattr(known.found[k], of)[theirs] for k, (_, theirs) in enumerate(pairs)])
-        for of in ("rays", "x_px")
+    of_image = [matches(found.descriptors, other.descriptors) for other in known.found]
+    seen = _Matched(
+        found.x_px,
+        np.concatenate([mine for mine, _ in of_image]),
+        np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
+        np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
     )
+    best = _located(known, seen, lens, lens_is_known, seed)
+    if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None:
+        return best
+    seen = seen.and_those(*known.learned.matched(picture, best.recon_from_camera))
+    more = _located(known, seen, lens, lens_is_known, seed)
+    if isinstance(more, int) or len(more.x_px) <= len(best.x_px):
+        return best
+    turned = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
+    return more if turned < SAME_VIEW else best
+
+
+@dataclass(frozen=True)
+class _Matched:
+    """Keypoints of a picture, and which image of known pose shows which of them where."""
+
+    x_px: Float[ndarray, "n 2"]
+    feature: Int[ndarray, " c"]
+    row: Int[ndarray, " c"]
+    row_x_px: Float[ndarray, "c 2"]
+
+    def and_those(
+        self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]
+    ) -> "_Matched":
+        """With the keypoints and matches of another kind of features."""
+        return _Matched(
+            np.concatenate([self.x_px, x_px]),
+            np.concatenate([self.feature, *(len(self.x_px) + mine for mine, _ in pairs)]),
+            np.concatenate([self.row, *(np.full(len(mine), k) for k, (mine, _) in enumerate(pairs))]),
+            np.concatenate([self.row_x_px, *(theirs for _, theirs in pairs)]),
+        )
+
+
+def _located(
+    known: Known,
+    seen: _Matched,
+    lens: Intrinsics,
+    lens_is_known: bool,
+    seed: int,
+) -> Shared | int:
+    """As `localised`, of what was matched."""
+    feature, row, count = seen.feature, seen.row, len(seen.x_px)
+    rays = unproject(known.lens, seen.row_x_px)[:, :2]
     gate = GATE_PX / known.lens.fx
-    points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, len(found.x_px))
+    points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, count)
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     candidate = np.flatnonzero(good)
-    placed = _placed(found.x_px[candidate], points[candidate], lens, lens_is_known, seed)
+    placed = _placed(seen.x_px[candidate], points[candidate], lens, lens_is_known, seed)
     if placed is None:
         return 0
     recon_from_camera, lens, inlier = placed
@@ -97,17 +193,17 @@ def localised(
     )
     ahead = in_camera[:, 2] > 1e-6
     miss = np.full(len(row), np.inf)
-    miss[ahead] = np.linalg.norm(project(known.lens, in_camera[ahead]) - seen[ahead], axis=1)
+    miss[ahead] = np.linalg.norm(project(known.lens, in_camera[ahead]) - seen.row_x_px[ahead], axis=1)
     kept = (miss < GATE_PX) & np.isin(feature, agreed)
-    number = np.zeros(len(found.x_px), int)
+    number = np.zeros(count, int)
     number[agreed] = np.arange(len(agreed))
     return Shared(
         recon_from_camera,
         lens,
         points[agreed],
-        found.x_px[agreed],
+        seen.x_px[agreed],
         row[kept],
-        seen[kept],
+        seen.row_x_px[kept],
         number[feature[kept]],
     )
 

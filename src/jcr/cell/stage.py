@@ -5,7 +5,7 @@ Every picture of another camera is localised in the reconstruction (localise.py)
 it was found: what is said here of others rests on the same images.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +40,10 @@ from jcr.rounding import significant
 
 SAME_PLACE = (0.02, np.radians(2.0))
 """m, rad: pictures of one fixed camera, or places of a camera on its gripper, differ by no more."""
+SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
+"""Of the distance of the scene, rad: the same where a focal length estimated from one picture is in it."""
+MEDIAN_PX = 3.0
+"""Pictures of a camera that miss by more, of one 1600 px wide, do not fit one place."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 EXACT = 1e-6
@@ -72,28 +76,25 @@ def place_cameras(
         return CellFound((), (), None)
     if not hand_eye.converged:
         why = f"the {capture.camera_name} camera's own calibration is not to be trusted"
-        failures = [
-            _failure(camera, [0] * len(camera.images), [None] * len(camera.images), why) for camera in others
-        ]
-        return CellFound(tuple(failures), (), None)
+        return CellFound(tuple(_Seen.nothing_of(camera).refused(why) for camera in others), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
     own = scale_translation(reconstruction.recon_from_camera[used], hand_eye.scale)
     images = [read_image(capture.folder / capture.images[row]) for row in rows]
     known = known_images(images, reconstruction.intrinsics, own)
-    seen: dict[str, list[Shared | int]] = {}
+    found: dict[str, list[Shared | int]] = {camera.name: [] for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress, "other cameras", todo):
         lens, _ = usable_lens(camera.intrinsics)
         picture = read_image((camera.folder or capture.folder) / image)
         start = lens or guessed_lens(camera.image_size)
-        seen.setdefault(camera.name, []).append(localised(known, picture, start, lens is not None))
+        found[camera.name].append(localised(known, picture, start, lens is not None))
     rigs = _Rigs(capture, hand_eye, own, rows)
     placed: list[_Member] = []
     failed: list[CameraFound] = []
     for camera in others:
-        member = rigs.add(camera, seen[camera.name])
+        member = rigs.add(_Seen.of(camera, found[camera.name]))
         if isinstance(member, CameraFound):
             failed.append(member)
         else:
@@ -119,20 +120,49 @@ def place_cameras(
 
 
 @dataclass(frozen=True)
-class _Member:
-    """A camera with the pictures that are used, in the order of its images."""
+class _Seen:
+    """What the pictures of one camera share with the images of known pose, in the order of its images."""
 
     camera: CellCamera
     shared: tuple[Shared | None, ...]
-    rig: Int[ndarray, " k"]
-    """Of each picture; -1 where it is not used."""
     counts: tuple[int, ...]
+    """Points."""
     reasons: tuple[str | None, ...]
-    rig_from_camera: Float[ndarray, "4 4"] | None
-    """Where it is not the rig's first camera."""
-    arm: int | None
-    """Place of its arm among the ties; None: fixed."""
-    notes: tuple[str, ...] = ()
+    """Why each is not used."""
+
+    @staticmethod
+    def of(camera: CellCamera, found: Sequence[Shared | int]) -> "_Seen":
+        """Of what localised() said of each picture."""
+        return _Seen(
+            camera,
+            tuple(one if isinstance(one, Shared) else None for one in found),
+            tuple(len(one.x_px) if isinstance(one, Shared) else one for one in found),
+            tuple(
+                None if isinstance(one, Shared) else f"shares {one} points with the mapped scene"
+                for one in found
+            ),
+        )
+
+    @staticmethod
+    def nothing_of(camera: CellCamera) -> "_Seen":
+        """Before anything is looked at."""
+        count = len(camera.images)
+        return _Seen(camera, (None,) * count, (0,) * count, (None,) * count)
+
+    @property
+    def rows(self) -> Int[ndarray, " k"]:
+        """Pictures that were localised."""
+        return np.flatnonzero([one is not None for one in self.shared])
+
+    @property
+    def places(self) -> Float[ndarray, "k 4 4"]:
+        """Of these."""
+        return np.stack([one.recon_from_camera for one in self.shared if one is not None])
+
+    @property
+    def distance(self) -> float:
+        """Of the scene."""
+        return float(np.median([distance(one) for one in self.shared if one is not None]))
 
     @property
     def lens(self) -> Intrinsics:
@@ -141,9 +171,36 @@ class _Member:
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
         return lens or best.lens
 
+    def without(self, reasons: Mapping[int, str]) -> "_Seen":
+        """With why some pictures are not used."""
+        return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
+
+    def refused(self, why: str) -> CameraFound:
+        """The camera is not placed."""
+        camera = self.camera
+        pictures = [
+            PictureFound(image, False, count, None, reason or "the camera was not placed")
+            for image, count, reason in zip(camera.images, self.counts, self.reasons, strict=True)
+        ]
+        return CameraFound(camera.name, camera.mount, camera.arm, tuple(pictures), warnings=(why,))
+
+
+@dataclass(frozen=True)
+class _Member:
+    """A camera with the pictures that are used."""
+
+    seen: _Seen
+    rig: Int[ndarray, " k"]
+    """Of each picture; -1 where it is not used."""
+    rig_from_camera: Float[ndarray, "4 4"] | None
+    """Where it is not the rig's first camera."""
+    arm: int | None
+    """Place of its arm among the ties; None: fixed."""
+    notes: tuple[str, ...] = ()
+
     @property
-    def distance(self) -> float:
-        return float(np.median([distance(one) for one in self.shared if one is not None]))
+    def camera(self) -> CellCamera:
+        return self.seen.camera
 
 
 class _Rigs:
@@ -157,51 +214,36 @@ class _Rigs:
         self.arms: list[str] = []
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
-    def add(self, camera: CellCamera, seen: list[Shared | int]) -> _Member | CameraFound:
+    def add(self, seen: _Seen) -> _Member | CameraFound:
         """The camera's pictures among the rigs; or why it cannot be placed."""
-        counts = tuple(len(one.x_px) if isinstance(one, Shared) else one for one in seen)
-        shared = [one if isinstance(one, Shared) else None for one in seen]
-        reasons: list[str | None] = [
-            None if isinstance(one, Shared) else f"shares {one} points with the mapped scene" for one in seen
-        ]
-        if all(one is None for one in shared):
-            most = int(np.argmax(counts))
-            return _failure(
-                camera,
-                counts,
-                reasons,
-                f"{camera.images[most]} shares {counts[most]} points with the mapped scene, too few: it must see the "
-                "same scene, unchanged, from a direction not too different",
+        if not len(seen.rows):
+            most = int(np.argmax(seen.counts))
+            return seen.refused(
+                f"{seen.camera.images[most]} shares {seen.counts[most]} points with the mapped scene, too few: it must "
+                "see the same scene, unchanged, from a direction not too different"
             )
-        if camera.arm is not None:
-            return self._on_other_arm(camera, shared, counts, reasons)
-        if camera.mount == "gripper":
-            return self._on_same_gripper(camera, shared, counts, reasons)
-        return self._fixed(camera, shared, counts, reasons)
+        if seen.camera.arm is not None:
+            return self._on_other_arm(seen, seen.camera.arm)
+        return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
 
-    def _fixed(
-        self,
-        camera: CellCamera,
-        shared: list[Shared | None],
-        counts: tuple[int, ...],
-        reasons: list[str | None],
-    ) -> _Member | CameraFound:
-        places = np.stack([one.recon_from_camera for one in shared if one is not None])
-        names = [name for name, one in zip(camera.images, shared, strict=True) if one is not None]
+    def _fixed(self, seen: _Seen) -> _Member | CameraFound:
+        places = seen.places
+        names = [seen.camera.images[k] for k in seen.rows]
         apart = step_between(places[:, None], places[None])
         metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
-        if camera.intrinsics is not None and (metres.max() > SAME_PLACE[0] or radians.max() > SAME_PLACE[1]):
-            a, b = np.unravel_index(metres.argmax(), metres.shape)
-            return _failure(
-                camera,
-                counts,
-                reasons,
+        most_m, most_rad = SAME_PLACE
+        if seen.camera.intrinsics is None:
+            most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
+        if metres.max() > most_m or radians.max() > most_rad:
+            a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
+            return seen.refused(
                 f"{names[a]} and {names[b]} were taken from places {1e3 * metres[a, b]:.0f} mm and "
                 f"{np.degrees(radians[a, b]):.1f}° apart: it is not fixed; of a camera on the gripper write mount "
-                "gripper, of several cameras give each its own name",
+                "gripper, of several cameras give each its own name"
             )
         middle = int(metres.sum(1).argmin())
-        rig = np.where([one is not None for one in shared], len(self.poses), -1)
+        rig = np.full(len(seen.shared), -1)
+        rig[seen.rows] = len(self.poses)
         self.poses.append(places[middle])
         notes = []
         own = np.stack(self.poses[: len(self._rows)])
@@ -216,33 +258,23 @@ class _Rigs:
                 f"it stands where the {self._capture.camera_name} camera was at {at}: if its picture is one of that "
                 "camera, it is not fixed"
             )
-        return _Member(camera, tuple(shared), rig, counts, tuple(reasons), None, None, tuple(notes))
+        return _Member(seen, rig, None, None, tuple(notes))
 
-    def _on_same_gripper(
-        self,
-        camera: CellCamera,
-        shared: list[Shared | None],
-        counts: tuple[int, ...],
-        reasons: list[str | None],
-    ) -> _Member | CameraFound:
-        assert camera.frame is not None
-        rig = np.full(len(shared), -1)
-        for k, (one, frame) in enumerate(zip(shared, camera.frame, strict=True)):
+    def _on_same_gripper(self, seen: _Seen) -> _Member | CameraFound:
+        assert seen.camera.frame is not None
+        rig, unused = np.full(len(seen.shared), -1), dict[int, str]()
+        for k in seen.rows.tolist():
+            frame = int(seen.camera.frame[k])
             at = np.flatnonzero(self._rows == frame)
-            if one is not None and len(at):
+            if len(at):
                 rig[k] = at[0]
-            elif one is not None:
-                reasons[k] = f"{self._capture.images[frame]}, taken with it, is not used"
+            else:
+                unused[k] = f"{self._capture.images[frame]}, taken with it, is not used"
+        seen = seen.without(unused)
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
-            return _failure(
-                camera, counts, reasons, "none of its pictures was taken with an image that is used"
-            )
-        poses = np.stack(self.poses)[rig[taken]]
-        places = [
-            one.recon_from_camera for k, one in zip(rig, shared, strict=True) if one is not None and k >= 0
-        ]
-        on_rig = inverse(poses) @ np.stack(places)
+            return seen.refused("none of its pictures was taken with an image that is used")
+        on_rig = inverse(np.stack(self.poses)[rig[taken]]) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
         off = step_between(on_rig[middle], on_rig)
@@ -250,53 +282,37 @@ class _Rigs:
             np.linalg.norm(off[:, 3:], axis=1) > SAME_PLACE[1]
         )
         if astray.mean() > 0.4:
-            return _failure(
-                camera,
-                counts,
-                reasons,
+            return seen.refused(
                 f"its place beside the {self._capture.camera_name} camera differs by up to "
                 f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between pictures: the two are not rigid, or "
-                "the pictures are not of the frames that they stand for",
+                "the pictures are not of the frames that they stand for"
             )
-        for k in taken[astray]:
-            rig[k], reasons[k] = -1, "its place on the gripper is not that of its other pictures"
-        return _Member(camera, tuple(shared), rig, counts, tuple(reasons), on_rig[middle], 0)
+        rig[taken[astray]] = -1
+        why = "its place on the gripper is not that of its other pictures"
+        seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
+        return _Member(seen, rig, on_rig[middle], 0)
 
-    def _on_other_arm(
-        self,
-        camera: CellCamera,
-        shared: list[Shared | None],
-        counts: tuple[int, ...],
-        reasons: list[str | None],
-    ) -> _Member | CameraFound:
-        assert camera.base_from_gripper is not None and camera.arm is not None
-        if camera.arm in self.arms:
-            return _failure(
-                camera, counts, reasons, f"a second camera on arm {camera.arm}: one each is supported"
+    def _on_other_arm(self, seen: _Seen, arm: str) -> _Member | CameraFound:
+        assert seen.camera.base_from_gripper is not None
+        if arm in self.arms:
+            return seen.refused(f"a second camera on arm {arm}: one each is supported")
+        if len(seen.rows) < LEAST_POSES:
+            return seen.refused(
+                f"{len(seen.rows)} of its pictures share enough of the mapped scene; {LEAST_POSES} are needed"
             )
-        taken = np.flatnonzero([one is not None for one in shared])
-        if len(taken) < LEAST_POSES:
-            return _failure(
-                camera,
-                counts,
-                reasons,
-                f"{len(taken)} of its pictures share enough of the mapped scene; {LEAST_POSES} are needed",
-            )
-        places = np.stack([one.recon_from_camera for one in shared if one is not None])
-        gripper = camera.base_from_gripper[taken]
+        places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
         if not found.converged:
-            return _failure(camera, counts, reasons, found.warnings[0])
-        rig = np.full(len(shared), -1)
-        rows = np.flatnonzero(found.inliers)
-        rig[taken[rows]] = len(self.poses) + np.arange(len(rows))
-        for k in np.flatnonzero(~found.inliers):
-            reasons[taken[k]] = found.reasons[k]
-        self.poses += list(places[rows])
-        self.arms.append(camera.arm)
-        self._of_arms.append((rig[taken[rows]], gripper[rows], found))
-        return _Member(camera, tuple(shared), rig, counts, tuple(reasons), None, len(self.arms))
+            return seen.refused(found.warnings[0])
+        rig = np.full(len(seen.shared), -1)
+        used = np.flatnonzero(found.inliers)
+        rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
+        why = {int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~found.inliers)}
+        self.poses += list(places[used])
+        self.arms.append(arm)
+        self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
+        return _Member(seen.without(why), rig, None, len(self.arms))
 
     def ties(self, options: CalibrateOptions) -> list[Tie]:
         """The arms, the capture's own first."""
@@ -314,16 +330,6 @@ class _Rigs:
             for rigs, gripper, found in self._of_arms
         ]
         return [first, *others]
-
-
-def _failure(
-    camera: CellCamera, counts: Sequence[int], reasons: Sequence[str | None], why: str
-) -> CameraFound:
-    pictures = [
-        PictureFound(image, False, count, None, reason or "the camera was not placed")
-        for image, count, reason in zip(camera.images, counts, reasons, strict=True)
-    ]
-    return CameraFound(camera.name, camera.mount, camera.arm, tuple(pictures), warnings=(why,))
 
 
 def _adjusted(
@@ -346,7 +352,7 @@ def _adjusted(
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
     count = len(own.points_in_recon)
     for c, member in enumerate(members, start=1):
-        for k, one in enumerate(member.shared):
+        for k, one in enumerate(member.seen.shared):
             if one is None or member.rig[k] < 0:
                 continue
             number[member.camera.name, k] = len(rig)
@@ -359,7 +365,7 @@ def _adjusted(
             rig.append(int(member.rig[k]))
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
-    lenses = [member.lens for member in members]
+    lenses = [member.seen.lens for member in members]
     priors = [
         prior_about(lens, member.camera.intrinsics is not None, member.camera.intrinsics_std)
         for lens, member in zip(lenses, members, strict=True)
@@ -430,7 +436,7 @@ def _found(
     pictures = tuple(
         PictureFound(image, reason is None, count, medians.get((camera.name, k)), reason)
         for k, (image, count, reason) in enumerate(
-            zip(camera.images, member.counts, member.reasons, strict=True)
+            zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
         )
     )
     found = CameraFound(
@@ -440,13 +446,13 @@ def _found(
         pictures,
         transform,
         covariance,
-        member.distance * answer.placed.scale,
+        member.seen.distance * answer.placed.scale,
         answer.placed.scene.cameras[c],
         lens_std,
     )
     doubt = _doubt(found, member)
     notes = list(member.notes)
-    widest = max(spread(one) for one in member.shared if one is not None)
+    widest = max(spread(one) for one in member.seen.shared if one is not None)
     if widest < LEAST_SPREAD:
         notes.append(
             f"its points lie in {100 * widest:.0f} % of the picture; more of the scene in view would help"
@@ -470,6 +476,14 @@ def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: Hand
 
 def _doubt(found: CameraFound, member: _Member) -> str | None:
     """Why the camera's place is not to be trusted, and the cure."""
+    missed = {picture.image: picture.reprojection_px or 0.0 for picture in found.pictures}
+    worst = max(missed, key=lambda image: missed[image])
+    if missed[worst] > MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
+        moved = "it is not fixed" if found.mount == "base" else "it is not rigid on the gripper"
+        return (
+            f"{worst} misses the place that fits its pictures together by {missed[worst]:.0f} px (median): {moved}, the "
+            "scene changed, or the intrinsics are wrong"
+        )
     assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
     std = np.sqrt(np.diag(found.covariance))
     if std[:3].max() <= MAX_STD[0] and std[3:].max() <= MAX_STD[1]:

@@ -41,6 +41,8 @@ class PosedImages:
     tracks: Tracks
     """As the reconstruction has them; see `points_in_base` for the points."""
     points_in_base: Float[ndarray, "p 3"]
+    beside: tuple[int, ...] | None = None
+    """Of a further camera on the same gripper: rows of the capture's own images that its images were taken with."""
 
 
 def posed_images(
@@ -142,10 +144,11 @@ def write_colmap(
     with _new_folder(folder) as made:
         (made / "images").mkdir()
         names, lens = _place_images(made / "images", views, undistorted, link)
-        model = _colmap_model(views, names, lens)
+        further = []
         for k, one in enumerate(others, start=1):
-            theirs, lens = _place_images(made / "images" / str(k), one, undistorted, link)
-            _add_camera(model, k + 1, lens, [f"{k}/{name}" for name in theirs], one.base_from_camera)
+            theirs, of_other = _place_images(made / "images" / str(k), one, undistorted, link)
+            further.append(_Further(one, of_other, [f"{k}/{name}" for name in theirs]))
+        model = _colmap_model(views, names, lens, further)
         model.extract_colors_for_all_images(str(made / "images"))
         sparse = made / "sparse" / "0"
         sparse.mkdir(parents=True)
@@ -157,17 +160,66 @@ def write_colmap(
         )
 
 
-def _colmap_model(views: PosedImages, names: list[str], lens: Intrinsics) -> pycolmap.Reconstruction:
+@dataclass(frozen=True)
+class _Further:
+    """A further camera as it is exported."""
+
+    views: PosedImages
+    lens: Intrinsics
+    names: list[str]
+    """In the folder of images."""
+
+
+def _colmap_model(
+    views: PosedImages, names: list[str], lens: Intrinsics, others: Sequence[_Further] = ()
+) -> pycolmap.Reconstruction:
+    """The cameras on the gripper are one rig, and a frame of it is what they saw at one pose."""
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_of(lens, known=True))
+    rig = pycolmap.Rig(rig_id=1)
+    for number, one in enumerate((lens, *(other.lens for other in others)), start=1):
+        camera = camera_of(one, known=True)
+        camera.camera_id = number
+        beside = None if number == 1 else others[number - 2].views.beside
+        if number > 1 and beside is None:
+            model.add_camera_with_trivial_rig(camera)
+            continue
+        model.add_camera(camera)
+        if beside is None:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            theirs = others[number - 2].views.base_from_camera[0]
+            rig.add_sensor(camera.sensor_id, _rigid(inverse(theirs) @ views.base_from_camera[beside[0]]))
+    model.add_rig(rig)
     x_px = views.tracks.x_px if lens == views.lens else _undistorted_px(views.tracks.x_px, views.lens, lens)
     inside = ((x_px >= -0.5) & (x_px < [lens.width - 0.5, lens.height - 0.5])).all(1)
     place = np.zeros(len(x_px), int)  # of each observation among those of its image
-    for row, (name, camera_from_base) in enumerate(zip(names, inverse(views.base_from_camera), strict=True)):
+    images: dict[int, list[pycolmap.Image]] = {}
+    for row, name in enumerate(names):
         mine = inside & (views.tracks.image == row)
         place[mine] = np.arange(mine.sum())
         image = pycolmap.Image(name=name, keypoints=x_px[mine] + 0.5, camera_id=1, image_id=row + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_base[:3]))
+        images[row] = [image]
+    count = len(names)
+    for number, other in enumerate(others, start=2):
+        for k, name in enumerate(other.names):
+            count += 1
+            image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=number, image_id=count)
+            if other.views.beside is None:
+                camera_from_base = inverse(other.views.base_from_camera[k])
+                model.add_image_with_trivial_frame(image, _rigid(camera_from_base))
+            else:
+                images[other.views.beside[k]].append(image)
+    first = max([0, *model.frames.keys()]) + 1
+    for row, together in images.items():
+        frame = pycolmap.Frame(frame_id=first + row, rig_id=rig.rig_id)
+        for image in together:
+            frame.add_data_id(image.data_id)
+            image.frame_id = frame.frame_id
+        frame.rig_from_world = _rigid(inverse(views.base_from_camera[row]))
+        model.add_frame(frame)
+        for image in together:
+            model.add_image(image)
+        model.register_frame(frame.frame_id)
     tracks = [pycolmap.Track() for _ in views.points_in_base]
     for k in np.flatnonzero(inside):
         tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
@@ -178,21 +230,8 @@ def _colmap_model(views: PosedImages, names: list[str], lens: Intrinsics) -> pyc
     return model
 
 
-def _add_camera(
-    model: pycolmap.Reconstruction,
-    number: int,
-    lens: Intrinsics,
-    names: list[str],
-    base_from_camera: Float[ndarray, "k 4 4"],
-) -> None:
-    camera = camera_of(lens, known=True)
-    camera.camera_id = number
-    model.add_camera_with_trivial_rig(camera)
-    for name, camera_from_base in zip(names, inverse(base_from_camera), strict=True):
-        image = pycolmap.Image(
-            name=name, keypoints=np.zeros((0, 2)), camera_id=number, image_id=model.num_images() + 1
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_base[:3]))
+def _rigid(a_from_b: Float[ndarray, "4 4"]) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(a_from_b[:3])
 
 
 def _undistorted_px(

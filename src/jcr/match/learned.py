@@ -48,11 +48,17 @@ class LearnedFeatures:
     """
 
     def __init__(self, kind: Literal["xfeat", "aliked"], images: Sequence[UInt8[ndarray, "h w 3"]]) -> None:
-        self._kind, self._images = kind, images
+        self._kind, self._images = kind, list(images)
         self._network, self._matcher = _networks(kind)
         self._sets: dict[tuple[int, int], _Set] = {}
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
         """Of every image, all angles together; pixel centres are whole numbers."""
+
+    def add(self, image: UInt8[ndarray, "h w 3"]) -> int:
+        """One more image; its row."""
+        self._images.append(image)
+        self.x_px.append(np.zeros((0, 2)))
+        return len(self._images) - 1
 
     def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
         """Rows of the keypoints of images i and j that match, the images turned by these angles (rad) before."""

@@ -5,7 +5,7 @@ with the cameras held. Dense pointmaps are made as for the COLMAP back end.
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -37,19 +37,18 @@ def reconstruct(
     report = progress or silent
     reader = colmap_model if cameras.is_dir() else transforms_json
     names, recon_from_camera = reader.read_cameras(cameras)
-    row_of = {Path(name).name: row for row, name in enumerate(names)}
-    known = [k for k, name in enumerate(capture.images) if Path(name).name in row_of]
+    row_of = _rows(names)
+    known = [k for k, name in enumerate(capture.images) if row_of(name) is not None]
     if len(known) < 3:
         raise InputError(
             f"{cameras}: knows {len(known)} of the capture's images by name; at least 3 are needed"
         )
-    recon_from_camera = recon_from_camera[[row_of[Path(capture.images[k]).name] for k in known]]
+    rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
+    recon_from_camera = recon_from_camera[rows]
     lens = capture.intrinsics or reader.read_lens(cameras, capture.image_size)
     plan_memory(len(known), capture.image_size, options)
     images = [read_image(capture.folder / capture.images[k]) for k in known]
-    tracks = _own_tracks(
-        cameras, [names[row_of[Path(capture.images[k]).name]] for k in known], capture.image_size
-    )
+    tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         tracks = _triangulated(images, lens, recon_from_camera, options, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
@@ -61,6 +60,19 @@ def reconstruct(
     notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()
     sparse = SparseModel(np.array(known), recon_from_camera, lens, tracks, notes)
     return with_pointmaps(sparse, images, options, report, backend="given")
+
+
+def _rows(names: Sequence[str]) -> Callable[[str], int | None]:
+    """Of an image the row of that name, with as much of its folder as the model tells; None where there is none."""
+    by_path = {Path(name).parts: row for row, name in enumerate(names)}
+    by_name = {Path(name).name: row for row, name in enumerate(names)}
+
+    def row_of(image: str) -> int | None:
+        parts = Path(image).parts
+        exact = (by_path[parts[k:]] for k in range(len(parts)) if parts[k:] in by_path)
+        return next(exact, by_name.get(parts[-1]))
+
+    return row_of
 
 
 def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> Tracks:

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.geometry import apply_similarity
+from jcr.cell.poses import base_from_camera as poses_of
+from jcr.geometry import apply_similarity, inverse
 from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.report.map_samples import SurfacePoints, point_size
 from jcr.report.markup import filled
@@ -44,9 +45,12 @@ def scene_section(
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
     tracks = PointLayer("tracked features", tracked, red)
     views = _views(result, base_from_camera)
+    others, bases = _others(result, base_from_camera)
     data = {
         **_packed_layers([*layers, tracks], base_from_camera[:, :3, 3]),
         "views": views,
+        "others": others,
+        "bases": bases,
         "next": [
             {
                 "gripper": pose.base_from_gripper[:3],
@@ -58,7 +62,8 @@ def scene_section(
         ],
         "lens": asdict(result.lens),
     }
-    checks = [("cameras", "cameras", True), ("grippers", "grippers", True), ("grid", "base and grid", True)]
+    checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
+    checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
     if result.calibration.next_poses:
         checks.append(("next", "poses to add (green)", False))
     checks.append(("tracks", "tracked features (red)", not layers))
@@ -143,3 +148,41 @@ def _views(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> list
         }
         for i, (image, name) in enumerate(zip(images, shown_names(images), strict=True))
     ]
+
+
+def _others(
+    result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The cell's further cameras, each with where it was and what it is, and the bases of other arms."""
+    if result.cameras is None:
+        return [], []
+    grippers = base_from_camera @ inverse(result.hand_eye.gripper_from_camera)
+    by_row = dict(zip(result.image_index.tolist(), grippers, strict=True))
+    known = {camera.name: camera for camera in result.capture.others}
+    out = []
+    for found in result.cameras.cameras:
+        if found.parent_from_camera is None or found.intrinsics is None:
+            continue
+        if found.mount == "base":
+            places = [np.array(found.parent_from_camera)]
+        elif found.name in known:
+            places = [*poses_of(known[found.name], found, result.cameras, by_row).values()]
+        else:
+            continue
+        arm = "" if found.arm is None else f" of arm {found.arm}"
+        doubt = "" if found.doubt is None else "\nnot to be trusted"
+        lens = found.intrinsics
+        out.append(
+            {
+                "name": found.name,
+                "caption": f"{'fixed in the base' if found.mount == 'base' else f'on the gripper{arm}'}{doubt}",
+                "fixed": found.mount == "base",
+                "lens": {key: getattr(lens, key) for key in ("fx", "fy", "cx", "cy", "width", "height")},
+                "cameras": [place[:3].round(6).tolist() for place in places],
+            }
+        )
+    bases = [
+        {"name": f"base of {arm.name}", "base": np.array(arm.base_from_other_base)[:3].round(6).tolist()}
+        for arm in result.cameras.arms
+    ]
+    return out, bases

@@ -47,7 +47,8 @@ def write_bag(
 ) -> Path:
     """A bag in which the arm stops at every view of a capture and moves smoothly between them.
 
-    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw. Topics:
+    Depth images of the capture, those of the nearest view, are on /camera/aligned_depth_to_color/image_raw; further
+    cameras NAME, on tool0 or fixed in base_link, on /NAME/image_raw/compressed. Topics:
     /camera/image_raw or /camera/image_raw/compressed, /camera/camera_info, /tf (base_link to tool0) and
     /tf_static (world to base_link).
     """
@@ -119,6 +120,11 @@ def _messages(
 
     yield START_NS, "/tf_static", tf(START_NS, "world", "base_link", np.eye(4))
     yield START_NS, "/camera/camera_info", _camera_info(types, header(START_NS, "camera"), capture)
+    if capture.others:  # tf tells which is which
+        yield START_NS, "/tf_static", tf(START_NS, "tool0", "camera", np.eye(4))
+    for camera in capture.others:
+        parent = "tool0" if camera.mount == "gripper" else "base_link"
+        yield START_NS, "/tf_static", tf(START_NS, parent, camera.name, np.eye(4))
     pictures = [read_image(capture.folder / name) for name in capture.images]
     rng = np.random.default_rng(0)
     events = [(k / tf_hz, "tf") for k in range(round(seconds * tf_hz))]
@@ -139,6 +145,12 @@ def _messages(
                 "/camera/aligned_depth_to_color/image_raw",
                 types["sensor_msgs/msg/Image"](later, *fields),
             )
+        for camera in capture.others:
+            k = 0 if camera.frame is None else int(np.abs(camera.frame - float(rows[0])).argmin())
+            data = np.frombuffer((capture.folder / camera.images[k]).read_bytes(), np.uint8)
+            later = header(at + DEPTH_LATER_NS, camera.name)
+            message = types["sensor_msgs/msg/CompressedImage"](later, "png", data)
+            yield at, f"/{camera.name}/image_raw/compressed", message
         picture = _blurred(pictures[round(float(rows[0]))], float(speeds[0]), rng)
         if compressed:
             data = np.asarray(cv2.imencode(".jpg", picture[:, :, ::-1])[1]).ravel()

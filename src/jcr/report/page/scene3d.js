@@ -34,6 +34,7 @@
     layer: Number(document.querySelector('input[name="scene-layer"]:checked')?.value ?? layers.length - 1),
     tracks: document.getElementById("scene-tracks").checked,
     cameras: document.getElementById("scene-cameras").checked,
+    others: document.getElementById("scene-others")?.checked,
     grippers: document.getElementById("scene-grippers").checked,
     grid: document.getElementById("scene-grid").checked,
     next: document.getElementById("scene-next")?.checked,
@@ -141,18 +142,58 @@
       if (!image.camera) return;
       const center = column(image.camera, 3);
       if (show.grippers && show.cameras) line(view, [grip, center], colors.faint, 1);
-      if (show.cameras) frustum(view, image.camera, color, k === picked ? 3 : 1.5);
+      if (show.cameras) frustum(view, image.camera, scene.lens, color, k === picked ? 3 : 1.5);
+    });
+    if (show.others) scene.others.forEach(({ fixed, lens, cameras }, k) => {
+      const chosen = scene.views.length + k === picked;
+      cameras.forEach((camera) =>
+        frustum(view, camera, lens, chosen ? colors.accent : colorOf(k, colors), chosen ? 3 : fixed ? 2.5 : 1.5, fixed ? 0.08 : 0.05));
     });
     if (show.next) scene.next.forEach(({ gripper, camera }) => {
       triad(view, gripper, 0.03, 2.5);
       line(view, [column(gripper, 3), column(camera, 3)], colors.next, 1);
-      frustum(view, camera, colors.next, 2.5);
+      frustum(view, camera, scene.lens, colors.next, 2.5);
     });
+    if (show.others) drawNames(view, colors);
   }
 
-  function frustum(view, camera, color, thick) {
-    const { fx, fy, cx, cy, width, height } = scene.lens;
-    const [center, reach] = [column(camera, 3), 0.05];
+  // Violet, teal, magenta, olive: none that has a meaning already.
+  const colorOf = (k, colors) => `hsl(${[262, 185, 320, 75][k % 4]} 75% ${colors.light})`;
+
+  // Behind the camera, of cameras that move once; names that would overlap are shifted down.
+  function drawNames(view, colors) {
+    const taken = [];
+    context.font = `600 ${12 * ratio}px system-ui, sans-serif`;
+    const items = scene.others.map(({ name, cameras }, k) => ({
+      name, at: column(cameras[0], 3), ahead: add(column(cameras[0], 3), column(cameras[0], 2), 0.05), color: colorOf(k, colors),
+    }));
+    scene.bases.forEach(({ name, base }) => {
+      triad(view, base, 0.1, 3);
+      items.push({ name, at: column(base, 3), ahead: add(column(base, 3), column(base, 2), 0.05), color: colors.ink });
+    });
+    for (const { name, at, ahead, color } of items) {
+      const [u, v, z] = project(view, at);
+      if (z < 0.02) continue;
+      const [wide, high] = [context.measureText(name).width, 15 * ratio];
+      const [du, dv] = project(view, ahead).map((value, k) => [u, v][k] - value);
+      const away = (10 * ratio) / Math.max(Math.hypot(du, dv), 1e-9);
+      let x = u + away * du - (du < 0 ? wide : 0);
+      x = Math.max(4 * ratio, Math.min(x, canvas.width - 4 * ratio - wide));
+      let y = v + away * dv + (dv > 0 ? 8 : 0) * ratio;
+      while (taken.some((box) => Math.abs(box.y - y) < high && x < box.x + box.wide && box.x < x + wide)) y += high;
+      taken.push({ x, y, wide });
+      context.strokeStyle = colors.paper;
+      context.lineWidth = 3 * ratio;
+      context.lineJoin = "round";
+      context.strokeText(name, x, y);
+      context.fillStyle = color;
+      context.fillText(name, x, y);
+    }
+  }
+
+  function frustum(view, camera, lens, color, thick, reach = 0.05) {
+    const { fx, fy, cx, cy, width, height } = lens;
+    const center = column(camera, 3);
     const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) =>
       apply(camera, [(reach * (u - 0.5 - cx)) / fx, (reach * (v - 0.5 - cy)) / fy, reach]));
     corners.forEach((corner, i) => {
@@ -182,7 +223,7 @@
     const show = shown();
     const view = eye();
     const style = getComputedStyle(canvas);
-    const colors = Object.fromEntries(["ink", "faint", "camera", "accent", "bad", "next"].map((name) =>
+    const colors = Object.fromEntries(["ink", "paper", "faint", "camera", "light", "accent", "bad", "next"].map((name) =>
       [name, style.getPropertyValue(`--scene-${name}`).trim()]));
     context.clearRect(0, 0, canvas.width, canvas.height);
     const picture = context.createImageData(canvas.width, canvas.height);
@@ -227,7 +268,8 @@
   function fit() {
     setThrough(-1);
     const important = scene.views.flatMap((view) => [view.gripper, view.camera].filter(Boolean).map((m) => column(m, 3)));
-    important.push([0, 0, 0]);
+    important.push([0, 0, 0], ...scene.others.flatMap(({ cameras }) => cameras.map((m) => column(m, 3))));
+    important.push(...scene.bases.map(({ base }) => column(base, 3)));
     const points = [];
     for (const { xyz } of layers.slice(0, 1)) {
       const stride = 3 * Math.max(1, Math.floor(xyz.length / 3 / 500));
@@ -291,10 +333,16 @@
         if (z > 0 && away < nearest) [best, nearest] = [k, away];
       }
     });
+    if (shown().others && state.through < 0) scene.others.forEach(({ cameras }, k) => cameras.forEach((matrix) => {
+      const [x, y, z] = project(view, column(matrix, 3));
+      const away = Math.hypot(x / ratio - u, y / ratio - v);
+      if (z > 0 && away < nearest) [best, nearest] = [scene.views.length + k, away];
+    }));
     if (best !== picked) { picked = best; redraw(); }
     tooltip.hidden = best < 0;
     if (best < 0) return;
-    tooltip.textContent = `${scene.views[best].name}\n${scene.views[best].caption}`;
+    const { name, caption } = scene.views[best] ?? scene.others[best - scene.views.length];
+    tooltip.textContent = `${name}\n${caption}`;
     tooltip.style.left = `${Math.min(u + 14, Math.max(0, box.width - tooltip.offsetWidth - 6))}px`;
     tooltip.style.top = `${Math.max(4, v - tooltip.offsetHeight - 10)}px`;
   }

@@ -1,0 +1,102 @@
+"""Further cameras of a recording: which were asked for, and their pictures beside the frames that were chosen."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from numpy import ndarray
+
+from jcr.capture.cell_cameras import MOUNTS
+from jcr.capture.checks import image_sizes
+from jcr.capture.images import encode_png
+from jcr.capture.options import ReadOptions
+from jcr.errors import InputError
+from jcr.files import write_bytes
+from jcr.records import CellCamera, Intrinsics, Mount
+
+Pictures = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
+"""Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
+Lens = Callable[[tuple[int, int]], Intrinsics | None]
+"""Intrinsics of images of a size."""
+OF_FIXED = 3
+"""Pictures of a fixed camera: more show the same again, fewer may have the arm in the way."""
+FOLDER = "cameras"
+NOT_ITS_NAME = re.compile(
+    r"^(observation\.)?(images?[./])?|[./](color|rgb|image(_raw|_rect|_rect_color|_color)?|compressed)(?=[./]|$)"
+)
+"""Of a topic or key what all cameras have."""
+
+
+@dataclass(frozen=True)
+class RecordedCamera:
+    """A camera of a recording beside the one whose frames are chosen."""
+
+    name: str
+    mount: Mount
+    pictures: Pictures
+    """Of rows of the chosen camera's frames, those that it has."""
+    lens_of_size: Lens
+
+
+def asked_cameras(options: ReadOptions) -> dict[str, Mount | None]:
+    """What --further-cameras names: by topic or key what carries the camera, None where the recording is to tell."""
+    asked: dict[str, Mount | None] = {}
+    for text in options.further_cameras:
+        key, _, said = text.partition("=")
+        mount: Mount | None = None
+        for known in MOUNTS:
+            mount = known if said == known else mount
+        if said and mount is None:
+            raise InputError(
+                f"--further-cameras {text}: write {key}=gripper for a camera on the gripper, {key}=base for a fixed one"
+            )
+        if key in asked:
+            raise InputError(f"--further-cameras {text}: names {key} twice")
+        asked[key] = mount
+    return asked
+
+
+def camera_names(keys: Sequence[str]) -> list[str]:
+    """Short names of topics or keys, all different: arm_left of /arm/left/image_raw, top of observation.images.top."""
+    names: list[str] = []
+    for key in keys:
+        words = re.sub(r"[^A-Za-z0-9]+", "_", NOT_ITS_NAME.sub("", key.strip("/"))).strip("_")
+        name = (words if words[:1].isalpha() else f"camera_{words}".rstrip("_"))[:48]
+        same = sum(other == name or other.startswith(f"{name}_again") for other in names)
+        names.append(f"{name}_again{same}" if same else name)
+    return names
+
+
+def kept_pictures(
+    cameras: Sequence[RecordedCamera], rows: Int[ndarray, " n"], names: Sequence[str], into: Path, where: str
+) -> tuple[CellCamera, ...]:
+    """The cameras with pictures in the folder `into`: of one on the gripper at each of the chosen `rows` that it has, of
+    a fixed one a few; `names` are those of all frames. InputError where one has none, or of several sizes.
+    """
+    out = []
+    for camera in cameras:
+        wanted = rows
+        if camera.mount == "base":
+            wanted = np.unique(rows[np.linspace(0, len(rows) - 1, OF_FIXED).round().astype(int)])
+        images, found = [], []
+        for row, picture, ending in camera.pictures(wanted):
+            images.append(f"{FOLDER}/{camera.name}/{names[row]}{ending}")
+            found.append(row)
+            write_bytes(into / images[-1], picture if isinstance(picture, bytes) else encode_png(picture))
+        if not images:
+            raise InputError(
+                f"{where}: camera {camera.name} has no picture of a moment at which the frames were taken; leave it out"
+            )
+        sizes = set(image_sizes(into, images))
+        if len(sizes) > 1:
+            raise InputError(
+                f"{where}: the pictures of camera {camera.name} are of several sizes; leave it out"
+            )
+        (size,) = sizes
+        frame = np.searchsorted(rows, found) if camera.mount == "gripper" else None
+        lens = camera.lens_of_size(size)
+        out.append(CellCamera(camera.name, camera.mount, tuple(images), size, lens, frame=frame))
+    return tuple(out)
