@@ -23,7 +23,7 @@ SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
 true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
-"""Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
+"""Relative. Lenses stored with real captures are up to 1.2 % from those of a board (jcr docs results/real)."""
 OFF_CENTRE = ESTIMATED["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 from jcr.errors import InputError, NotTrustedError, printable
 
@@ -39,6 +40,7 @@ COMMANDS = {
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README (in the source)",
     "models": "back ends, weights present or not, licences",
+    "docs": "the pages of the manual, in the terminal",
 }
 
 _OVERVIEW = """\
@@ -169,6 +171,18 @@ def _interrupted(error: BaseException | None) -> bool:
     return False
 
 
+def configuration() -> tuple[Any, ...]:
+    """How tyro makes options of the fields of a command's `Arguments`."""
+    import tyro
+
+    return (
+        tyro.conf.OmitArgPrefixes,
+        tyro.conf.FlagCreatePairsOff,
+        tyro.conf.PositionalMetavarFromFieldName,
+        tyro.conf.DisallowNone,
+    )
+
+
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
@@ -180,12 +194,7 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
                 command.Arguments,
                 prog=program,
                 args=list(arguments),
-                config=(
-                    tyro.conf.OmitArgPrefixes,
-                    tyro.conf.FlagCreatePairsOff,
-                    tyro.conf.PositionalMetavarFromFieldName,
-                    tyro.conf.DisallowNone,
-                ),
+                config=configuration(),
             )
     except SystemExit as stop:
         if not stop.code:

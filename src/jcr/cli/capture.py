@@ -45,7 +45,7 @@ class Arguments:
     optics: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
     """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
-    hand), or tcp (a program sends them, docs/capture.md)."""
+    hand), or tcp (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
     """How poses are typed, and how the next pose is told; auto: as the arm writes them."""
     pose_units: UnitsName = "auto"

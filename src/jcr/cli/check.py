@@ -31,7 +31,7 @@ class Arguments:
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture, or another format (docs/captures.md)."""
+    """Folder of the capture, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     suggest: int = 0
     """Propose so many gripper poses that would shrink the uncertainty most."""

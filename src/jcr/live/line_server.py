@@ -1,4 +1,4 @@
-"""Gripper poses over TCP, one JSON object a line, from any program that can open a socket (docs/capture.md).
+"""Gripper poses over TCP, one JSON object a line, from any program that can open a socket (jcr docs capture).
 
 A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) says that the arm rests there now;
 the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.

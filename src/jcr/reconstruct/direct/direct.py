@@ -7,7 +7,7 @@ From there coarse to fine, with a depth for each of a few thousand pixels; in th
 that what disagrees with the robot's motion shows.
 
 Pointmaps are matched near edges; plain surfaces between them are filled with planes (depth/priors.py).
-docs/plain-tables.md says when, and what it gives.
+The page `plain-tables` says when, and what it gives.
 """
 
 from collections.abc import Sequence

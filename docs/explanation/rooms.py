@@ -1,4 +1,4 @@
-"""Draws rooms.svg, the picture of docs/architecture.md: `python docs/rooms.py` writes it beside this file.
+"""Draws rooms.svg, the picture of architecture.md: `python docs/explanation/rooms.py` writes it beside this file.
 
 The colours follow the reader's light or dark mode; the ground is opaque, so that the picture can be read on any page.
 """
@@ -43,6 +43,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (
         ("errors.py", "bad input, a rejected answer", 1),
         ("extras.py", "optional packages", 1),
+        ("pages.py", "the manual", 1),
         ("deflate.py", "zlib before pycolmap", 1),
     ),
 )
