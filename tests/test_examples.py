@@ -190,3 +190,21 @@ def test_the_notebook_runs_and_shows_the_result(tmp_path: Path):
     assert "<b>gripper_from_camera</b>, accepted" in done.stdout
     assert (tmp_path / "out/notebook/report.html").is_file()
     assert "out/notebook/export/hand_eye.launch" in done.stdout
+
+
+def test_the_python_of_the_readme_prints_what_the_readme_shows(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("torch")
+    section = (ROOT / "README.md").read_text().split("## Ten lines of Python")[1]
+    code, shown = re.findall(r"```(?:python)?\n(.*?)```", section, flags=re.DOTALL)[:2]
+    (tmp_path / "examples").symlink_to(EXAMPLES)
+    shutil.copytree(done, tmp_path / "out" / "tabletop")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    number = re.compile(r"-?\d+\.?\d*")
+    assert number.sub("", printed).split() == number.sub("", shown).split()
+    assert np.allclose(
+        [*map(float, number.findall(printed))], [*map(float, number.findall(shown))], atol=0.02
+    )
