@@ -151,16 +151,19 @@ def with_claims(index: str, out: Path, without: Collection[str] = ()) -> str:
         f"| {_cell(claim)} | {_cell(number)} | [`{_command(page)}`]({page.name}) | {_commit(page)} |"
         for page in sorted(out.glob("*.md"))
         if page.name != "README.md" and page.stem not in without
-        for claim, number in map(_parts, claims(page))
+        for claim, number in (_parts(claim, page) for claim in claims(page))
     ]
     head = ["", "| claim | number | command | commit |", "|---|---|---|---|"]
     return "\n".join([before + begin, *head, *rows, "", end]) + after
 
 
-def _parts(claim: str) -> tuple[str, str]:
-    """What was measured, and what came out, where a colon parts them."""
+def _parts(claim: str, page: Path) -> tuple[str, str]:
+    """What was measured, and what came out: parted by a colon, or what the bench is for and the whole."""
     about, colon, number = claim.partition(": ")
-    return (about, number) if colon else (claim, "")
+    if colon:
+        return about, number
+    lines = [line for line in page.read_text().splitlines() if line]
+    return lines[1] if len(lines) > 1 else page.stem, claim
 
 
 def _cell(text: str) -> str:

@@ -5,7 +5,10 @@ import re
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
+from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
@@ -29,6 +32,7 @@ suppress_warnings = ["myst.strikethrough"]
 nitpicky = True
 highlight_language = "text"
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"jcr {release}"
 html_static_path = ["_static"]
@@ -53,6 +57,14 @@ def _files_beside(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"\[([^\]\n]+)\]\((\.\.?/[^)\s]+)\)", there, source[0])
 
 
+def _formula(translator: Any, node: nodes.Element) -> None:
+    """As MathML, which browsers draw without a script from elsewhere."""
+    display = "block" if isinstance(node, nodes.math_block) else "inline"
+    translator.body.append(convert(node.astext(), display=display))
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
+    app.add_html_math_renderer("mathml", (_formula, None), (_formula, None))
     app.connect("source-read", _files_beside)

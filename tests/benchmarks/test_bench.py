@@ -105,7 +105,7 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     write_index(outcomes, tmp_path, "jcr bench all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
     assert "2 of 3 benches were run this time, in 1.5 minutes" in index
-    assert "| the map is good |  | [`jcr bench map`](map.md) |" in index
+    assert "| map | the map is good | [`jcr bench map`](map.md) |" in index
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 
 
@@ -119,12 +119,11 @@ def test_a_page_older_than_the_sources_is_measured_again(tmp_path: Path):
 
 
 def test_claims_go_between_the_marks_as_a_table_and_an_index_without_them_is_refused(tmp_path: Path):
-    (tmp_path / "map.md").write_text(
-        f"# map\n\n    jcr bench map\n\n2026-11-22, commit `abcdef0`.\n{CLAIM}the map: 1 mm off\n{CLAIM}2 s long\n"
-    )
+    about = "# map\n\nof things\n\n    jcr bench map\n\n2026-11-22, commit `abcdef0`.\n"
+    (tmp_path / "map.md").write_text(f"{about}{CLAIM}the map: 1 mm off\n{CLAIM}2 s long\n")
     written = with_claims(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n", tmp_path)
     command = "[`jcr bench map`](map.md) | `abcdef0` |"
-    assert f"| the map | 1 mm off | {command}\n| 2 s long |  | {command}\n" in written
+    assert f"| the map | 1 mm off | {command}\n| of things | 2 s long | {command}\n" in written
     assert written.startswith("before\n") and written.endswith("after\n") and "old" not in written
     with pytest.raises(InputError, match="marks|lines"):
         with_claims("no marks", tmp_path)
