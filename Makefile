@@ -55,7 +55,7 @@ docs: .venv-docs/ready
 	touch $@
 
 # Wheel and source, checked as a package index checks them.
-dist:
+dist: docs
 	$(PYTHON) -m venv .venv-dist
 	.venv-dist/bin/pip install --quiet --disable-pip-version-check build twine
 	rm -rf dist

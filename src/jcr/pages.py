@@ -13,16 +13,16 @@ SECTIONS = ("tutorials", "how-to", "reference", "explanation", "results")
 
 def pages() -> dict[str, Path]:
     """The file of each page by its name, as `jcr docs` takes it; empty where no page was installed."""
-    if CHECKOUT.is_dir():
+    if (CHECKOUT / "conf.py").is_file():
         found = sorted(CHECKOUT.rglob("*.md"))
     else:
         try:
-            installed = files(DISTRIBUTION) or []
+            installed = [file for file in files(DISTRIBUTION) or [] if file.suffix == ".md"]
         except PackageNotFoundError:  # run from source files alone
             installed = []
         found = sorted(Path(str(file.locate())) for file in installed if f"doc/{DISTRIBUTION}/" in str(file))
     order = {section: number for number, section in enumerate(SECTIONS)}
-    found = [path for path in found if path.suffix == ".md" and path.parent.name in order]
+    found = [path for path in found if path.parent.name in order and path.name not in ("index.md", "README.md")]
     found.sort(key=lambda path: order[path.parent.name])
     return {_name(path): path for path in found}
 
