@@ -77,10 +77,10 @@ def test_a_capture_is_calibrated_and_reported(calibrated: Path, tabletop: Path):
 def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_path: Path):
     done = run_jcr("calibrate", capture, tmp_path / "out", "--quiet")
     assert done.returncode == 0, done.stderr
-    one, other = (
-        json.loads((out / "calibration.json").read_text()) for out in (calibrated, tmp_path / "out")
-    )
-    assert one["gripper_from_camera"] == other["gripper_from_camera"]
+    compared = run_jcr("compare", tmp_path / "out", calibrated, "--json")
+    assert compared.returncode == 0, compared.stderr
+    # Equal to the last digit as a rule, but once a process with other libraries loaded was 0.2 mm away.
+    assert max(map(abs, json.loads(compared.stdout)["sigmas"])) < 1
 
 
 @pytest.mark.parametrize(

@@ -31,12 +31,14 @@ SHEAR = "shear"
 
 @dataclass(frozen=True)
 class Nuisance:
-    """The normal equations with every column that may be freed, points eliminated."""
+    """The normal equations of every column that may be freed; points and the adjustment's own unknowns eliminated."""
 
-    hessian: Float[ndarray, "d d"]
-    right: Float[ndarray, " d"]
-    base: int
-    """Columns of the adjustment itself: X (6), its free intrinsics, the grippers."""
+    hessian: Float[ndarray, "e e"]
+    right: Float[ndarray, " e"]
+    x_covariance: Float[ndarray, "6 6"]
+    """Of X where nothing is freed."""
+    x_by_extra: Float[ndarray, "6 e"]
+    """How far X moves with each column."""
     images: int
     dispersion: float
     """Variance of what pulls at a parameter, over what the weights say."""
@@ -72,7 +74,7 @@ class Nuisance:
     @property
     def extra(self) -> int:
         """Columns that may be freed."""
-        return len(self.right) - self.base
+        return len(self.right)
 
     def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
         out = np.zeros((self.extra, shares.shape[1]))
@@ -115,25 +117,21 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
     by_camera = by_parameters(camera, in_camera)
     names = parameter_names(camera)
     c, base = len(lens_std), 6 + len(lens_std) + 6 * m
-    j = np.zeros((len(image), 2, base + nuisance_columns(camera, m)), np.float32)
-    each = np.arange(len(image))
-    j[:, :, :3] = -by_gripper
-    j[:, :, 3:6] = np.cross(by_gripper, (in_gripper - x_offset)[:, None])
-    j[:, :, 6 : 6 + c] = by_camera @ lens
-    for axis in range(3):
-        j[each, :, 6 + c + 6 * image + axis] = -by_base[:, :, axis]
-    turned = np.cross(by_base, np.einsum("kij,kj->ki", gripper[:, :3, :3], in_gripper)[:, None])
-    for axis in range(3):
-        j[each, :, 6 + c + 6 * image + 3 + axis] = turned[:, :, axis]
     units = np.array([used.fx, used.fy, used.width, used.width, *[1.0] * (len(names) - 4)])
-    j[:, :, base : base + len(names)] = by_camera * units
-    at = base + len(names)
-    row = (x_px[:, 1] - camera.cy) / camera.height
-    j[:, 0, at] = camera.fx * row
-    j[each, :, at + 1 + image] = (x_px - [camera.cx, camera.cy]).astype(np.float32)
-    j[each, 0, at + 1 + m + image] = camera.fx * row
+    sheared = np.zeros((len(image), 2, 1))
+    sheared[:, 0, 0] = camera.fx * (x_px[:, 1] - camera.cy) / camera.height
+    turned = np.cross(by_base, np.einsum("kij,kj->ki", gripper[:, :3, :3], in_gripper)[:, None])
+    at_x = np.cross(by_gripper, (in_gripper - x_offset)[:, None])
+    common = np.concatenate([-by_gripper, at_x, by_camera @ lens, by_camera * units, sheared], axis=2)
+    own = np.concatenate([-by_base, turned, (x_px - [camera.cx, camera.cy])[..., None], sheared], axis=2)
 
-    hessian, right = _eliminated(j, by_base, residual, weight, point, len(points))
+    at = base + len(names)
+    of_all = np.r_[0 : 6 + c, base : at + 1]
+    each = np.arange(m)[:, None]
+    of_image = np.hstack([6 + c + 6 * each + np.arange(6), at + 1 + each, at + 1 + m + each])
+    hessian, right = _without_points(
+        _Columns(common, own, of_all, of_image, image), by_base, residual, weight, point, len(points)
+    )
     told = step_between(problem.reported, bundle.base_from_gripper).ravel()
     poses = slice(6 + c, base)
     hessian[poses, poses] += adjusted.precision
@@ -149,7 +147,7 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
     )
     distance = np.where(np.isfinite(distance), distance, np.nanmedian(distance))
     spread = _dispersion(residual, weight, image, x_px, camera.width, len(points), m)
-    return Nuisance(hessian, right, base, m, spread, names, units, distance)
+    return Nuisance(*_without_adjusted(hessian, right, base), m, spread, names, units, distance)
 
 
 def nuisance_columns(camera: Intrinsics, images: int) -> int:
@@ -157,8 +155,26 @@ def nuisance_columns(camera: Intrinsics, images: int) -> int:
     return len(parameter_names(camera)) + 1 + 2 * images
 
 
-def _eliminated(
-    j: Float[ndarray, "k 2 d"],
+@dataclass(frozen=True)
+class _Columns:
+    """Derivatives of observations: columns that all images share, and those of each image by itself."""
+
+    common: Float[ndarray, "k 2 s"]
+    own: Float[ndarray, "k 2 o"]
+    of_all: Int[ndarray, " s"]
+    """Places of the shared columns."""
+    of_image: Int[ndarray, "m o"]
+    """Places of each image's."""
+    image: Int[ndarray, " k"]
+
+    @property
+    def count(self) -> int:
+        """Of all columns."""
+        return len(self.of_all) + self.of_image.size
+
+
+def _without_points(
+    columns: _Columns,
     by_point: Float[ndarray, "k 2 3"],
     residual: Float[ndarray, "k 2"],
     weight: Float[ndarray, " k"],
@@ -167,22 +183,50 @@ def _eliminated(
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
     """Hessian and right side after the points: Schur's complement."""
     root = np.sqrt(weight)[:, None]
-    d = j.shape[2]
-    flat = (j * root[..., None]).reshape(-1, d).astype(np.float64)
-    scaled = residual * root
-    hessian, right = flat.T @ flat, -(flat.T @ scaled.ravel())
-    to_point = by_point * root[..., None]
-    v = np.zeros((count, 3, 3))
-    np.add.at(v, point, np.swapaxes(to_point, 1, 2) @ to_point)
+    common, own, to_point = (part * root[..., None] for part in (columns.common, columns.own, by_point))
+    scaled, d = residual * root, columns.count
+    hessian, right = np.zeros((d, d)), np.zeros(d)
+    for k, places in enumerate(columns.of_image):
+        rows = columns.image == k
+        block = np.concatenate([common[rows], own[rows]], axis=2).reshape(
+            -1, len(columns.of_all) + len(places)
+        )
+        at = np.r_[columns.of_all, places]
+        hessian[np.ix_(at, at)] += block.T @ block
+        right[at] -= block.T @ scaled[rows].ravel()
+    transposed = np.swapaxes(to_point, 1, 2)
+    v, w = np.zeros((count, 3, 3)), np.zeros((count, 3, d + 1))
+    np.add.at(v, point, transposed @ to_point)
     v += (1e-9 * np.trace(v, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(3)
-    order = np.argsort(point, kind="stable")
-    starts = np.searchsorted(point[order], np.arange(count))
-    pull = np.concatenate([flat.reshape(-1, 2, d), scaled[..., None]], axis=2)[order]
-    w = np.add.reduceat(np.swapaxes(to_point[order], 1, 2) @ pull, starts)
+    shared = np.zeros((count, 3, len(columns.of_all)))
+    np.add.at(shared, point, transposed @ common)
+    w[:, :, columns.of_all] = shared
+    axes = np.arange(3)[None, :, None]
+    np.add.at(w, (point[:, None, None], axes, columns.of_image[columns.image][:, None]), transposed @ own)
+    np.add.at(w[..., d], point, (transposed @ scaled[..., None])[..., 0])
     half = np.linalg.solve(np.linalg.cholesky(v), w).reshape(3 * count, d + 1)
     hessian -= half[:, :d].T @ half[:, :d]
     right += half[:, :d].T @ half[:, d]
     return hessian, right
+
+
+def _without_adjusted(
+    hessian: Float[ndarray, "d d"], right: Float[ndarray, " d"], base: int
+) -> tuple[
+    Float[ndarray, "e e"],
+    Float[ndarray, " e"],
+    Float[ndarray, "6 6"],
+    Float[ndarray, "6 e"],
+]:
+    """The equations of what may be freed, and X: its covariance and its derivative by that."""
+    inverse = np.linalg.inv(hessian[:base, :base])
+    by_extra = inverse @ hessian[:base, base:]
+    return (
+        hessian[base:, base:] - hessian[base:, :base] @ by_extra,
+        right[base:] - by_extra.T @ right[:base],
+        inverse[:6, :6],
+        -by_extra[:6],
+    )
 
 
 def _dispersion(
@@ -222,25 +266,22 @@ def tested(
     fewer, more = spanned(beside), spanned(both)
     without, gain_without, _ = _freed(equations, fewer)
     step, gain, covariance = _freed(equations, more)
-    base, spread, p = equations.base, equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
-    to_value = np.linalg.pinv(both)[q:] @ more
+    spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
+    to_value, to_x = np.linalg.pinv(both)[q:] @ more, equations.x_by_extra @ more
     return Tested(
         float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
-        to_value @ step[base:],
-        spread * to_value @ covariance[base:, base:] @ to_value.T,
-        step[:6] - without[:6],
-        covariance[:6, :6],
+        to_value @ step,
+        spread * to_value @ covariance @ to_value.T,
+        to_x @ step - equations.x_by_extra @ fewer @ without,
+        equations.x_covariance + to_x @ covariance @ to_x.T,
     )
 
 
 def _freed(
     equations: Nuisance, free: Float[ndarray, "e r"]
-) -> tuple[Float[ndarray, " s"], float, Float[ndarray, "s s"]]:
-    """The step with these columns free, what it gains, and the inverse of the equations."""
-    base, r = equations.base, free.shape[1]
-    to_all = np.zeros((len(equations.right), base + r))
-    to_all[:base, :base], to_all[base:, base:] = np.eye(base), free
-    covariance = np.linalg.inv(to_all.T @ equations.hessian @ to_all)
-    right = to_all.T @ equations.right
+) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
+    """How far these combinations go where they are free, what it gains, and the covariance."""
+    covariance = np.linalg.inv(free.T @ equations.hessian @ free)
+    right = free.T @ equations.right
     step = covariance @ right
     return step, float(right @ step), covariance
