@@ -27,7 +27,7 @@ class Bench:
     timed: bool = False
     """Measures time, so that nothing else may run beside it."""
     draws: bool = False
-    """Writes pictures beside its page."""
+    """Writes images beside its page."""
     of_captures: bool = False
     """Asks for the folder of captures."""
     measures: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ BENCHES = {
         measures=(*SOLVER, *FEATURES, *READING),
     ),
     "cameras": Bench(
-        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld pictures of captures in DIR",
+        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld images of captures in DIR",
         of_captures=True,
         measures=(*SOLVER, *FEATURES, *READING, "src/jcr/cell", "src/jcr/simulate"),
     ),
@@ -210,7 +210,7 @@ class Arguments:
     boards: tuple[str, ...] = ()
     """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
+    """Also write NAME.md in this folder, and the images of those benches that draw some."""
     resume: bool = False
     """For all: leave out the benches whose page is newer than the program's source files."""
     write: bool = False

@@ -57,7 +57,7 @@ def commit_of(page: Path) -> str:
 
 
 def changed_since_measured(page: Path, paths: Sequence[str], at_most: int | None = None) -> list[str]:
-    """Files under `paths` that compute something else than at the commit of the page; `at_most` so many.
+    """Files under `paths` that compute something else than at the commit of the page; `at_most` this many.
 
     What a file says is no difference: comments, docstrings, and texts of more than one word.
     """

@@ -278,9 +278,9 @@ def write_lerobot(
     fps: int = 10,
     codec: str | None = "libsvtav1",
 ) -> Path:
-    """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video.
+    """A data set of episodes (images, states), with one camera; v3.0 keeps them all in one table and video.
 
-    Without a codec the pictures are in the table, as PNG files.
+    Without a codec the images are in the table, as PNG files.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

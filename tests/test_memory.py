@@ -35,7 +35,7 @@ SIDE = 320
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten pictures of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
+    """Ten images of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
     from safetensors.torch import save_file
 
     from benchmarks.pairs import random_network

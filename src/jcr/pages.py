@@ -22,7 +22,9 @@ def pages() -> dict[str, Path]:
             installed = []
         found = sorted(Path(str(file.locate())) for file in installed if f"doc/{DISTRIBUTION}/" in str(file))
     order = {section: number for number, section in enumerate(SECTIONS)}
-    found = [path for path in found if path.parent.name in order and path.name not in ("index.md", "README.md")]
+    found = [
+        path for path in found if path.parent.name in order and path.name not in ("index.md", "README.md")
+    ]
     found.sort(key=lambda path: order[path.parent.name])
     return {_name(path): path for path in found}
 

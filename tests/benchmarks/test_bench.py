@@ -64,7 +64,9 @@ def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page
 
 
 def test_what_code_says_does_not_make_a_page_old():
-    code = "def f(x):\n    'Two.'\n    if x < 0:\n        raise ValueError(f'{x} too low')\n    return x + 1\n"
+    code = (
+        "def f(x):\n    'Two.'\n    if x < 0:\n        raise ValueError(f'{x} too low')\n    return x + 1\n"
+    )
     said_otherwise = code.replace("Two", "2").replace("too low", "below zero") + "# more\n"
     assert essence(code) == essence(said_otherwise)
     assert essence(code) != essence(code.replace("x + 1", "x + 2"))

@@ -1,4 +1,4 @@
-"""Further cameras of a cell: the truth of simulated cells within sigma, pictures placed or refused with the reason."""
+"""Further cameras of a cell: the truth of simulated cells within sigma, images placed or refused with the reason."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ SCALE = 0.37
 
 
 def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Answer:
-    """As the stage does it, from starts that are near; lenses off by what is usual."""
+    """As the stage does it, from starts that are near; intrinsics off by what is usual."""
     rng = np.random.default_rng(5)
     cameras, priors = [], []
     for camera in problem.cameras:
@@ -193,12 +193,12 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert "must see the same scene" in found.cameras[0].warnings[0]
     assert "it is not fixed" in found.cameras[1].warnings[0]
     untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
-    assert "not to be trusted" in untrusted.cameras[0].warnings[0]
+    assert "rejected" in untrusted.cameras[0].warnings[0]
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Pictures of two sizes, all different."""
+    """Images of two sizes, all different."""
     for k in range(8):
         picture = np.full((48, 64, 3) if k < 7 else (24, 32, 3), 20 * k, np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
@@ -253,7 +253,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     [
         ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
         ({"mount": "base", "images": []}, "no images"),
-        ({"mount": "base", "images": ["3.png", "7.png"]}, "all pictures of a camera must have one size"),
+        ({"mount": "base", "images": ["3.png", "7.png"]}, "all images of a camera must have one size"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
         ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
         ({"mount": "base", "images": ["7.png"], "intrinsics": LENS}, "another resolution"),

@@ -123,7 +123,8 @@ def read_cameras(folder: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
 
 
 def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
-    """The one lens of all images, of the given size; InputError when there are several, or a strange one."""
+    """The one set of intrinsics of all images, of the given size; InputError when there are several, or a strange
+    one."""
     found = read_model(folder)
     cameras = {
         (camera.model.name, camera.width, camera.height, *map(float, camera.params))

@@ -1,4 +1,4 @@
-"""LeRobot data sets v2.1 and v3.0: videos or pictures of a wrist camera, with poses or joint angles frame by frame."""
+"""LeRobot data sets v2.1 and v3.0: videos or images of a wrist camera, with poses or joint angles frame by frame."""
 
 from collections.abc import Iterator
 from pathlib import Path

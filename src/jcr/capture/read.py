@@ -59,7 +59,7 @@ def read_capture(
     """The capture at a path, in any format of the page `captures`.
 
     The images of a recording (bag, LeRobot) are put in the new folder `into`, which is a capture folder itself.
-    Raises InputError naming the file, the fault and its cure: anything missing, unreadable, of another size,
+    Raises InputError naming the file, the fault and its remedy: anything missing, unreadable, of another size,
     not rigid, in millimetres, or fewer than three frames.
     """
     found = read_source(path, options, into=into, progress=progress)

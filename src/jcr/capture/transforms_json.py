@@ -66,7 +66,8 @@ def _located(file: Path, name: str, k: int) -> str:
 
 
 def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
-    """The one lens of all frames, of the given size; InputError when there are several, or a strange one."""
+    """The one set of intrinsics of all frames, of the given size; InputError when there are several, or a strange
+    one."""
     content: dict[str, Any] = read_json(file)
     lenses = [
         {key: source[key] for key in _LENS_KEYS if key in source}
@@ -74,7 +75,7 @@ def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
     ]
     first = lenses[0]
     if any(lens != first for lens in lenses):
-        raise InputError(f"{file}: its frames have different lenses; jcr needs images of one camera")
+        raise InputError(f"{file}: its frames have different intrinsics; jcr needs images of one camera")
     model = content.get("camera_model", "OPENCV")
     if model not in (
         "OPENCV",

@@ -1,8 +1,8 @@
-"""Where a picture of another camera was taken from, in the reconstruction of the capture's own camera.
+"""Where an image of another camera was taken from, in the reconstruction of the capture's own camera.
 
-Features that it shares with two or more images of known pose become points; the picture's place follows from those that
+Features that it shares with two or more images of known pose become points; the image's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures.
+bundle adjustment of all images.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
 
 FOCAL_OF_WIDTH = 0.9
-"""Of a camera of which nothing is known: where the search for its focal length starts."""
+"""Of a camera without known intrinsics: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
@@ -38,13 +38,13 @@ class Known:
 
 @dataclass(frozen=True)
 class Shared:
-    """The points that a picture shares with images of known pose, and where it was taken from."""
+    """The points that an image shares with images of known pose, and where it was taken from."""
 
     recon_from_camera: Float[ndarray, "4 4"]
     lens: Intrinsics
     points_in_recon: Float[ndarray, "p 3"]
     x_px: Float[ndarray, "p 2"]
-    """In the picture."""
+    """In the image."""
     row: Int[ndarray, " k"]
     """Image of known pose of each further observation."""
     row_x_px: Float[ndarray, "k 2"]
@@ -68,7 +68,7 @@ def guessed_lens(size: tuple[int, int]) -> Intrinsics:
 def localised(
     known: Known, picture: UInt8[ndarray, "h w 3"], lens: Intrinsics, lens_is_known: bool, seed: int = 0
 ) -> Shared | int:
-    """The picture's place, or how few points it shares with the known images where these do not show it."""
+    """The image's place, or how few points it shares with the known images where these do not show it."""
     found = features(picture, lens)
     pairs = [matches(found.descriptors, other.descriptors) for other in known.found]
     feature = np.concatenate([mine for mine, _ in pairs])
@@ -119,7 +119,7 @@ def _placed(
     lens_is_known: bool,
     seed: int,
 ) -> tuple[Float[ndarray, "4 4"], Intrinsics, ndarray] | None:
-    """Pose, lens and inliers; None where no pose has enough of these."""
+    """Pose, intrinsics and inliers; None where no pose has enough of these."""
     estimation, refinement = (
         pycolmap.AbsolutePoseEstimationOptions(),
         pycolmap.AbsolutePoseRefinementOptions(),
@@ -146,7 +146,7 @@ def _placed(
 
 
 def spread(shared: Shared) -> float:
-    """Share of the picture's area within which its points lie, as their standard deviations span it."""
+    """Share of the image's area within which its points lie, as their standard deviations span it."""
     sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(shared.x_px.T)))
     return float(sides.prod() / (shared.lens.width * shared.lens.height))
 

@@ -1,6 +1,6 @@
-"""Further cameras of a cell, placed with the calibration of the capture's own: pictures first, then robots.
+"""Further cameras of a cell, placed with the calibration of the capture's own: images first, then robots.
 
-Every picture of another camera is localised in the reconstruction (localise.py); all pictures are adjusted together
+Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together
 (bundle.py), and the arms' poses tie them to their bases (ties.py). The calibration of the capture's own camera stays as
 it was found: what is said here of others rests on the same images.
 """
@@ -39,7 +39,7 @@ from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
 from jcr.rounding import significant
 
 SAME_PLACE = (0.02, np.radians(2.0))
-"""m, rad: pictures of one fixed camera, or places of a camera on its gripper, differ by no more."""
+"""m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 EXACT = 1e-6
@@ -52,7 +52,7 @@ NOTHING: dict[str, ndarray] = {
 }
 """Fields of tracks without an observation."""
 LEAST_POSES = 3
-"""Of another arm, or of another camera on the gripper: pictures."""
+"""Of another arm, or of another camera on the gripper: images."""
 
 
 def place_cameras(
@@ -71,7 +71,7 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.converged:
-        why = f"the {capture.camera_name} camera's own calibration is not to be trusted"
+        why = f"the {capture.camera_name} camera's own calibration is rejected"
         failures = [
             _failure(camera, [0] * len(camera.images), [None] * len(camera.images), why) for camera in others
         ]
@@ -120,12 +120,12 @@ def place_cameras(
 
 @dataclass(frozen=True)
 class _Member:
-    """A camera with the pictures that are used, in the order of its images."""
+    """A camera with the images that are used, in the order of its images."""
 
     camera: CellCamera
     shared: tuple[Shared | None, ...]
     rig: Int[ndarray, " k"]
-    """Of each picture; -1 where it is not used."""
+    """Of each image; -1 where it is not used."""
     counts: tuple[int, ...]
     reasons: tuple[str | None, ...]
     rig_from_camera: Float[ndarray, "4 4"] | None
@@ -136,7 +136,7 @@ class _Member:
 
     @property
     def lens(self) -> Intrinsics:
-        """Given, or as the picture with most points has it."""
+        """Given, or as the image with most points has it."""
         lens, _ = usable_lens(self.camera.intrinsics)
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
         return lens or best.lens
@@ -158,7 +158,7 @@ class _Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
     def add(self, camera: CellCamera, seen: list[Shared | int]) -> _Member | CameraFound:
-        """The camera's pictures among the rigs; or why it cannot be placed."""
+        """The camera's images among the rigs; or why it cannot be placed."""
         counts = tuple(len(one.x_px) if isinstance(one, Shared) else one for one in seen)
         shared = [one if isinstance(one, Shared) else None for one in seen]
         reasons: list[str | None] = [
@@ -213,7 +213,7 @@ class _Rigs:
         if len(near):
             at = self._capture.images[self._rows[near[0]]]
             notes.append(
-                f"it stands where the {self._capture.camera_name} camera was at {at}: if its picture is one of that "
+                f"it stands where the {self._capture.camera_name} camera was at {at}: if its image is one of that "
                 "camera, it is not fixed"
             )
         return _Member(camera, tuple(shared), rig, counts, tuple(reasons), None, None, tuple(notes))
@@ -236,7 +236,7 @@ class _Rigs:
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
             return _failure(
-                camera, counts, reasons, "none of its pictures was taken with an image that is used"
+                camera, counts, reasons, "none of its images was taken with an image that is used"
             )
         poses = np.stack(self.poses)[rig[taken]]
         places = [
@@ -255,11 +255,11 @@ class _Rigs:
                 counts,
                 reasons,
                 f"its place beside the {self._capture.camera_name} camera differs by up to "
-                f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between pictures: the two are not rigid, or "
-                "the pictures are not of the frames that they stand for",
+                f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between images: the two are not rigid, or "
+                "the images are not of the frames that they stand for",
             )
         for k in taken[astray]:
-            rig[k], reasons[k] = -1, "its place on the gripper is not that of its other pictures"
+            rig[k], reasons[k] = -1, "its place on the gripper is not that of its other images"
         return _Member(camera, tuple(shared), rig, counts, tuple(reasons), on_rig[middle], 0)
 
     def _on_other_arm(
@@ -280,7 +280,7 @@ class _Rigs:
                 camera,
                 counts,
                 reasons,
-                f"{len(taken)} of its pictures share enough of the mapped scene; {LEAST_POSES} are needed",
+                f"{len(taken)} of its images share enough of the mapped scene; {LEAST_POSES} are needed",
             )
         places = np.stack([one.recon_from_camera for one in shared if one is not None])
         gripper = camera.base_from_gripper[taken]
@@ -334,7 +334,7 @@ def _adjusted(
     members: Sequence[_Member],
     rigs: _Rigs,
 ) -> tuple[Imaged, dict[tuple[str, int], float]]:
-    """All pictures adjusted together, and the median reprojection error (px) of each camera's by their number."""
+    """All images adjusted together, and the median reprojection error (px) of each camera's by their number."""
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     held = None
@@ -398,7 +398,7 @@ def _as_given(reconstruction: Reconstruction, hand_eye: HandEye) -> Float[ndarra
 
 
 def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"]]:
-    """Where the camera, the c-th of the pictures', is on its parent."""
+    """Where the camera, the c-th of the images', is on its parent."""
     rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
 
     def parent_from_camera(placed: Placed) -> Float[ndarray, "4 4"]:
@@ -449,7 +449,7 @@ def _found(
     widest = max(spread(one) for one in member.shared if one is not None)
     if widest < LEAST_SPREAD:
         notes.append(
-            f"its points lie in {100 * widest:.0f} % of the picture; more of the scene in view would help"
+            f"its points lie in {100 * widest:.0f} % of the image; more of the scene in view would help"
         )
     warnings = notes if doubt is None else [doubt, *notes]
     return replace(found, converged=doubt is None, warnings=tuple(warnings))
@@ -458,7 +458,7 @@ def _found(
 def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: HandEye) -> Float[ndarray, "6 6"]:
     """What the calibration of the capture's own camera counts beside its images and robot, carried over.
 
-    A wrong lens, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.
+    Wrong intrinsics, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.
     """
     size = np.sqrt(np.diag(hand_eye.covariance))
     more = (hand_eye.covariance - answer.covariance[:7, :7]) / np.outer(size, size)
@@ -469,7 +469,7 @@ def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: Hand
 
 
 def _doubt(found: CameraFound, member: _Member) -> str | None:
-    """Why the camera's place is not to be trusted, and the cure."""
+    """Why the camera's place is rejected, and the remedy."""
     assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
     std = np.sqrt(np.diag(found.covariance))
     if std[:3].max() <= MAX_STD[0] and std[3:].max() <= MAX_STD[1]:
@@ -480,7 +480,7 @@ def _doubt(found: CameraFound, member: _Member) -> str | None:
     if member.camera.intrinsics is None:
         percent = 100 * found.intrinsics_std[0] / found.intrinsics.fx
         return (
-            f"{known_to}, for its pictures do not show its intrinsics (focal length ± {significant(percent)} %): give "
-            "them, or pictures with more of the scene, at other depths"
+            f"{known_to}, for its images do not show its intrinsics (focal length ± {significant(percent)} %): give "
+            "them, or images with more of the scene, at other depths"
         )
     return f"{known_to}; let it see more of the mapped scene, or add images to the wrist camera's capture"

@@ -2,7 +2,7 @@
 
 A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
 field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
-status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug. Each has an `output` (output.py): with
+status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output` (output.py): with
 --json its result is one JSON object on stdout, with --quiet nothing but an error comes on stderr.
 """
 
@@ -29,7 +29,7 @@ COMMANDS = {
     "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
-    "add-camera": "where a fixed camera is, from its pictures of the scene of a run",
+    "add-camera": "where a fixed camera is, from its images of the scene of a run",
     "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
     "measure": "support plane and the objects on it: height, footprint, label",
     "view": "a run in 3D, in the browser",
@@ -46,7 +46,7 @@ COMMANDS = {
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-From pictures of a robot's wrist camera and the gripper pose of each: where the camera sits on the gripper,
+From images of a robot's wrist camera and the gripper pose of each: where the camera sits on the gripper,
 the metric scale, and a map in the robot's base frame.
 
 {commands}
@@ -74,7 +74,7 @@ _DISK = {
     errno.ELOOP: "a link leads back to itself; put a file or a folder there",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-"""What the machine, not the program, has wrong, and the cure."""
+"""What the machine, not the program, has wrong, and the remedy."""
 
 
 NO_DEFAULT = re.compile(r"\(default:(?:[\s│]|\x1b\[[0-9;]*m)+(?:None|True|False)\)")
@@ -153,7 +153,7 @@ def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str])
     except BaseException as error:
         if not _interrupted(error):
             raise
-        return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
+        return _fail(130, "interrupted; finished stages are kept and the same command resumes")
 
 
 def _write_no_more() -> None:

@@ -36,7 +36,7 @@ class Arguments:
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     camera: str | None = None
-    """A fixed camera of the run, to be held against a picture of the same scene by it, in place of CAPTURE: has it
+    """A fixed camera of the run, to be held against an image of the same scene by it, in place of CAPTURE: has it
     moved?"""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)

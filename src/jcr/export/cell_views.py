@@ -1,4 +1,4 @@
-"""The pictures of a cell's further cameras in the base frame, beside those of the capture's own."""
+"""The images of a cell's further cameras in the base frame, beside those of the capture's own."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ def posed_cameras(
     rows: Int[ndarray, " m"],
     gripper_from_camera: Float[ndarray, "4 4"],
 ) -> list[PosedImages]:
-    """Those of the used pictures of every camera that sees the scene; `views` are the own camera's, at `rows`."""
+    """Those of the used images of every camera that sees the scene; `views` are the own camera's, at `rows`."""
     bases = {arm.name: np.array(arm.base_from_other_base) for arm in cameras.arms}
     grippers = dict(zip(rows.tolist(), views.base_from_camera @ inverse(gripper_from_camera), strict=True))
     placed = {camera.name: camera for camera in cameras.cameras}
@@ -58,7 +58,7 @@ def _pose(
     grippers: dict[int, Float[ndarray, "4 4"]],
     bases: dict[str, Float[ndarray, "4 4"]],
 ) -> Float[ndarray, "4 4"]:
-    """base_from_camera of one picture."""
+    """base_from_camera of one image."""
     parent_from_camera = np.array(found.parent_from_camera)
     if camera.base_from_gripper is not None and camera.arm is not None:
         return bases[camera.arm] @ camera.base_from_gripper[k] @ parent_from_camera

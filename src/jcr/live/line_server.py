@@ -173,7 +173,7 @@ def pose_of(message: dict[str, Any]) -> Float[ndarray, "4 4"]:
 
 
 def _answer(client: socket.socket, answer: Answer) -> None:
-    """Send a line; a client that has gone misses it, and the picture is kept all the same."""
+    """Send a line; a client that has gone misses it, and the image is kept all the same."""
     before = client.gettimeout()
     client.settimeout(ANSWER_S)
     try:
@@ -201,7 +201,7 @@ def _refusal(reason: str) -> Answer:
 
 def _silence(listen: Listen) -> InputError:
     return InputError(
-        f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the pictures "
+        f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the images "
         "taken are kept and the same command goes on"
     )
 

@@ -20,7 +20,7 @@ CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons
 
 CC_BY_NC = "CC BY-NC 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
-"""Without what the package asks for beside these, numpy below 2 among it, of which its network uses nothing."""
+"""Without what the package asks for beside these, numpy below 2 among it; its network uses none of it."""
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -429,7 +429,7 @@ def reconstruct(
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """The reconstruction with its images in the capture's own order, of which row k was taken as order[k]."""
+    """The reconstruction with its images in the capture's own order; row k was taken as order[k]."""
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)

@@ -144,7 +144,7 @@ def _images(
         lens = pinhole = None
         warnings += (
             f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
-            "lens is estimated as a pinhole",
+            "intrinsics are estimated as a pinhole",
         )
     else:
         pinhole = lens

@@ -303,7 +303,7 @@ def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
         except OSError as error:
             raise InputError(
                 f"{tempfile.gettempdir()}: no room for pointmaps that do not fit --memory-gb ({error.strerror}); make "
-                "room, name another folder in TMPDIR, or raise --memory-gb"
+                "space, name another folder in TMPDIR, or raise --memory-gb"
             ) from None
         return np.memmap(stream, np.float32, "w+", shape=shape)
 
