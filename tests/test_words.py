@@ -12,7 +12,7 @@ GENERATED = ("cli.md", "api.md", "formats.md")
 """From the source, when the site is built."""
 
 SAY = {
-    r"\boffset (?:of the camera|in the gripper)\b|\b(?:of )?the offset(?: is)?\b": "translation, or hand-eye transform",
+    r"\boffset (?:of the camera|in the gripper)\b|\bof the offset\b|\bthe offset is\b": "translation, hand-eye transform",
     r"\blens(?:es)?\b": "intrinsics, or distortion; the glass alone is a lens",
     r"\bpictures?\b": "image",
     r"\bturn(?:s|ed|ing)?\b(?! (?:out|into|to|off|on|red|blue|green)\b)": "rotate, rotation",

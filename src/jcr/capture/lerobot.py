@@ -77,7 +77,7 @@ def _camera(features: dict[str, Feature], options: ReadOptions, path: Path) -> s
         return str(options.camera_topic)
     if options.camera_topic is not None or len(cameras) != 1:
         raise InputError(
-            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos or pictures'}"
+            f"{path}: choose the wrist's camera with --camera-topic: {', '.join(cameras) or 'no videos or images'}"
         )
     return cameras[0]
 

@@ -34,8 +34,8 @@ COMMANDS = {
     "measure": "support plane and the objects on it: height, footprint, label",
     "view": "a run in 3D, in the browser",
     "compare": "difference of two calibrations, and whether their errors explain it",
-    "verify": "is a calibration still true of today's few images",
-    "touch": "is the map where the robot's tip feels it",
+    "verify": "has the camera moved? a calibration against a few new images",
+    "touch": "touch test: the map against points touched with the robot's tip",
     "batch": "many captures, on this machine or a Ray cluster",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README (in the source)",
@@ -46,8 +46,8 @@ COMMANDS = {
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-From images of a robot's wrist camera and the gripper pose of each: where the camera sits on the gripper,
-the metric scale, and a map in the robot's base frame.
+Eye-in-hand calibration without a target: from images of a wrist camera and the gripper pose at each, the hand-eye
+transform, the metric scale, and a map in the robot's base frame.
 
 {commands}
 

@@ -255,7 +255,7 @@ def _scene(live: LiveFolder, found: Coverage) -> str:
         "<span>a pyramid opens along the gripper's z axis</span>"
     )
     return (
-        f'{_svg(parts, "Gripper poses of the pictures, and the next one")}<div class="legend">{legend}</div>'
+        f'{_svg(parts, "Gripper poses of the images, and the next one")}<div class="legend">{legend}</div>'
     )
 
 
