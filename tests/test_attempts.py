@@ -166,7 +166,7 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     assert tried == ["colmap"] and not kept.notes
     kept, tried = auto_result(problem, {"sift": NotTrustedError("0 of 8"), "xfeat": good}, monkeypatch)
     assert tried == ["colmap", "colmap"]
-    assert "colmap with sift, failed (0 of 8); colmap with xfeat (held-out" in kept.notes[0]
+    assert "colmap with sift, failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
     # Two that fail, and a third that does not: all three are told.
     refused = NotTrustedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)

@@ -123,7 +123,7 @@ def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: P
     assert off_mm < 3 * np.sqrt(3) * sigma_mm < 10 and off_deg < 3 * np.sqrt(3) * sigma_deg < 1
     assert "used: 10 of 10" in text
     assert "without rotating: observable False, trusted False" in text
-    assert re.search(r"^- offset of the camera.*; tilt the wrist", text, re.MULTILINE)
+    assert re.search(r"^- translation of the camera.*; tilt the wrist", text, re.MULTILINE)
 
 
 def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):

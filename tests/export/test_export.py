@@ -512,7 +512,7 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
                     text = str(arrays["warning"]).encode()
             else:
                 text = file.read_bytes()
-            assert b"NOT TO BE TRUSTED: scale: every view turns" in text, row.name
+            assert b"REJECTED: scale: every view rotates" in text, row.name
     assert not [path for path in run.rglob("*") if ".part" in path.name]
 
 
