@@ -12,7 +12,7 @@ GENERATED = ("cli.md", "api.md", "formats.md")
 """From the source, when the site is built."""
 
 SAY = {
-    r"\boffset (?:of the camera|in the gripper)\b|\bof the offset\b|\bthe offset is\b": "translation, hand-eye transform",
+    r"\boffset (?:of the camera|in the gripper)\b|\bof the offset\b|\bthe offset is\b": "translation",
     r"\blens(?:es)?\b": "intrinsics, or distortion; the glass alone is a lens",
     r"\bpictures?\b": "image",
     r"\bturn(?:s|ed|ing)?\b(?! (?:out|into|to|off|on|red|blue|green)\b)": "rotate, rotation",
@@ -29,7 +29,7 @@ SAY = {
     r"\bg[ai]ves? nothing\b": "failed: registered 2 of 12 images",
     r"\bdetective\b": "pose-convention diagnosis",
     r"\bfood of\b": "observations",
-    r"\bgo(?:es)? on (?:with|from)\b|\bgone on with\b": "resumed",
+    r"\bgo(?:es)? on (?:with|from)\b|\bgone on with\b|\bcommand goes on\b": "resumed",
     r"\bmend(?:s|ed)?\b": "fix",
     r"\bask(?:s|ing)? the map\b": "query the map",
     r"\bwhat leaves\b": "export formats",

@@ -27,7 +27,7 @@ class Arguments:
     """Collect a capture with a camera and the gripper poses of a robot, and see what is still missing.
 
     Each image is taken when the arm rests, and kept when it is sharp and still; OUT/live.html shows the
-    images, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command goes on.
+    images, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command resumes.
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -82,7 +82,7 @@ def main(arguments: Arguments) -> int:
         live = LiveFolder(arguments.out, lens or camera.intrinsics, arguments.robot)
         _say(f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
         collect(live, camera, _asks(arguments), arguments.collect, tell, _words(arguments, live))
-    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command goes on"
+    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command resumes"
     arguments.output.result(
         f"{len(live.names)} images in {arguments.out}{more}; next: jcr check {arguments.out}\n",
         {"capture": str(arguments.out), "images": live.names, "answers": answers},

@@ -82,7 +82,7 @@ class Newest:
                 if frame is None or not is_fresh():
                     raise InputError(
                         f"--camera {self._name}: gives no more images; check its cable and start again: the same "
-                        "command goes on where it was"
+                        "command resumes"
                     )
             yield frame
 

@@ -202,7 +202,7 @@ def _refusal(reason: str) -> Answer:
 def _silence(listen: Listen) -> InputError:
     return InputError(
         f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the images "
-        "taken are kept and the same command goes on"
+        "taken are kept and the same command resumes"
     )
 
 

@@ -254,9 +254,7 @@ def _scene(live: LiveFolder, found: Coverage) -> str:
         '<span><span class="key ghost"></span>next pose</span><span>axes of the base, grid 0.1 m</span>'
         "<span>a pyramid opens along the gripper's z axis</span>"
     )
-    return (
-        f'{_svg(parts, "Gripper poses of the images, and the next one")}<div class="legend">{legend}</div>'
-    )
+    return f'{_svg(parts, "Gripper poses of the images, and the next one")}<div class="legend">{legend}</div>'
 
 
 def _svg(parts: list[str], label: str) -> str:
