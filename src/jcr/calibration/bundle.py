@@ -25,7 +25,7 @@ from jcr.handeye.systematic import Region, smooth_errors
 from jcr.least_squares import loss_weight
 from jcr.records import Budget, Intrinsics, Tracks
 
-POINTS_AT_ONCE = 4096
+POINTS_AT_ONCE = 1024
 """Points whose coupling to the cameras is held in memory together."""
 MIN_SIGMA_PX = 0.05
 FAR_OFF = 6.0
@@ -37,6 +37,8 @@ CELLS = 8
 model leaves."""
 ENOUGH = 1e-5
 """Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
+SIZES_SETTLED = 0.01
+"""Relative change of the sizes of errors, of pixels and of the robot, from one round to the next that ends them."""
 START_NOISE = (1e-3, np.radians(0.2))
 """m, rad; of gripper poses, until it is estimated."""
 
@@ -113,6 +115,28 @@ class _Problem:
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3."""
+    groups: "list[_Group]"
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Points that are eliminated together, for they are seen by few images of many."""
+
+    points: Int[ndarray, " n"]
+    rows: Int[ndarray, " k"]
+    """Of their observations, point by point."""
+    images: Int[ndarray, " i"]
+    """That see any of them."""
+    point: Int[ndarray, " k"]
+    """Of each observation, in `points`."""
+    image: Int[ndarray, " k"]
+    """Of each observation, in `images`."""
+    starts: Int[ndarray, " n"]
+    """Each point's first observation."""
+
+    def columns(self, shared: int) -> Int[ndarray, " d"]:
+        """Of the normal equations: those that all images share, and these images' grippers."""
+        return np.r_[:shared, (shared + 6 * self.images[:, None] + np.arange(6)).ravel()]
 
 
 @dataclass(frozen=True)
@@ -132,7 +156,7 @@ class _Normal:
     schur: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
     point_steps: list
-    """Per chunk of points: Cholesky of V, W and its right side, to step the points back."""
+    """Per group of points: V, W and its right side, to step the points back."""
 
 
 def adjust(
@@ -167,6 +191,7 @@ def adjust(
         smooth_errors(base_from_gripper) if systematic is None else systematic,
         noise,
         chi2.ppf(0.5, 2 * np.bincount(point) - 3),
+        _groups(point, tracks.image[order]),
     )
     recon_scaled = recon_from_camera.copy()
     recon_scaled[:, :3, 3] *= scale
@@ -189,10 +214,10 @@ def adjust(
         total += used
         pixels = _pixel_errors(view, problem)
         equations, _ = _equations(bundle, view, problem, pixels, precision)
-        log_sizes, _ = most_likely(equations, log_sizes)
+        log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
         precision = np.linalg.inv(replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
-        if max(change, abs(np.log(pixels.sigma_px / before[0].sigma_px))) < 0.01:
+        if max(change, abs(np.log(pixels.sigma_px / before[0].sigma_px))) < SIZES_SETTLED:
             break
     equations, region = _equations(bundle, view, problem, pixels, precision)
     log_sizes, information = most_likely(equations, log_sizes)
@@ -230,6 +255,24 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
     first = np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)]
     order = order[first]
     return order[np.bincount(tracks.point[order])[tracks.point[order]] >= 2]
+
+
+def _groups(point: Int[ndarray, " k"], image: Int[ndarray, " k"]) -> list[_Group]:
+    """Points in the order of the first image that sees them: those beside each other are seen by few others."""
+    if len(point) == 0:
+        return []
+    starts = np.searchsorted(point, np.arange(point[-1] + 1))
+    seen = np.diff(np.r_[starts, len(point)])
+    by_first = np.argsort(image[starts], kind="stable")
+    groups = []
+    for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)):
+        counts = seen[points]
+        begins = np.cumsum(counts) - counts
+        rows = np.repeat(starts[points] - begins, counts) + np.arange(counts.sum())
+        images, of_image = np.unique(image[rows], return_inverse=True)
+        of_point = np.repeat(np.arange(len(points)), counts)
+        groups.append(_Group(points, rows, images, of_point, of_image, begins))
+    return groups
 
 
 def _minimise(
@@ -364,39 +407,35 @@ def _normal_equations(
     right[6:shared] -= _lens_step(bundle, problem) / problem.free.std**2
     hessian[diagonal, diagonal] *= 1 + damping
 
-    chunks = []
-    bounds = np.searchsorted(problem.point, np.arange(0, len(bundle.points_in_base), POINTS_AT_ONCE))
-    for begin, end in zip(bounds, [*bounds[1:], len(problem.point)], strict=True):
-        first = int(problem.point[begin])
-        local = problem.point[begin:end] - first
-        count = int(local[-1]) + 1
-        starts = np.searchsorted(local, np.arange(count))
-        j_point = by_base_axes[begin:end]
+    point_steps = []
+    for group in problem.groups:
+        count, columns = len(group.points), group.columns(shared)
+        j_point, missed = by_base_axes[group.rows], residual[group.rows]
         transposed = np.swapaxes(j_point, 1, 2)
-        v = np.add.reduceat(transposed @ j_point, starts)
+        v = np.add.reduceat(transposed @ j_point, group.starts)
         v[:, range(3), range(3)] *= 1 + damping
         v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
-        w = np.zeros((count, 3, size))
-        w[:, :, :shared] = np.add.reduceat(transposed @ common[begin:end], starts)
-        columns = shared + 6 * problem.image[begin:end, None] + np.arange(6)
-        w[local[:, None, None], np.arange(3)[None, :, None], columns[:, None, :]] = (
-            transposed @ own[begin:end]
+        w = np.zeros((count, 3, len(columns)))
+        w[:, :, :shared] = np.add.reduceat(transposed @ common[group.rows], group.starts)
+        of_image = shared + 6 * group.image[:, None] + np.arange(6)
+        w[group.point[:, None, None], np.arange(3)[None, :, None], of_image[:, None, :]] = (
+            transposed @ own[group.rows]
         )
-        g = np.add.reduceat((transposed @ residual[begin:end, :, None])[..., 0], starts)
+        g = np.add.reduceat((transposed @ missed[..., None])[..., 0], group.starts)
         factor = np.linalg.cholesky(v)
-        half = np.linalg.solve(factor, np.concatenate([w, g[..., None]], axis=2)).reshape(3 * count, size + 1)
-        hessian -= half[:, :size].T @ half[:, :size]
-        right += half[:, :size].T @ half[:, size]
-        chunks.append((first, count, v, w, g))
-    return _Normal(hessian, right, chunks)
+        half = np.linalg.solve(factor, np.concatenate([w, g[..., None]], axis=2)).reshape(3 * count, -1)
+        hessian[np.ix_(columns, columns)] -= half[:, :-1].T @ half[:, :-1]
+        right[columns] += half[:, :-1].T @ half[:, -1]
+        point_steps.append((group.points, columns, v, w, g))
+    return _Normal(hessian, right, point_steps)
 
 
 def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
     """The bundle after one Gauss-Newton step."""
     step = np.linalg.solve(normal.schur, normal.right)
     points = bundle.points_in_base.copy()
-    for first, count, v, w, g in normal.point_steps:
-        points[first : first + count] += np.linalg.solve(v, -(g + w @ step)[..., None])[..., 0]
+    for chosen, columns, v, w, g in normal.point_steps:
+        points[chosen] += np.linalg.solve(v, -(g + w @ step[columns])[..., None])[..., 0]
     c = len(problem.free.std)
     return Bundle(
         retract(bundle.gripper_from_camera, step[:6]),

@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.linalg import solve_triangular
+from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import root_scalar
 from scipy.stats import chi2
 
@@ -214,6 +214,13 @@ def over(root: Float[ndarray, "*k n n"], right: Float[ndarray, "*#k n r"]) -> Fl
     return upper(root, lower(root, right))
 
 
+def _inverse(root: Float[ndarray, "n n"]) -> Float[ndarray, "n n"]:
+    """(L Lᵀ)⁻¹ of a lower triangular factor L."""
+    (potri,) = get_lapack_funcs(("potri",), (root,))
+    half = np.tril(potri(root, lower=1)[0])
+    return half + np.tril(half, -1).T
+
+
 def _cholesky(matrix: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k n n"]:
     """Lower factor of a matrix that is positive definite but for rounding: of motions that show nothing it is not."""
     size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
@@ -230,22 +237,22 @@ def _cholesky(matrix: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k n n"]:
 
 
 def most_likely(
-    equations: Equations, start: LogSizes | None = None
+    equations: Equations, start: LogSizes | None = None, settled: float = SETTLED
 ) -> tuple[LogSizes, Float[ndarray, "c c"]]:
-    """Log sizes at the mode of their posterior, and the information there (Fisher scoring)."""
+    """Log sizes at the mode of their posterior, and the information there (Fisher scoring to a last step `settled`)."""
     at = np.log(equations.typical) if start is None else start
     value, gradient, information = _score(equations, at)
     for _ in range(40):
         step = np.linalg.solve(information, gradient)
         step /= max(1.0, float(np.abs(step).max()))
-        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > SETTLED:
+        while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
             step = step / 2
         if scored[0] < value:
             break
         gained = scored[0] - value
         at = at + step
         value, gradient, information = scored
-        if np.abs(step).max() < SETTLED or gained < 1e-9:
+        if np.abs(step).max() < settled or gained < 1e-9:
             break
     return at, information
 
@@ -319,22 +326,25 @@ def _prior_slope(equations: Equations, log_sizes: LogSizes) -> tuple[LogSizes, F
 def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, Float[ndarray, "c c"]]:
     """Log posterior of the sizes, its gradient, and the expected information."""
     solution = solve(equations, log_sizes)
-    inverse = over(solution.root, np.eye(len(equations.residual)))
+    inverse = _inverse(solution.root)
     projection = inverse - solution.weighed @ solution.gain
     left = inverse @ (equations.residual + equations.jacobian @ solution.step)
-    masks = (equations.of_position, 1 - equations.of_position)
-    products = [projection * mask for mask in masks]
-    squares = [left @ (mask * left) for mask in masks]
+    of_position = equations.of_position
+    masks = np.stack([of_position, 1 - of_position])
+    squares, traces = masks @ left**2, masks @ np.diagonal(projection)
+    pairs = masks @ projection**2 @ masks.T
     if equations.systematic is not None:
-        products.append(projection @ equations.systematic)
-        squares.append(left @ equations.systematic @ left)
+        by_systematic = projection @ equations.systematic
+        beside = masks @ (by_systematic * projection).sum(1)
+        own = (by_systematic * by_systematic.T).sum()
+        pairs = np.block([[pairs, beside[:, None]], [beside[None], own]])
+        squares = np.append(squares, left @ equations.systematic @ left)
+        traces = np.append(traces, np.trace(by_systematic))
     growth = np.exp(2 * log_sizes)
-    traces = np.array([np.trace(product) for product in products])
     gradient, information = _prior_slope(equations, log_sizes)
-    pairs = np.array([[(one * other.T).sum() for other in products] for one in products])
     return (
         float(solution.log_posterior),
-        gradient + growth * (np.array(squares) - traces),
+        gradient + growth * (squares - traces),
         information + 2 * np.outer(growth, growth) * pairs,
     )
 
