@@ -19,6 +19,7 @@ RUN apt-get update \
 WORKDIR /opt/jcr
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY src src
+COPY docs docs
 # torch by itself and first: an open range would bring several GB of CUDA packages where none are wanted.
 RUN case "$TORCH" in \
       cpu) pip install "torch==$TORCH_VERSION" --index-url https://download.pytorch.org/whl/cpu ;; \

@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: env demo test test-fast test-lowest lint audit
+.PHONY: env demo test test-fast test-lowest lint audit docs dist
 env: .venv/ready
 
 # torch first and pinned: an open range pulls several GB of CUDA packages.
@@ -42,6 +42,25 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+# Warnings are errors, and so are links inside the site that lead nowhere.
+docs: .venv-docs/ready
+	OMP_NUM_THREADS=1 .venv-docs/bin/python -m sphinx -b html -W --keep-going -q docs docs/_site
+	.venv-docs/bin/python docs/links.py docs/_site
+
+.venv-docs/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check torch==2.13.0
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+# Wheel and source, checked as a package index checks them.
+dist: docs
+	$(PYTHON) -m venv .venv-dist
+	.venv-dist/bin/pip install --quiet --disable-pip-version-check build twine
+	rm -rf dist
+	.venv-dist/bin/python -m build --outdir dist .
+	.venv-dist/bin/python -m twine check --strict dist/*
 
 audit: .venv/ready
 	$(BIN)/bandit --quiet --recursive src --configfile pyproject.toml --severity-level medium

@@ -27,69 +27,163 @@ class Bench:
     timed: bool = False
     """Measures time, so that nothing else may run beside it."""
     draws: bool = False
-    """Writes pictures beside its page."""
+    """Writes images beside its page."""
     of_captures: bool = False
     """Asks for the folder of captures."""
+    measures: tuple[str, ...] = ()
+    """Files and folders whose change makes its page old, beside the bench's own."""
+
+
+SOLVER = (
+    "src/jcr/handeye",
+    "src/jcr/calibration",
+    "src/jcr/camera.py",
+    "src/jcr/geometry.py",
+    "src/jcr/least_squares.py",
+)
+FEATURES = (
+    "src/jcr/match",
+    "src/jcr/reconstruct/colmap.py",
+    "src/jcr/reconstruct/sfm.py",
+    "src/jcr/attempts.py",
+)
+DEPTH = ("src/jcr/reconstruct/depth", "src/jcr/reconstruct/pointmaps.py")
+MAP = ("src/jcr/represent", "src/jcr/mapping.py")
+READING = ("src/jcr/capture",)
+WHOLE = (*SOLVER, *FEATURES, *DEPTH, *MAP, *READING, "src/jcr/pipeline.py", "src/jcr/report")
 
 
 BENCHES = {
-    "run": Bench("the whole job on the bundled capture: error, time and memory", True),
-    "table1": Bench("hand-eye calibration from few images of three scenes, by the paper and by ours"),
-    "real": Bench("real captures in DIR, against the references stored beside them", True, of_captures=True),
+    "run": Bench("the whole job on the bundled capture: error, time and memory", True, measures=WHOLE),
+    "table1": Bench(
+        "hand-eye calibration from few images of three scenes, by the paper and by ours",
+        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/global_alignment", "src/jcr/simulate"),
+    ),
+    "real": Bench(
+        "real captures in DIR, against the references stored beside them",
+        True,
+        of_captures=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/reconstruct/marker.py",
+            "src/jcr/reconstruct/board.py",
+        ),
+    ),
     "matching": Bench(
         "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
         True,
         of_captures=True,
+        measures=(*SOLVER, *FEATURES, *READING),
     ),
     "cameras": Bench(
-        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld pictures of captures in DIR",
+        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld images of captures in DIR",
         of_captures=True,
+        measures=(*SOLVER, *FEATURES, *READING, "src/jcr/cell", "src/jcr/simulate"),
     ),
-    "gate": Bench("scenes that mislead matching, with the robot's gate and without", True),
-    "many": Bench("from 8 to 200 images: seconds and peak memory", True),
+    "gate": Bench(
+        "scenes that mislead matching, with the robot's gate and without",
+        True,
+        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
+    ),
+    "many": Bench(
+        "from 8 to 200 images: seconds and peak memory",
+        True,
+        measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/simulate"),
+    ),
     "calibrate": Bench(
-        "hand-eye solvers on the same simulated poses, for accuracy and time", True, draws=True
+        "hand-eye solvers on the same simulated poses, for accuracy and time",
+        True,
+        draws=True,
+        measures=("src/jcr/handeye", "src/jcr/simulate/problem.py"),
     ),
     "robots": Bench(
-        "arms with systematic errors: is the answer within its sigma, and nearer than others'", draws=True
+        "arms with systematic errors: is the answer within its sigma, and nearer than others'",
+        draws=True,
+        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "src/jcr/simulate/problem.py"),
     ),
-    "limits": Bench("where it breaks: one thing made worse at a time", draws=True),
-    "attack": Bench("captures with one silent fault: named, refused, or wrong; and false alarms"),
-    "table2": Bench("heights of objects in simulated scenes, from 8 and 10 images"),
+    "limits": Bench(
+        "where it breaks: one thing made worse at a time",
+        draws=True,
+        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
+    ),
+    "attack": Bench(
+        "captures with one silent fault: named, refused, or wrong; and false alarms",
+        measures=(*SOLVER, "src/jcr/simulate/observations.py", "src/jcr/simulate/faults.py"),
+    ),
+    "table2": Bench(
+        "heights of objects in simulated scenes, from 8 and 10 images",
+        measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/segment", "src/jcr/simulate"),
+    ),
     "density": Bench(
-        "how much of a plain table and its objects a cloud covers, beside COLMAP's points", draws=True
+        "how much of a plain table and its objects a cloud covers, beside COLMAP's points",
+        draws=True,
+        measures=(*FEATURES, *DEPTH, "src/jcr/simulate"),
     ),
     "depth": Bench(
-        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason", True
+        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason",
+        True,
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/simulate"),
     ),
     "map": Bench(
-        "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl", True
+        "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl",
+        True,
+        measures=(*MAP, *DEPTH, "src/jcr/simulate"),
     ),
     "predictions": Bench(
-        "the whole job from pointmaps with a network's errors: error, honesty, map, time", True
+        "the whole job from pointmaps with a network's errors: error, honesty, map, time",
+        True,
+        measures=(*SOLVER, "src/jcr/reconstruct/global_alignment", "src/jcr/reconstruct/from_pairs.py", *MAP),
     ),
     "models": Bench(
-        "any-view models from predictions with published errors, beside COLMAP and direct alignment"
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment",
+        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/views_at_once", "src/jcr/reconstruct/direct"),
     ),
     "model_cost": Bench(
-        "seconds and memory of any-view networks with random weights, beside what is estimated", True
+        "seconds and memory of any-view networks with random weights, beside what is estimated",
+        True,
+        measures=("src/jcr/reconstruct/views_at_once",),
     ),
     "align": Bench(
-        "global alignment: fast against adam, kinematic against free, in error, time and memory", True
+        "global alignment: fast against adam, kinematic against free, in error, time and memory",
+        True,
+        measures=("src/jcr/reconstruct/global_alignment",),
     ),
-    "pairs": Bench("predicting pairs with every image encoded once, or with every pair", True),
-    "memory": Bench("peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks"),
-    "bag": Bench("frames chosen from a minute of a robot's MCAP: which, time and memory", True),
-    "samples": Bench("metric samples of a marker beside OpenCV's five methods"),
-    "first_day": Bench("what a new user types and sees, from files as robots write them to a URDF", True),
-    "batch": Bench("many small captures by one process and by two: time, and memory while they run", True),
+    "pairs": Bench(
+        "predicting pairs with every image encoded once, or with every pair",
+        True,
+        measures=("src/jcr/reconstruct/dust3r",),
+    ),
+    "memory": Bench(
+        "peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks",
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py", "src/jcr/reconstruct/threads.py"),
+    ),
+    "bag": Bench(
+        "frames chosen from a minute of a robot's MCAP: which, time and memory", True, measures=(*READING,)
+    ),
+    "samples": Bench(
+        "metric samples of a marker beside OpenCV's five methods",
+        measures=(*SOLVER, "src/jcr/capture/samples.py"),
+    ),
+    "first_day": Bench(
+        "what a new user types and sees, from files as robots write them to a URDF",
+        True,
+        measures=(*WHOLE, "src/jcr/cli", "src/jcr/live"),
+    ),
+    "batch": Bench(
+        "many small captures by one process and by two: time, and memory while they run",
+        True,
+        measures=(*WHOLE, "src/jcr/batch.py"),
+    ),
 }
 """In the order of the README's claims."""
 
 if TYPE_CHECKING:
     BenchName = str
 else:
-    BenchName = Literal[("all", *sorted(BENCHES))]
+    BenchName = Literal[("all", "stale", *sorted(BENCHES))]
 
 
 @dataclass(frozen=True)
@@ -100,24 +194,27 @@ class Arguments:
       jcr bench calibrate
       jcr bench run --out docs/results
       jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
-      jcr bench all captures --out docs/results --readme README.md
+      jcr bench all captures --out docs/results
+      jcr bench stale --write
     """
 
     name: Annotated[
         BenchName,
         tyro.conf.Positional,
-        tyro.conf.arg(help=f"What to measure: {', '.join(('all', *sorted(BENCHES)))}."),
+        tyro.conf.arg(
+            help=f"What to measure: {', '.join(('all', *sorted(BENCHES)))}; stale: which pages are old."
+        ),
     ]
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
     """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md in this folder, and the pictures of those benches that draw some."""
+    """Also write NAME.md in this folder, and the images of those benches that draw some."""
     resume: bool = False
     """For all: leave out the benches whose page is newer than the program's source files."""
-    readme: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """For all: a README in which the claims are put between its two marks."""
+    write: bool = False
+    """For stale: write into each page whether it is older than the code that it measures."""
     output: Output = field(default_factory=Output)
 
 
@@ -125,6 +222,8 @@ def main(arguments: Arguments) -> int:
     """Run one bench, or all of them."""
     if arguments.name == "all":
         return _all(arguments)
+    if arguments.name == "stale":
+        return _stale(arguments)
     from jcr.files import write_text
 
     name = arguments.name
@@ -152,8 +251,7 @@ def _all(arguments: Arguments) -> int:
     """Every bench; 1 when one of them failed."""
     if arguments.out is None:
         raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
-    from benchmarks.suite import Outcome, absent_networks, between_marks, run, write_index
-    from jcr.files import write_text
+    from benchmarks.suite import Outcome, absent_networks, run, write_index
 
     names: dict[str, bool] = {name: bench.timed for name, bench in BENCHES.items()}
     given: dict[str, list[str]] = {}
@@ -174,14 +272,43 @@ def _all(arguments: Arguments) -> int:
     outcomes = run(names, arguments.out, given, arguments.resume, report)
     command = " ".join(["jcr bench all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"])
     write_index(outcomes, arguments.out, command, machine(), absent, time.perf_counter() - begun)
-    if arguments.readme is not None:
-        link = os.path.relpath(arguments.out, arguments.readme.parent)
-        text = between_marks(arguments.readme.read_text(), arguments.out, list(names), link)
-        write_text(arguments.readme, text)
     index = arguments.out / "README.md"
     facts = {outcome.name: {"seconds": outcome.seconds, "trouble": outcome.trouble} for outcome in outcomes}
     arguments.output.result(index.read_text(), {"bench": "all", "benches": facts})
     return int(any(outcome.trouble for outcome in outcomes))
+
+
+def _stale(arguments: Arguments) -> int:
+    """Which pages are older than the code that they measure; 1 where one does not say so."""
+    from benchmarks.freshness import PAGES, changed_since_measured, marked, says_it_is_old
+    from benchmarks.suite import with_claims
+    from jcr.files import write_text
+
+    pages = arguments.out or PAGES
+    facts, lines, silent = {}, [], 0
+    for page in sorted(pages.glob("*.md")):
+        if (paths := paths_of(page.stem)) is None:
+            continue
+        text, changed = page.read_text(), changed_since_measured(page, paths)
+        facts[page.stem] = changed
+        lines.append(f"{page.stem}: {f'{len(changed)} files changed since' if changed else 'new'}")
+        if arguments.write:
+            write_text(page, marked(text, changed))
+        elif bool(changed) is not says_it_is_old(text):
+            silent += 1
+            lines[-1] += (
+                f"; the page does {'not say so' if changed else 'say otherwise'}: jcr bench stale --write"
+            )
+    if arguments.write:
+        write_text(pages / "README.md", with_claims((pages / "README.md").read_text(), pages))
+    arguments.output.result("\n".join(lines) + "\n", {"bench": "stale", "changed": facts})
+    return int(silent > 0)
+
+
+def paths_of(page: str) -> tuple[str, ...] | None:
+    """What the numbers of a page come from, the bench itself included; None for the index."""
+    name = {"real_all": "real"}.get(page, page)
+    return (*BENCHES[name].measures, f"benchmarks/{name}.py") if name in BENCHES else None
 
 
 def heading(arguments: Arguments) -> str:
@@ -190,9 +317,12 @@ def heading(arguments: Arguments) -> str:
     if arguments.captures is not None:
         # Where they lie is the machine's own affair.
         command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
+    from benchmarks.freshness import commit_now
+
+    measured = f"{date.today().isoformat()}, {commit_now(paths_of(arguments.name) or ())}"
     return (
         f"# jcr bench {arguments.name}\n\n{BENCHES[arguments.name].what}\n\n"
-        f"    {shlex.join(command)}\n\n{date.today().isoformat()}. {machine()}\n\n"
+        f"    {shlex.join(command)}\n\n{measured}. {machine()}\n\n"
     )
 
 

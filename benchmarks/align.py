@@ -35,7 +35,7 @@ FEW_STEPS = 3
 """Of adam at the large size, whose 300 take a quarter of an hour."""
 ERRORS = {
     "white 0.3 %, smooth distance 1 %, 2 % outliers (below: these and)": PairErrors(),
-    "pairs turned by 1° per axis": PairErrors(pair_turn_deg=1.0),
+    "pairs rotated by 1° per axis": PairErrors(pair_turn_deg=1.0),
     "smooth direction 0.6°": PairErrors(bend=0.01),
     "20 % outliers": PairErrors(outliers=0.2),
     "10 % of the pairs wrong": PairErrors(wrong_pairs=6),
@@ -195,7 +195,7 @@ def _kinds() -> str:
 def _hand_eye() -> str:
     rows = [
         f"With the robot's poses, mean camera errors and median calibration errors over {HAND_EYE_SEEDS} seeds, "
-        f"{_size(SMALL)}. The robot's noise is not told but estimated. `jcr` keeps the alignment that promises the "
+        f"{_size(SMALL)}. The robot pose noise is not told but estimated. `jcr` keeps the alignment that promises the "
         "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n",
         "| robot noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
         "|---|---|---|---|---|---|",

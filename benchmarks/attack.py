@@ -1,6 +1,6 @@
 """`jcr bench attack`: captures with one thing wrong that looks like nothing, and captures with nothing wrong.
 
-Without pictures: gripper poses and image observations of simulated faults (simulate/faults.py), cameras by structure
+Without images: gripper poses and image observations of simulated faults (simulate/faults.py), cameras by structure
 from motion of these observations with the intrinsics that the user believes, then the calibration stage as it is.
 """
 
@@ -30,7 +30,6 @@ NAMES = {
     "focal length changes": "zoom",
     "images are sheared": "rolling shutter",
     "sheared by itself": "rolling shutter",
-    "pictures show": "intrinsics",
     "images show": "intrinsics",
     "have moved on the gripper": "slip",
     "drift on the gripper": "drift",

@@ -77,7 +77,7 @@ def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int]) -> list[str]:
     return [
         f"> Simulated poses, robot noise 0.5 mm and 0.1°, 10 images: {at[ours]} off (median), the paper's grid search "
         f"{at[papers]}.",
-        f"> {most} wrong gripper poses among {MANY} images are all named, and none else, in {named[most]} of {TRIALS} "
+        f"> {most} wrong gripper poses among {MANY} images are all named, and no others, in {named[most]} of {TRIALS} "
         f"captures, and the offset is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other method is off "
         f"by {others:.0f} mm or more.",
     ]
@@ -135,7 +135,7 @@ def _all_missed(solver: Solver, noise: tuple[float, float], count: int, wrong: i
 def _spoilt(
     seed: int, count: int, noise: tuple[float, float], wrong: int
 ) -> tuple[HandEyeProblem, Int[ndarray, " wrong"]]:
-    """A problem in which so many images have another one's gripper pose, and which these are."""
+    """A problem in which this many images have another one's gripper pose, and which these are."""
     problem = problem_of(seed, count, noise)
     bad = np.sort(np.random.default_rng(seed).choice(count, wrong, replace=False))
     if wrong == 1:  # there is no other wrong one to swap with
@@ -205,7 +205,7 @@ def _outliers(spoilt: Spoilt, named: dict[int, int]) -> list[str]:
     for name in _solvers():
         lines.append(f"| {name} | " + " | ".join(_cell(spoilt[name, wrong]) for wrong in WRONG) + " |")
     told = " | ".join(f"{named[wrong]} of {TRIALS}" for wrong in WRONG)
-    return [*lines, f"| *captures in which jcr names the wrong ones, and none else* | {told} |"]
+    return [*lines, f"| *captures in which jcr names the wrong ones, and no others* | {told} |"]
 
 
 def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
@@ -249,7 +249,7 @@ def _time() -> list[str]:
     large_fit = (large_start.gripper_from_camera, large_start.scale, large_start.base_from_recon)
     large_tracks = observed(large, np.random.default_rng(0), 6000, 0.3)
     rows = [
-        ("jcr: closed form, outliers, uncertainty, observability, held-out error", 15,
+        ("jcr: closed form, outliers, uncertainty, observability, leave-one-out error", 15,
          lambda: solve_hand_eye(gripper, camera), 21),
         (f"jcr: bundle adjustment, {len(tracks.image)} observations", 15,
          lambda: adjust(gripper, pose_fit, camera, LENS, tracks), 3),

@@ -1,4 +1,4 @@
-"""`jcr bench cameras DIR`: further cameras and arms, simulated against the truth and real pictures against the robot."""
+"""`jcr bench cameras DIR`: further cameras and arms, simulated against the truth and real images against the robot."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ COUNT = 10
 """Poses of each arm."""
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
 WITHHELD = 4
-"""Every so many of a real capture's images are declared pictures of fixed cameras, one each."""
+"""Every this many of a real capture's images are declared images of fixed cameras, one each."""
 Of = Callable[[Placed], Float[ndarray, "4 4"]]
 
 
@@ -79,7 +79,7 @@ class Draw:
 
 
 def run(captures: Path, boards: Sequence[str] = ()) -> str:
-    """Markdown: 40 simulated draws of each kind, and withheld pictures of every capture below `captures`.
+    """Markdown: 40 simulated draws of each kind, and withheld images of every capture below `captures`.
 
     Raises InputError where there is no capture, or boards are named.
     """
@@ -96,7 +96,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
 
 
 def answered(problem: CellProblem, seed: int) -> Answer:
-    """The cell from its pictures and poses; intrinsics are off by what is usual of given ones."""
+    """The cell from its images and poses; intrinsics are off by what is usual of given ones."""
     rng = np.random.default_rng([seed, 17])
     cameras = []
     for camera in problem.cameras:
@@ -126,7 +126,7 @@ def _drawn(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
 
 @dataclass(frozen=True)
 class Row:
-    """One withheld picture."""
+    """One withheld image."""
 
     capture: str
     image: str
@@ -225,7 +225,7 @@ def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Seq
         named = sorted({row.capture for row in placed})
         median = np.median(errors, axis=0)
         lines.append(
-            f"> Real pictures declared to be of fixed cameras, {len(placed)} of {len([r for r in real if r.lens])} "
+            f"> Real images declared to be of fixed cameras, {len(placed)} of {len([r for r in real if r.lens])} "
             f"placed, of {', '.join(named)}: base_from_camera {median[0]:.1f} mm and {median[1]:.2f}° from the robot's "
             f"pose times X (median), at most {errors[:, 0].max():.1f} mm; "
             f"{sum(row.draw.sigmas > 3 for row in placed if row.draw is not None)} beyond 3 σ of both on an axis."
@@ -235,8 +235,8 @@ def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Seq
         "Simulated: arms of UR5e kinematics, white: random errors of 0.5 mm and 0.1°; typical: joint offsets of 0.1° "
         "and link errors of 0.3 mm, the truth then the effective transform. Points of a table (of a box of "
         f"{_box()} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
-        "length, 0.5 % of the width). No pictures: what bundle adjustment and the robots make of them. σ also counts "
-        "what features of real pictures leave wrong in the intrinsics, and systematic errors of any arm: why squared "
+        "length, 0.5 % of the width). No images: what bundle adjustment and the robots make of them. σ also counts "
+        "what features of real images leave wrong in the intrinsics, and systematic errors of any arm: why squared "
         "distance / 6 is below 1 here is in docs/cameras.md.",
         "",
         "| cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ | "
@@ -257,11 +257,11 @@ def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Seq
             )
     lines += [
         "",
-        f"Real: every {WITHHELD}th image of a capture is declared the picture of a fixed camera of its own, its gripper "
+        f"Real: every {WITHHELD}th image of a capture is declared the image of a fixed camera of its own, its gripper "
         "pose withheld; base_from_camera then against the pose that the robot reported there, times the X of the other "
         "images. In σ: largest on an axis, of the camera's place, X and the robot's pose together.",
         "",
-        "| capture | picture | intrinsics | points | off: mm | ° | in σ | ±σ: mm | ° | at the scene: mm |",
+        "| capture | image | intrinsics | points | off: mm | ° | in σ | ±σ: mm | ° | at the scene: mm |",
         "|---" * 10 + "|",
     ]
     for row in real:

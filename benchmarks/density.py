@@ -111,12 +111,12 @@ def _covered(cloud: Cloud, surface: Float[ndarray, "n 3"], labels: ndarray) -> t
 
 
 def _figure(picture: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
-    """PNG: a picture, and each dense cloud from above in its colours with COLMAP's points in red (paper, Fig. 8)."""
+    """PNG: an image, and each dense cloud from above in its colours with COLMAP's points in red (paper, Fig. 8)."""
     sparse, *dense = clouds
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     first, *others = figure.subplots(1, 1 + len(dense))
     first.imshow(picture)
-    first.set_title("one of the pictures", fontsize=9)
+    first.set_title("one of the images", fontsize=9)
     first.set_axis_off()
     for axis, cloud in zip(others, dense, strict=True):
         _from_above(axis, cloud)

@@ -211,7 +211,7 @@ def _rolled(gripper_from_camera: Float[ndarray, "4 4"], step_deg: float) -> Tran
 
 
 def _with_moved_object(scene: Scene) -> Scene:
-    """The scene with its largest object 10 cm aside and turned."""
+    """The scene with its largest object 10 cm aside and rotated."""
     largest = max(range(len(scene.objects)), key=lambda k: scene.objects[k].radius)
     aside = transform(rotation_exp(np.array([0.0, 0.0, 0.6])), np.array([0.07, -0.07, 0.0]))
     objects = list(scene.objects)

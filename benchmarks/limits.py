@@ -36,7 +36,7 @@ NOISE = (0.5, 0.1)
 WRONG_MM, WRONG_DEG = 20.0, 2.0
 """Beyond this an answer is wrong; wrong and trusted is the worst fault there is."""
 POSE_TRIALS = 15
-"""Simulated pose sets behind a line without pictures."""
+"""Simulated pose sets behind a line without images."""
 ROTATIONS = (0.0, 1.0, 3.0, 6.0, 12.0, 25.0)
 """Degrees."""
 SURPRISE = 3.0
@@ -102,7 +102,7 @@ class Verdict:
     """Largest error on an axis of offset and orientation in reported standard deviations."""
     std_mm: float = np.nan
     status: int = 3
-    """Of `jcr calibrate`: 3 where the answer is not to be trusted."""
+    """Of `jcr calibrate`: 3 where the answer is rejected."""
     reason: str = ""
 
     @property
@@ -152,10 +152,10 @@ def run(out: Path | None = None) -> str:
         "|---" * 10 + "|",
         *map(_line, verdicts),
         "",
-        f"Least rotation: views that turn by so much about random axes, {COUNT} poses, no pictures, "
+        f"Least rotation: views that rotate by so much about random axes, {COUNT} poses, no images, "
         f"{POSE_TRIALS} draws.",
         "",
-        "| turned by | trusted | of those wrong | silent wrong | median off when trusted: mm | median ±σ: mm |",
+        "| rotated by | trusted | of those wrong | silent wrong | median off when trusted: mm | median ±σ: mm |",
         "|---" * 6 + "|",
         *rotations,
     ]
@@ -215,7 +215,7 @@ def _short(text: str) -> str:
 
 
 def _sheet(verdicts: Sequence[Verdict]) -> bytes:
-    """PNG: a row for each thing that is made worse, a picture for each level, framed by what came of it."""
+    """PNG: a row for each thing that is made worse, an image for each level, framed by what came of it."""
     kinds = list(dict.fromkeys(v.trial.what for v in verdicts))
     across = max(sum(v.trial.what == kind for v in verdicts) for kind in kinds)
     figure = Figure(figsize=(2.3 * across, 2.1 * len(kinds)))
@@ -267,7 +267,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _blurred(length_px: int) -> Change:
-    """A wrist that moves while it takes the picture, each time in another direction."""
+    """A wrist that moves while it takes the image, each time in another direction."""
 
     def change(folder: Path) -> None:
         for k, path in enumerate(_pictures(folder)):
@@ -294,7 +294,7 @@ def _focal(factor: float) -> Change:
 
 
 def _redrawn(other: Callable[[Scene], Scene], first: int) -> Change:
-    """Pictures from number `first` on show another scene from the same places."""
+    """Images from number `first` on show another scene from the same places."""
 
     def change(folder: Path) -> None:
         truth: Truth = read_truth(folder)

@@ -36,7 +36,7 @@ SMALL = {
     "dec_num_heads": 3,
     "head_type": "linear",
 }
-"""Three million parameters; its weights are random, for what it says of the pictures changes no size."""
+"""Three million parameters; its weights are random, for what it says of the images changes no size."""
 DPT = SMALL | {"dec_depth": 10, "head_type": "dpt"}
 """With the heads of the published network, 43 million."""
 PREDICT, NEAR = ["--pair-graph", "complete", "--cache-gb", "0"], ["--pair-graph", "window"]
@@ -46,7 +46,7 @@ SQUARE = ["--image-size", "224"]
 
 @dataclass(frozen=True)
 class Job:
-    """A command, on captures of so many images."""
+    """A command, on captures of this many images."""
 
     name: str
     command: list[str]

@@ -81,7 +81,7 @@ def run() -> str:
     shares = ", ".join(f"{level} {np.mean(values):.0f} %" for level, values in right.items())
     lines = [
         f"Simulated scenes `measuring`, seed {', '.join(map(str, SEEDS))}, {IMAGES} images, with the robot noise and "
-        "the webcam of table1; medians. The predictions are the truth with errors: each camera turned about the scene "
+        "the webcam of table1; medians. The predictions are the truth with errors: each camera rotated about the scene "
         "and about itself, its distance and its depth wrong by smooth shares, depth edges smoothed, a little worse than "
         f"published. Pairs right up to "
         f"3° (area under the curve): {shares}. σ: the true error over the reported one. Surface: median distance of "
@@ -145,7 +145,7 @@ def _median(values: list[float]) -> float:
 
 
 def _methods(place: Path, seed: int) -> dict[str, Callable[[Capture], Reconstruction]]:
-    """What turns the capture in a folder into a reconstruction, by name."""
+    """What rotates the capture in a folder into a reconstruction, by name."""
 
     def predicted(errors: ViewErrors, refined: bool) -> Callable[[Capture], Reconstruction]:
         options = ViewsOptions(
@@ -174,7 +174,7 @@ def _methods(place: Path, seed: int) -> dict[str, Callable[[Capture], Reconstruc
 
 
 def _cell(capture: Capture, place: Path, reconstructed: Callable[[Capture], Reconstruction]) -> Cell | None:
-    """Errors of a back end on the simulated capture in a folder; None where it gave nothing."""
+    """Errors of a back end on the simulated capture in a folder; None where it failed."""
     try:
         reconstruction = reconstructed(capture)
         hand_eye = calibrate(capture, reconstruction)

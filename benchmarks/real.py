@@ -72,10 +72,11 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "",
         "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
         "own. σ: the largest reported standard deviation of an axis; joint: that of the reference, where it states "
-        "one, counted as well (white noise of its board poses alone). Held out: each gripper pose predicted by the "
-        "other images; where two calibrations predict alike, the pictures cannot tell which is the better one.",
+        "one, counted as well (white noise of its board poses alone). Left out: each gripper pose predicted by the "
+        "other images; where two calibrations predict alike, the images cannot tell which is the better one.",
         "",
-        "| capture | from | images used | off: mm | ° | in σ | joint | ±σ: mm | ° | held out: mm / ° | trusted | s |",
+        "| capture | from | images used | off: mm | ° | in σ | joint | ±σ: mm | ° | leave-one-out "
+        "error: mm / ° | trusted | s |",
         "|---" * 12 + "|",
         *map(_line, rows),
         "",
@@ -93,13 +94,13 @@ def _claims(rows: Sequence[Row]) -> list[str]:
     refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
     joint = [row.joint_sigmas for row in rows if row.trusted and row.joint_sigmas is not None]
     beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
-    told = f" Not trusted, and said so: {', '.join(refused)}." if refused else ""
+    told = f" Rejected, and said so: {', '.join(refused)}." if refused else ""
     return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}{beyond}"]
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:
     capture = read_capture(folder)
-    how = "pictures alone" if board is None else f"`{board}`"
+    how = "images alone" if board is None else f"`{board}`"
     known = read_hand_eye(folder / "reference.json")
     reference = known.gripper_from_camera
     options = RunOptions(ReconstructOptions(board=board))
@@ -146,7 +147,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
 
 
 def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) -> list[Row]:
-    """The same with the lens found from the board: how much of the distance the stored lens may explain."""
+    """The same with the intrinsics found from the board: how much of the distance the stored intrinsics may explain."""
     if capture.intrinsics is None:
         return []
     blind = replace(capture, intrinsics=None)
@@ -156,7 +157,7 @@ def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) ->
     except NotTrustedError:
         return []
     off_mm, off_deg = _off(hand_eye.gripper_from_camera, reference)
-    how = f"`{board}`, its lens ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
+    how = f"`{board}`, its intrinsics ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
     held = hand_eye.held_out
     told = (
         None

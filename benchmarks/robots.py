@@ -262,7 +262,7 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = ()) -> str:
             f"Intrinsics drawn around the true ones ({100 * INTRINSICS_STD:g} % of the focal length and of the width), "
             f"{POINTS} points seen with {PIXEL_STD} px, {draws // 2} draws of each arm, nothing known of it: held as "
             "given, or measurements of that error in the bundle adjustment. Their σ holds what calibrations from real "
-            "pictures differ by beside it, which simulated ones do not: squared distances are below one.",
+            "images differ by beside it, which simulated ones do not: squared distances are below one.",
             "",
             *_table(intrinsics),
         ]

@@ -4,13 +4,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 import jcr
+from benchmarks.freshness import COMMIT, says_it_is_old
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.reconstruct.backends import BACKENDS
@@ -19,7 +20,7 @@ CHECKOUT = Path(__file__).parents[1]
 CLAIM = "> "
 """Begins the lines of a bench's page that say in a sentence what was found."""
 MARKS = ("<!-- jcr bench all: begin -->", "<!-- jcr bench all: end -->")
-"""Lines of a README between which the claims go."""
+"""Lines of the index between which the claims go."""
 
 
 @dataclass(frozen=True)
@@ -102,15 +103,9 @@ def write_index(
         "# Results",
         "",
         f"Written by `{command}`, {date.today().isoformat()}. {machine} {len(ran)} of {len(outcomes)} benches were "
-        f"run this time, in {wall_s / 60:.1f} minutes; those that are not timed ran two at a time. Each page says "
-        "above its tables which command writes them.",
+        f"run this time, in {wall_s / 60:.1f} minutes; those that are not timed ran two at a time.",
         "",
-        *(
-            f"- {claim} ([{outcome.name}]({outcome.name}.md))"
-            for outcome in outcomes
-            for claim in claims(out / f"{outcome.name}.md")
-            if not outcome.trouble
-        ),
+        *MARKS,
         "",
         "Not here:",
         "",
@@ -120,8 +115,16 @@ def write_index(
         "| bench | s |",
         "|---|---|",
         *(f"| [{outcome.name}]({outcome.name}.md) | {outcome.seconds:.0f} |" for outcome in ran),
+        "",
+        "```{toctree}",
+        ":hidden:",
+        ":glob:",
+        "",
+        "*",
+        "```",
     ]
-    write_text(out / "README.md", "\n".join(lines) + "\n")
+    failed = {outcome.name for outcome in outcomes if outcome.trouble}
+    write_text(out / "README.md", with_claims("\n".join(lines) + "\n", out, failed))
 
 
 def absent_networks() -> list[str]:
@@ -133,18 +136,46 @@ def absent_networks() -> list[str]:
     ]
 
 
-def between_marks(readme: str, out: Path, names: Sequence[str], link: str) -> str:
-    """A README's text with the claims of every page between its marks; `link` is where it finds `out`.
+def with_claims(index: str, out: Path, without: Collection[str] = ()) -> str:
+    """An index with a table of the claims of the pages in `out` between its marks: claim, number, command, commit.
 
     Raises InputError where the text has no marks.
     """
-    before, begin, rest = readme.partition(MARKS[0])
+    before, begin, rest = index.partition(MARKS[0])
     _, end, after = rest.partition(MARKS[1])
     if not (begin and end):
-        raise InputError(f"the README has no lines {MARKS[0]} and {MARKS[1]} to put the claims between")
+        raise InputError(
+            f"the index of results has no lines {MARKS[0]} and {MARKS[1]} to put the claims between"
+        )
     rows = [
-        f"- {claim} ([`jcr bench {name}`]({link}/{name}.md))"
-        for name in names
-        for claim in claims(out / f"{name}.md")
+        f"| {_cell(claim)} | {_cell(number)} | [`{_command(page)}`]({page.name}) | {_commit(page)} |"
+        for page in sorted(out.glob("*.md"))
+        if page.name != "README.md" and page.stem not in without
+        for claim, number in (_parts(claim, page) for claim in claims(page))
     ]
-    return "\n".join([before + begin, *rows, end]) + after
+    head = ["", "| claim | number | command | commit |", "|---|---|---|---|"]
+    return "\n".join([before + begin, *head, *rows, "", end]) + after
+
+
+def _parts(claim: str, page: Path) -> tuple[str, str]:
+    """What was measured, and what came out: parted by a colon, or what the bench is for and the whole."""
+    about, colon, number = claim.partition(": ")
+    if colon:
+        return about, number
+    lines = [line for line in page.read_text().splitlines() if line]
+    return lines[1] if len(lines) > 1 else page.stem, claim
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _command(page: Path) -> str:
+    lines = (line.strip() for line in page.read_text().splitlines() if line.startswith("    jcr bench"))
+    return " ".join(next(lines, f"jcr bench {page.stem}").split()[:3])
+
+
+def _commit(page: Path) -> str:
+    text = page.read_text()
+    named = COMMIT.search(text)
+    return (f"`{named[1]}`" if named else "") + (", older than the code" if says_it_is_old(text) else "")

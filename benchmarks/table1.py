@@ -32,7 +32,7 @@ WEBCAM = {"noise": 3.0, "blur": 0.7, "vignetting": 0.35, "jpeg_quality": 75, "ro
 """Grey levels, pixels, share, percent; mm and degrees per axis."""
 PUBLISHED = PairErrors(warp=0.04, bend=0.01, pair_turn_deg=0.6)
 """A mean relative depth error of 3.6 % over first and second views, where DUSt3R's paper has 3.5 % on DTU (arXiv
-2312.14132, its table of multi-view depth), and second views turned by 1.0° (rms), where it has medians of 1.0° to
+2312.14132, its table of multi-view depth), and second views rotated by 1.0° (rms), where it has medians of 1.0° to
 1.3° on most of 7-Scenes; the lines of sight bend by 0.6°."""
 GRID_SCALE = 2.0
 """The unit in which the paper's grid search is asked, so that λ lies in the only range that it covers."""
@@ -91,12 +91,13 @@ def run() -> str:
         f"Simulated scenes, {SEEDS} captures each (seeds 0 to {SEEDS * len(SCENES) - 1}, no two scenes share one; "
         f"{degraded}; intrinsics given), medians; the same images for every method. Converged: within {RIGHT[0]:g} mm "
         f"and {RIGHT[1]:g}° of the truth. δ_t (m) and δ_R are the paper's residuals over consecutive images; they hold "
-        "the robot's noise, and are no smaller where the answer is exact. σ: the largest error on an axis in reported "
+        "the robot pose noise, and are no smaller where the answer is exact. σ: the largest error "
+        "on an axis in reported "
         f"standard deviations. The paper's calibration is asked in a unit in which λ is {GRID_SCALE:g}, since its grid "
         "ends at 4.",
         "",
         "Simulated predictions: true pointmaps of all pairs at 128x96 with errors of the size that DUSt3R's paper "
-        "publishes: 3.6 % mean error of depth (3.5 % on DTU), second views turned by 1.0° (1.0° to 1.3° on most of "
+        "publishes: 3.6 % mean error of depth (3.5 % on DTU), second views rotated by 1.0° (1.0° to 1.3° on most of "
         "7-Scenes), lines of sight bent by 0.6°, 2 % outliers. The errors of different pairs are independent, which a "
         "network's are not: an optimistic stand-in.",
     ]
@@ -123,7 +124,7 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
             mm, deg = (np.nanmedian([getattr(cell, key) for cell in chosen]) for key in ("off_mm", "off_deg"))
             said.append(f"{method} {right} of {len(chosen)} right, {mm:.2f} mm and {deg:.3f}° off")
         images = f"{counts[0]} to {counts[-1]} images"
-        lines.append(f"> Few pictures of plain tables by a webcam, {images} (medians): {'; '.join(said)}.")
+        lines.append(f"> Few images of plain tables by a webcam, {images} (medians): {'; '.join(said)}.")
     ours = [cell for many in cells.values() for cell in many if cell.trusted is not None]
     silent = sum(cell.silent for cell in ours)
     lines.append(

@@ -1,4 +1,4 @@
-"""Take a capture live from a Universal Robots arm: a picture whenever it has come to rest in a new place.
+"""Take a capture live from a Universal Robots arm: an image whenever it has come to rest in a new place.
 
     python examples/04_ur_robot.py [ROBOT_ADDRESS [CAMERA]]
 
@@ -25,7 +25,7 @@ from jcr.simulate.ur import SimulatedUr
 
 
 def simulated_camera(table, arm):
-    """What a camera on the simulated arm's wrist sees at 20 pictures a second."""
+    """What a camera on the simulated arm's wrist sees at 20 images a second."""
     while True:
         yield Frame(read_image(table.folder / table.images[arm.stop]), time.monotonic())
         time.sleep(0.05)
@@ -44,12 +44,12 @@ with ExitStack() as until_done:
         shutil.rmtree(out, ignore_errors=True)  # a real one is gone on with
 
     def tell(answer, lines):
-        """Which picture was kept or why not, what the motions do not show yet, and the pose to add next."""
+        """Which image was kept or why not, what the motions do not show yet, and the pose to add next."""
         print("\n".join(lines))
 
-    print("move the arm; a picture is taken whenever it rests")
+    print("move the arm; an image is taken whenever it rests")
     asks = asks_at_rest(lambda: states(host, port))
     collect(LiveFolder(out), camera, asks, CollectOptions(images), tell, ArmWords("ur"))
 
 capture = jcr.read_capture(out)
-print(f"{len(capture)} pictures in {out}; next: jcr run {out} out/ur_run")
+print(f"{len(capture)} images in {out}; next: jcr run {out} out/ur_run")

@@ -40,7 +40,7 @@ class Clearance:
     def touches(self, joint_values: Float[ndarray, "*batch 6"]) -> Bool[ndarray, "*batch"]:
         """The gripper may go only where someone has looked; the rest of the arm must clear what was seen.
 
-        The pictures show the table, not the space about the arm's own base.
+        The images show the table, not the space about the arm's own base.
         """
         seen = self.scene.check_robot(self.arm, joint_values, unknown="free")
         return np.asarray(seen | self.scene.check_robot(self.gripper, joint_values, unknown="occupied"))
@@ -88,7 +88,7 @@ def plan(
     setup.setPlanner(planner)
     setup.solve(seconds)
     if not setup.haveExactSolutionPath():
-        raise RuntimeError("no way was found; give more time, or pictures of what is still unknown")
+        raise RuntimeError("no way was found; give more time, or images of what is still unknown")
     setup.simplifySolution(2.0)
     path = setup.getSolutionPath()
     path.interpolate(max(2, int(np.ceil(path.length() / STEP_RAD))))

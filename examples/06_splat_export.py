@@ -8,7 +8,7 @@ points that a splat starts from. To train it, where there is a GPU and `pip inst
     ns-train splatfacto --data OUT/splat nerfstudio-data --orientation-method none --center-method none \\
         --auto-scale-poses False
 
-The three options keep nerfstudio from turning, shifting and scaling: a place in the splat is then a place in the
+The three options keep nerfstudio from rotating, shifting and scaling: a place in the splat is then a place in the
 robot's base frame. The command line does the same: `jcr export OUT nerfstudio OUT/splat`.
 """
 

@@ -81,7 +81,7 @@ def cloud(points: int = 60_000, cameras: int = 10, noise: float = 0.0, seed: int
 
 
 def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:
-    """base_from_camera of the ring, at different distances and turned about their axes."""
+    """base_from_camera of the ring, at different distances and rotated about their axes."""
     poses = np.tile(np.eye(4), (cameras, 1, 1))
     for k, center in enumerate(camera_centers(cameras)):
         z = -center / np.linalg.norm(center)

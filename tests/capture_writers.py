@@ -279,9 +279,9 @@ def write_lerobot(
     codec: str | None = "libsvtav1",
     further: dict[str, list[np.ndarray]] | None = None,
 ) -> Path:
-    """A data set of episodes (pictures, states), with one camera; v3.0 keeps them all in one table and video.
+    """A data set of episodes (images, states), with one camera; v3.0 keeps them all in one table and video.
 
-    Without a codec the pictures are in the table, as PNG files; there may then be `further` cameras, for all frames.
+    Without a codec the images are in the table, as PNG files; there may then be `further` cameras, for all frames.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -50,7 +50,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 SLOW_FIXTURES = {"done", "opengl", "real_captures", "tiny_sam", "garbage_weights"}
-"""They run the command line, draw, reconstruct from pictures, or load a network."""
+"""They run the command line, draw, reconstruct from images, or load a network."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -93,7 +93,7 @@ def tabletop() -> Path:
 
 @pytest.fixture(scope="session")
 def small_capture(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> Path:
-    """Five pictures of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
+    """Five images of the bundled capture, 200 pixels wide: the first attempt is kept, a whole run takes seconds."""
     return shrunk_capture(tabletop, tmp_path_factory.mktemp("small") / "capture", 5, 200)
 
 

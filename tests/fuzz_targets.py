@@ -57,7 +57,7 @@ class Target:
 
 
 def small_capture(folder: Path) -> Capture:
-    """Four tiny pictures, and poses of a hand-eye problem."""
+    """Four tiny images, and poses of a hand-eye problem."""
     (folder / "images").mkdir(parents=True)
     draw = np.random.default_rng(0)
     images = tuple(f"images/{k}.png" for k in range(COUNT))
@@ -117,7 +117,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
 
 def pictures(folder: Path) -> dict[str, Target]:
-    """A picture in each format that cameras write."""
+    """An image in each format that cameras write."""
     folder.mkdir()
     pixels = np.random.default_rng(2).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
     names = [f"picture.{ending}" for ending in ("png", "jpg", "tif", "bmp", "webp", "gif")]

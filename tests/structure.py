@@ -179,7 +179,7 @@ def documents(folder: Path) -> dict[str, Document]:
 
 
 def gone_on(folder: Path) -> object:
-    """A live capture resumed and one picture added, which is then taken away."""
+    """A live capture resumed and one image added, which is then taken away."""
     live = LiveFolder(folder)
     pixels = np.full((SIZE[1], SIZE[0], 3), 7, np.uint8)
     return live.add(pixels, np.eye(4))

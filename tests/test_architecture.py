@@ -14,6 +14,7 @@ SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"deflate", "errors"},
     {"extras"},
+    {"pages"},
     {"geometry", "records", "files", "memory", "progress", "rounding"},
     {"camera", "intrinsics_json", "least_squares"},
     {"handeye"},

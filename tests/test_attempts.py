@@ -103,14 +103,14 @@ def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
 
     kept, tried = auto_result(problem, {"mast3r": shuffled, "colmap": good}, monkeypatch)
     assert tried == ["mast3r", "colmap"] and kept.backend == "colmap"
-    assert "mast3r, the best whose weights are on this machine, is not to be trusted (" in kept.notes[0]
-    assert "colmap (held-out error" in kept.notes[0] and "used instead of mast3r" in kept.notes[0]
+    assert "mast3r, the best whose weights are on this machine, is rejected (" in kept.notes[0]
+    assert "colmap (leave-one-out error" in kept.notes[0] and "used instead of mast3r" in kept.notes[0]
 
     nothing = NotTrustedError("0 of 8 images registered")
     kept, _ = auto_result(problem, {"mast3r": nothing, "colmap": good}, monkeypatch)
-    assert kept.backend == "colmap" and "gave nothing (0 of 8" in kept.notes[0]
+    assert kept.backend == "colmap" and "failed (0 of 8" in kept.notes[0]
     kept, _ = auto_result(problem, {"mast3r": shuffled, "colmap": nothing}, monkeypatch)
-    assert kept.backend == "mast3r" and "colmap gave nothing (0 of 8" in kept.notes[0]
+    assert kept.backend == "mast3r" and "colmap failed (0 of 8" in kept.notes[0]
     damaged = InputError("model.safetensors: damaged")
     kept, _ = auto_result(problem, {"mast3r": damaged, "colmap": good}, monkeypatch)
     assert kept.backend == "colmap" and "damaged" in kept.notes[0]
@@ -135,7 +135,7 @@ def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
     ):
         kept, tried = auto_result(problem, answers, monkeypatch)
         assert tried == ["dust3r", "colmap"] and kept.backend == name
-        assert f"nor is colmap; {name} (held-out error" in kept.notes[0]
+        assert f"nor is colmap; {name} (leave-one-out error" in kept.notes[0]
 
 
 def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
@@ -151,7 +151,7 @@ def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
     assert tried == ["colmap", "direct"] and kept.backend == "direct"
     kept, tried = auto_result(problem, {"colmap": nothing, "direct": good}, monkeypatch)
     assert tried == ["colmap", "direct"] and kept.backend == "direct"
-    assert "colmap, gave nothing (0 of 8 images registered)" in kept.notes[0]
+    assert "colmap, failed (0 of 8 images registered)" in kept.notes[0]
 
 
 def test_learned_features_are_asked_where_those_of_sift_fail(
@@ -166,7 +166,7 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     assert tried == ["colmap"] and not kept.notes
     kept, tried = auto_result(problem, {"sift": NotTrustedError("0 of 8"), "xfeat": good}, monkeypatch)
     assert tried == ["colmap", "colmap"]
-    assert "colmap with sift, gave nothing (0 of 8); colmap with xfeat (held-out" in kept.notes[0]
+    assert "colmap with sift, failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
     # Two that fail, and a third that does not: all three are told.
     refused = NotTrustedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
@@ -203,13 +203,13 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     colmap, direct = content["attempts"]
     assert (colmap["backend"], direct["backend"]) == ("colmap", "direct")
     assert colmap["images_registered"] == direct["images_registered"] == 12
-    assert colmap["why_not"].startswith("not to be trusted: ") and direct["why_not"] is None
+    assert colmap["why_not"].startswith("rejected: ") and direct["why_not"] is None
     assert (colmap["reconstruct_s"], direct["reconstruct_s"]) == (20.0, 400.0)
     assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
     assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0, "report": 0.0}
     assert result.calibration.model_dump()["attempts"] == content["attempts"]
     told = (tmp_path / "log.txt").read_text().splitlines()
-    assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (not to be trusted: ")
+    assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (rejected: ")
     assert told[2] == (
         "attempt 2: direct registered 12 of 12 images, kept; reconstruct 400.00 s, calibrate 3.00 s"
     )
@@ -233,7 +233,7 @@ def test_where_nothing_is_found_each_attempt_says_why(
         raise NotTrustedError(f"{options.backend} saw nothing")
 
     monkeypatch.setattr(attempts, "reconstruct", door)
-    with pytest.raises(NotTrustedError, match="direct saw nothing; back end colmap, gave nothing"):
+    with pytest.raises(NotTrustedError, match="direct saw nothing; back end colmap, failed"):
         calibrate(read_capture(tabletop), tmp_path)
     tried = RunFolder(tmp_path).calibration().attempts
     assert [(attempt.backend, attempt.images_registered, attempt.why_not) for attempt in tried] == [
@@ -385,7 +385,7 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says
     found = json.loads((out / "calibration.json").read_text())
     assert found["backend"] == "colmap" and found["converged"]
     why = next(text for text in found["notes"] if text.startswith("back end dust3r"))
-    assert "colmap" in why and ("not to be trusted" in why or "gave nothing" in why)
+    assert "colmap" in why and ("rejected" in why or "failed" in why)
     assert why in (out / "log.txt").read_text()
     # Its own answer, asked for by name, is not trusted.
     assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3

@@ -24,7 +24,7 @@ COMPLETE = BatchOptions(calibrate_only=True, processes=2)
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[Path]:
-    """Four and five small pictures of the table, one folder with a broken picture, one with no features."""
+    """Four and five small images of the table, one folder with a broken image, one with no features."""
     from PIL import Image
 
     root = tmp_path_factory.mktemp("captures")

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 
 def calibration(capture: Path, out: Path, threads: int) -> dict:
-    """What `jcr calibrate` finds with so many threads on so many cores."""
+    """What `jcr calibrate` finds with this many threads on this many cores."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     cores = set(sorted(os.sched_getaffinity(0))[:threads])
     command = [sys.executable, "-m", "jcr", "calibrate", str(capture), str(out), "--quiet"]

@@ -1,20 +1,36 @@
 """What the documents name exists: files, links, imports."""
 
 import ast
+import contextlib
+import io
+import json
 import re
 import runpy
+import shlex
 from html import unescape
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
+import tyro
 
+from benchmarks.freshness import OLD
+from jcr.cli import COMMANDS, configuration, dispatch
+from jcr.errors import InputError
+from jcr.pages import page as page_named
+from jcr.pages import pages
 from places import ROOT
 
 SOURCE = ROOT / "src" / "jcr"
-ARCHITECTURE = ROOT / "docs" / "architecture.md"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+ARCHITECTURE = ROOT / "docs" / "explanation" / "architecture.md"
+GENERATED = ("cli.md", "api.md", "formats.md")
+"""By docs/generated.py, when the site is built."""
+PAGES = [
+    ROOT / "README.md",
+    *sorted(page for page in (ROOT / "docs").rglob("*.md") if page.name not in GENERATED),
+]
 MORE_PAGES = [
-    *sorted((ROOT / "docs" / "results").glob("*.md")),
     ROOT / "CHANGELOG.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "SECURITY.md",
@@ -24,6 +40,11 @@ MORE_PAGES = [
 
 def without_code(page: Path) -> str:
     return re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+
+
+def without_old(page: Path) -> str:
+    """Without the files that a page of results says have changed, or gone."""
+    return "\n".join(line for line in page.read_text().splitlines() if not line.startswith(OLD))
 
 
 def anchors(page: Path) -> set[str]:
@@ -47,6 +68,8 @@ def test_relative_links_resolve(page):
             continue
         path, _, anchor = link.partition("#")
         target = (page.parent / path).resolve() if path else page
+        if target.name in GENERATED:
+            continue  # `make docs` checks these
         if not target.exists() or (anchor and anchor not in anchors(target)):
             broken.append(link)
     assert not broken
@@ -54,7 +77,7 @@ def test_relative_links_resolve(page):
 
 @pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_named_files_of_the_project_exist(page):
-    named = re.findall(r"`(?:python )?((?:src|tests|benchmarks|examples|docs)/[\w/.-]+)", page.read_text())
+    named = re.findall(r"`(?:python )?((?:src|tests|benchmarks|examples|docs)/[\w/.-]+)", without_old(page))
     assert not [path for path in named if not (ROOT / path).exists()]
 
 
@@ -74,6 +97,83 @@ def test_imports_of_the_examples_on_a_page_exist(page):
     assert not missing
 
 
+def commands(page: Path) -> list[str]:
+    """The lines of a page's code blocks that call jcr, without comments; continued lines are one."""
+    blocks = re.findall(
+        r"^ *```(?:bash|text)?\n(.*?)^ *```", page.read_text(), flags=re.DOTALL | re.MULTILINE
+    )
+    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return [re.split(r"\s+#|\s+&&|\s+>", line)[0] for line in lines if re.match(r"jcr [a-z]", line)]
+
+
+@pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_on_a_page_are_understood(page):
+    if page.parent.name == "results":
+        return  # what was typed when it was measured, mistakes included
+    for line in commands(page):
+        _, name, *rest = shlex.split(line)
+        assert name in COMMANDS, line
+        command = import_module(f"jcr.cli.{name.replace('-', '_')}")
+        complaint = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(complaint):
+                tyro.cli(command.Arguments, args=rest, config=configuration())
+        except SystemExit:
+            pytest.fail(f"{line}\n{complaint.getvalue()}")
+
+
+def test_pages_that_messages_name_exist():
+    named = {
+        name
+        for file in SOURCE.rglob("*.py")
+        for name in re.findall(r"jcr docs ([a-z][\w/-]*)", file.read_text())
+    }
+    assert named and named <= pages().keys() | {name.removesuffix(".md") for name in GENERATED}
+
+
+def test_pages_are_printed_and_listed(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["docs", "captures"]) == 0
+    assert capsys.readouterr().out == (ROOT / "docs" / "reference" / "captures.md").read_text()
+    assert dispatch(["docs"]) == 0
+    assert "results/run" in capsys.readouterr().out
+    with pytest.raises(InputError, match="no such page; there are: .*captures"):
+        page_named("nonsense")
+
+
+def test_every_page_that_a_checkout_has_is_installed():
+    import tomllib
+
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    shipped = {file for globs in tool["data-files"].values() for glob in globs for file in ROOT.glob(glob)}
+    assert set(pages().values()) <= shipped
+
+
+def test_the_readme_is_short_before_its_limits():
+    assert len((ROOT / "README.md").read_text().split("## Limits")[0].split()) <= 700
+
+
+def test_the_schema_of_captures_takes_ours_and_knows_every_key_that_is_read():
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads((ROOT / "docs" / "reference" / "schemas" / "capture.schema.json").read_text())
+    valid = jsonschema.Draft202012Validator(schema)
+    valid.validate(json.loads((ROOT / "examples" / "tabletop" / "capture.json").read_text()))
+    cell = re.search(r"```json\n(.*?)```", (ROOT / "docs" / "how-to" / "cameras.md").read_text(), re.DOTALL)
+    assert cell is not None
+    content: dict[str, Any] = json.loads(cell[1])
+    content["cameras"]["right"]["frames"][0]["base_from_gripper"] = content["frames"][0]["base_from_gripper"]
+    valid.validate(content)
+    assert not valid.is_valid({"frames": [{"image": "a.png"}]})
+    source = "\n".join(
+        (SOURCE / "capture" / file).read_text()
+        for file in ("capture_json.py", "cell_cameras.py", "lens_json.py")
+    )
+    read = set(re.findall(r"\b(?:content|frame|camera|lens|given)\.get\(\"(\w+)\"", source))
+    known = set(schema["properties"]).union(
+        *(part.get("properties", {}) for part in schema["$defs"].values())
+    )
+    assert len(read) > 10 and read <= known
+
+
 def test_architecture_names_what_there_is():
     """A bare file name belongs to the package that its paragraph is about, or to the top of the source."""
     missing, seen = [], set()
@@ -90,8 +190,8 @@ def test_architecture_names_what_there_is():
 
 
 def test_picture_shows_what_there_is():
-    drawn = (ROOT / "docs" / "rooms.svg").read_text()
-    assert drawn == runpy.run_path(str(ROOT / "docs" / "rooms.py"))["picture"]()
+    drawn = (ROOT / "docs" / "explanation" / "rooms.svg").read_text()
+    assert drawn == runpy.run_path(str(ROOT / "docs" / "explanation" / "rooms.py"))["picture"]()
     names = re.findall(r'<text class="name"[^>]*>([^<]*)<', drawn)
     shown = {
         name if name.endswith(("/", ".py")) else f"{name}.py"

@@ -122,8 +122,8 @@ def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: P
     off_mm, off_deg = numbers(r"off the truth: (.+) mm, (.+)°", text)
     assert off_mm < 3 * np.sqrt(3) * sigma_mm < 10 and off_deg < 3 * np.sqrt(3) * sigma_deg < 1
     assert "used: 10 of 10" in text
-    assert "without turning: observable False, trusted False" in text
-    assert re.search(r"^- offset of the camera.*; tilt the wrist", text, re.MULTILINE)
+    assert "without rotating: observable False, trusted False" in text
+    assert re.search(r"^- translation of the camera.*; tilt the wrist", text, re.MULTILINE)
 
 
 def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):
@@ -138,7 +138,7 @@ def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):
 
 
 def test_a_simulated_ur_arm_gives_a_capture_of_its_stops(tmp_path: Path):
-    assert "5 pictures in out/ur_robot" in told("04_ur_robot", tmp_path)
+    assert "5 images in out/ur_robot" in told("04_ur_robot", tmp_path)
     taken, table = (jcr.read_capture(path) for path in (tmp_path / "out/ur_robot", EXAMPLES / "tabletop"))
     np.testing.assert_allclose(taken.base_from_gripper, table.base_from_gripper[:5], atol=1e-9)
 
@@ -190,3 +190,21 @@ def test_the_notebook_runs_and_shows_the_result(tmp_path: Path):
     assert "<b>gripper_from_camera</b>, accepted" in done.stdout
     assert (tmp_path / "out/notebook/report.html").is_file()
     assert "out/notebook/export/hand_eye.launch" in done.stdout
+
+
+def test_the_python_of_the_readme_prints_what_the_readme_shows(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("torch")
+    section = (ROOT / "README.md").read_text().split("## Ten lines of Python")[1]
+    code, shown = re.findall(r"```(?:python)?\n(.*?)```", section, flags=re.DOTALL)[:2]
+    (tmp_path / "examples").symlink_to(EXAMPLES)
+    shutil.copytree(done, tmp_path / "out" / "tabletop")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    number = re.compile(r"-?\d+\.?\d*")
+    assert number.sub("", printed).split() == number.sub("", shown).split()
+    assert np.allclose(
+        [*map(float, number.findall(printed))], [*map(float, number.findall(shown))], atol=0.02
+    )

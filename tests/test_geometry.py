@@ -40,7 +40,7 @@ batch = array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3)
 
 
 def steps(shape: tuple[int, ...], largest: float = 1.7):
-    """Steps (...,6) whose rotations stay below a half turn: √3 · 1.7 < π."""
+    """Steps (...,6) whose rotations stay below a rotation by 180°: √3 · 1.7 < π."""
     return arrays(np.float64, (*shape, 6), elements=st.floats(-largest, largest, allow_subnormal=False))
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: one line, status 130, nothing half-written, and the same command goes on."""
+"""Ctrl-C at any moment: one line, status 130, nothing half-written, and the same command resumes."""
 
 import json
 import signal

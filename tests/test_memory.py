@@ -35,7 +35,7 @@ SIDE = 320
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten pictures of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
+    """Ten images of noise, whose pairs make 0.57 GB of pointmaps, and weights beside them."""
     from safetensors.torch import save_file
 
     from benchmarks.pairs import random_network
@@ -163,7 +163,7 @@ def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.Monk
     def full(*arguments: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    named = r"no room for pointmaps.*No space left.*TMPDIR"
+    named = r"no space for pointmaps.*No space left.*TMPDIR"
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(InputError, match=named):
         predictor._new_array((4, 4), False)

@@ -101,7 +101,7 @@ def test_a_picture_of_something_else_is_not_located(reconstruction: Reconstructi
 def drifts(
     capture: Capture, x: np.ndarray, seed: int, rows: list[int], noise=(0.5, 0.1), bump=None, nudge=None
 ):
-    """The drift of images `rows` on poses alone: the robot's noise and the cameras' drawn anew."""
+    """The drift of images `rows` on poses alone: the robot pose noise and the cameras' drawn again."""
     rng = np.random.default_rng(seed)
     camera_std = np.r_[np.full(3, 3e-4 / SCALE), np.full(3, 5e-4)]
     places = cameras(capture, x)
@@ -261,7 +261,7 @@ def test_the_command_finds_a_bump_from_one_image_and_says_what_to_do(
     assert found["moved"] and found["p_value"] < 1e-3 and found["cause"] == "either"
     assert np.linalg.norm(found["drift_mm"]) == pytest.approx(3.0, abs=2.0)
     assert np.linalg.norm(found["drift_deg"]) == pytest.approx(1.0, abs=0.3)
-    assert "calibrate anew" in told.err
+    assert "calibrate again" in told.err
 
 
 def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, tmp_path: Path, capsys):

@@ -1,4 +1,4 @@
-"""Joint calibration and representation: a wrist camera's pictures to a calibrated camera and a map.
+"""Joint calibration and representation: a wrist camera's images to a calibrated camera and a map.
 
 capture = jcr.read_capture("captures/table")
 result = jcr.run(capture, "out/table")

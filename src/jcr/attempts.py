@@ -1,4 +1,4 @@
-"""Which back end a run goes on with: each that is tried is reconstructed, calibrated and timed, one after the other."""
+"""Which back end a run keeps: each that is tried is reconstructed, calibrated and timed, one after the other."""
 
 import time
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from jcr.records import Attempt, Capture, HandEye, Reconstruction
 
 @dataclass(frozen=True)
 class Choice:
-    """What the run goes on with, and how it came to that."""
+    """What the run keeps, and why."""
 
     reconstruction: Reconstruction
     hand_eye: HandEye
@@ -51,11 +51,10 @@ def choose(
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
     `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long as
-    the ones before gave nothing or a calibration that is not to be trusted for another reason than the motion. Of two
-    results a trusted one is kept, else the one with the smaller held-out error; dense depth is made for the one that is
-    kept, unless a known length is read from it. `chosen` is told the reconstruction as soon as it is sure that the run
-    goes on with it. Raises InputError as the back end does, NothingFoundError where none
-    gave anything.
+    the ones before failed or gave a calibration that is rejected for another reason than the motion. Of two results an
+    accepted one is kept, else the one with the smaller leave-one-out error; dense depth is made for the one that is kept,
+    unless a known length is read from it. `chosen` gets the reconstruction as soon as it is sure that the run keeps it.
+    Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
     made = tries(options)
     if len(made) == 1:
@@ -95,7 +94,7 @@ def again(
     options: CalibrateOptions,
     progress: Progress | None = None,
 ) -> Choice:
-    """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated anew; raises as `choose` does.
+    """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated again; raises as `choose` does.
 
     The account of how it was chosen stays what it was.
     """
@@ -130,7 +129,7 @@ class _Tried:
 
     @property
     def is_enough(self) -> bool:
-        """Whether no other back end is asked: this one is trusted, or the motion is at fault."""
+        """Whether no other back end is asked: this one is accepted, or the motion is at fault."""
         hand_eye = self.hand_eye
         return hand_eye is not None and (hand_eye.converged or not hand_eye.observability.observable)
 
@@ -138,7 +137,9 @@ class _Tried:
         """The back end, and its error on images left out."""
         held_out = None if self.hand_eye is None else self.hand_eye.held_out
         error = (
-            "too few images to leave one out" if held_out is None else f"held-out error {missed(held_out)}"
+            "too few images to leave one out"
+            if held_out is None
+            else f"leave-one-out error {missed(held_out)}"
         )
         return f"{self.name} ({error})"
 
@@ -198,7 +199,7 @@ def _tried(
 def _calibrated(
     capture: Capture, tried: _Tried, options: CalibrateOptions, progress: Progress | None
 ) -> _Tried:
-    """Input that calibration cannot use, no other back end mends: its InputError is the caller's."""
+    """Input that calibration cannot use, no other back end fixes: its InputError is the caller's."""
     report = progress or silent
     assert tried.reconstruction is not None
     report("calibrate", 0.0)
@@ -223,24 +224,24 @@ def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
     if isinstance(other.failure, InputError) and not BACKENDS[other.backend].hub_id:
         raise other.failure
     if one.hand_eye is None:
-        nothing = f"{_about(one.backend, one.name)}, gave nothing ({one.failure})"
+        nothing = f"{_about(one.backend, one.name)}, failed ({one.failure})"
         if other.hand_eye is None:
             # The licence of weights that were used belongs to this answer, too.
             failure = NotTrustedError(f"{other.failure}; {nothing}")
             return replace(other, failure=failure), (one.attempt(), other.attempt())
         kept = other.noted(f"{nothing}; {other.told()} was used instead")
         return kept, (one.attempt(), other.attempt())
-    doubt = f"{_about(one.backend, one.name)}, is not to be trusted ({one.hand_eye.warnings[0]})"
+    doubt = f"{_about(one.backend, one.name)}, is rejected ({one.hand_eye.warnings[0]})"
     if other.hand_eye is None:
-        kept = one.noted(f"{doubt}, and {other.name} gave nothing ({other.failure})")
+        kept = one.noted(f"{doubt}, and {other.name} failed ({other.failure})")
         return kept, (one.attempt(), other.attempt())
-    untrusted = f"not to be trusted: {one.hand_eye.warnings[0]}"
+    untrusted = f"rejected: {one.hand_eye.warnings[0]}"
     if other.hand_eye.converged:
         kept = other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
         return kept, (one.attempt(untrusted), other.attempt())
     kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
     words = f"{doubt}, nor is {other.name}; {kept.told()} was used and not {left.told()}"
-    farther = f"not to be trusted, and its held-out error is not the smaller one: {left.told()}"
+    farther = f"rejected, and its leave-one-out error is not the smaller one: {left.told()}"
     attempts = tuple(tried.attempt(farther if tried is left else None) for tried in (one, other))
     return kept.noted(words), attempts
 

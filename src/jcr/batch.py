@@ -70,7 +70,7 @@ class Row:
     held_out_deg: float | None = None
     seconds: float = 0.0
     reason: str = ""
-    """Why it failed or is not trusted."""
+    """Why it failed or is rejected."""
 
 
 @dataclass(frozen=True)
@@ -307,8 +307,9 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>jcr batch
 table{{border-collapse:collapse}}th,td{{padding:.3em .8em;text-align:left;border-bottom:1px solid #8885}}
 td.n,th.n{{text-align:right;font-variant-numeric:tabular-nums}}.bad{{color:#c33}}</style>
 <h1>{done} of {n} captures calibrated</h1><table><thead><tr><th class="n">#</th><th>capture</th><th>status</th>
-<th class="n">images used</th><th class="n">offset ± mm</th><th class="n">turn ± °</th><th class="n">scale ± %</th>
-<th class="n">held out mm</th><th class="n">held out °</th><th class="n">s</th><th>reason</th></tr></thead>
+<th class="n">images used</th>
+<th class="n">translation ± mm</th><th class="n">rotation ± °</th><th class="n">scale ± %</th>
+<th class="n">leave-one-out mm</th><th class="n">leave-one-out °</th><th class="n">s</th><th>reason</th></tr></thead>
 <tbody>{rows}</tbody></table></html>
 """
 

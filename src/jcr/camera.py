@@ -237,7 +237,7 @@ def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, 
         return lens, ()
     warning = (
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
-        "calibrate the lens again with points out to the corners, or give zero distortion"
+        "calibrate the intrinsics again with points out to the corners, or give zero distortion"
     )
     return without_distortion(lens), (warning,)
 

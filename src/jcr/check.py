@@ -40,12 +40,12 @@ class Examination:
     """records.COVARIANCE_ORDER, for the noise that was given or assumed."""
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
-    """From sparse features, where the pictures were looked at and registered."""
+    """From sparse features, where the images were looked at and registered."""
     angle_ratio: tuple[float, float] | None
     """Rotation angles between cameras over those between grippers, and its standard deviation; 1 is right whatever
     gripper_from_camera is. None without cameras to compare with."""
     faults: tuple[str, ...]
-    """Why a calibration of this capture would not be trusted."""
+    """Why a calibration of this capture would be rejected."""
     remarks: tuple[str, ...]
 
 
@@ -59,7 +59,7 @@ def check(
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
-    """Examine a capture; with `look` its pictures are registered sparsely to hold the poses against them.
+    """Examine a capture; with `look` its images are registered sparsely to hold the poses against them.
 
     A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
     `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
@@ -81,7 +81,7 @@ def check(
             )
     if move < 5e-3 and turn > np.radians(5):
         remarks.append(
-            f"the gripper moves by at most {1e3 * move:.2g} mm while it turns by {np.degrees(turn):.0f}°: "
+            f"the gripper moves by at most {1e3 * move:.2g} mm while it rotates by {np.degrees(turn):.0f}°: "
             "positions that were divided by 1000 look so"
         )
     held, quick = None, False
@@ -180,6 +180,6 @@ def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]
 def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):
     for name, grey, sharp in zip(capture.images, brightness, sharpness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
-            yield f"{name} is {fault}; expose it anew"
+            yield f"{name} is {fault}; expose it again"
         elif sharp < BLURRED:
             yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"

@@ -1,4 +1,4 @@
-"""The two things that can be wrong and are no bug: the user's input, and an answer not to be trusted."""
+"""The two things that can be wrong and are no bug: the user's input, and a rejected answer."""
 
 
 def printable(text: str) -> str:
@@ -7,11 +7,11 @@ def printable(text: str) -> str:
 
 
 class InputError(ValueError):
-    """The user's input cannot be used; the message says what, where and how to mend it (exit status 2)."""
+    """The user's input cannot be used; the message says what, where and how to fix it (exit status 2)."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))
 
 
 class NotTrustedError(RuntimeError):
-    """No trustworthy answer exists for sound input; the message gives the reason and the cure (exit 3)."""
+    """No trustworthy answer exists for sound input; the message gives the reason and the remedy (exit 3)."""

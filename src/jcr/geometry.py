@@ -91,7 +91,7 @@ def retract(
 def step_between(
     a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
 ) -> Float[ndarray, "... 6"]:
-    """Steps (...,6) that take `a_from_b` to `target`: the inverse of `retract`, rotations up to a half turn."""
+    """Steps (...,6) that take `a_from_b` to `target`: the inverse of `retract`, rotations up to a rotation by 180°."""
     turn = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(turn)], axis=-1)
 

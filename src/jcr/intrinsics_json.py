@@ -30,7 +30,7 @@ class IntrinsicsJson(BaseModel):
     def _as_many_as_the_model_has(self) -> "IntrinsicsJson":
         names = COEFFICIENTS[self.model]
         if len(self.distortion) != len(names):
-            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} lens has {names}")
+            raise ValueError(f"{len(self.distortion)} coefficients, but a {self.model} model has {names}")
         return self
 
     def record(self) -> Intrinsics:

@@ -146,17 +146,17 @@ def add_camera(
     *,
     progress: Progress | None = None,
 ) -> RunResult:
-    """A fixed camera placed in the run folder `out` by pictures of the scene that was mapped there.
+    """A fixed camera placed in the run folder `out` by images of the scene that was mapped there.
 
     `intrinsics` is a JSON file as capture.json has them; None: they are estimated. The camera becomes part of the run,
-    cameras.json and the report. Raises InputError for pictures that are not of one camera or fit no intrinsics, and
+    cameras.json and the report. Raises InputError for images that are not of one camera or fit no intrinsics, and
     NotTrustedError, with nothing kept, where they do not show the camera's place or the run is not calibrated.
     """
     made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
     earlier = RunFolder(Path(out)).calibration()
     if earlier.doubt is not None:
         raise NotTrustedError(
-            f"{out}: no camera can be placed by a calibration that is not to be trusted: {earlier.doubt}"
+            f"{out}: no camera can be placed by a calibration that is rejected: {earlier.doubt}"
         )
     options = RunOptions(made_with.reconstruct, made_with.calibrate)
     with held(Path(out)) as folder:

@@ -8,7 +8,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 Progress = Callable[[str, float], None]
-"""Told the stage's name and the fraction of it that is done."""
+"""Gets the stage's name and the fraction of it that is done."""
 
 
 def silent(stage: str, fraction: float) -> None:

@@ -28,7 +28,7 @@ Coefficients = (
 
 
 def coefficients_of(values: Iterable[float]) -> Coefficients:
-    """Four, five or eight numbers as a lens has them."""
+    """Four, five or eight numbers as a model has them."""
     return cast(Coefficients, tuple(float(value) for value in values))
 
 
@@ -58,7 +58,7 @@ Mount = Literal["gripper", "base"]
 
 @dataclass(frozen=True)
 class CellCamera:
-    """A further camera of the robot's cell, and its pictures."""
+    """A further camera of the robot's cell, and its images."""
 
     name: str
     mount: Mount
@@ -70,12 +70,12 @@ class CellCamera:
     folder: Path | None = None
     """None: the capture's."""
     frame: Int[ndarray, " k"] | None = None
-    """Rows of the capture at whose gripper poses the pictures were taken: of a camera on the same gripper, or of a fixed
+    """Rows of the capture at whose gripper poses the images were taken: of a camera on the same gripper, or of a fixed
     one that watches what this gripper carries. None of others."""
     arm: str | None = None
     """The other arm that carries it; None: the capture's own, or none."""
     base_from_gripper: Float[ndarray, "k 4 4"] | None = None
-    """Of the other arm, in its own base, at each picture."""
+    """Of the other arm, in its own base, at each image."""
 
     @property
     def watches_gripper(self) -> bool:
@@ -110,7 +110,7 @@ class Capture:
     urdf: Path | None = None
     """Of the arm, where it was given."""
     orientation: int = 1
-    """EXIF's, of all images: 1 as the sensor has them; others were turned upright, and the camera frame is theirs."""
+    """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
     depths: tuple[str | None, ...] | None = None
     """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
     camera_name: str = "wrist"
@@ -147,12 +147,12 @@ class PosePairs:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations of common 3D points, the food of bundle adjustment, whatever back end made them."""
+    """Observations of common 3D points, for bundle adjustment, whatever back end made them."""
 
     image: Int[ndarray, " k"]
     """Row of the reconstruction (not of the capture) that each observation belongs to."""
     x_px: Float[ndarray, "k 2"]
-    """In the capture's original image, distorted as the lens made it."""
+    """In the capture's original image, distorted as the camera made it."""
     point: Int[ndarray, " k"]
     """Row of `points_in_recon`."""
     points_in_recon: Float[ndarray, "p 3"]
@@ -162,7 +162,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """What the pictures alone say of the cameras, and how surely; the robot was not asked."""
+    """What the images alone say of the cameras, and how surely; the robot was not asked."""
 
     recon_from_camera: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"]
@@ -206,7 +206,7 @@ class Reconstruction:
     depth_std: Float[ndarray, "m h w"] | None = None
     """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
     evidence: CameraEvidence | None = None
-    """In the same frame, where the robot's poses had a say in `recon_from_camera` or cameras err beside them."""
+    """In the same frame, where the robot's poses were used for `recon_from_camera` or cameras err beside them."""
 
 
 @dataclass(frozen=True)
@@ -227,9 +227,9 @@ class Observability:
 
     observable: bool
     unobservable: tuple[str, ...]
-    """In words, e.g. "scale: every view turns about one point fixed to the gripper"."""
+    """In words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
     advice: tuple[str, ...]
-    """One cure per unobservable direction."""
+    """One remedy per unobservable direction."""
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ class Budget:
     intrinsics: Float[ndarray, "7 7"]
     """What would go if they were known."""
     images: Float[ndarray, "7 7"]
-    """Camera poses and features; and what no motion shows."""
+    """Camera poses and features; and what is unobservable."""
 
 
 @dataclass(frozen=True)
@@ -405,8 +405,9 @@ class HandEye:
     scale_from_robot_alone: bool = False
     """No length that is known otherwise, and no depth camera, had a say."""
     lens_shift: Float[ndarray, "7"] | None = None
-    """How far the lens that the pictures show, in place of the one given, would move the answer; in COVARIANCE_ORDER,
-    and in the covariance. None where nothing speaks against the lens."""
+    """How far the intrinsics that the images show, in place of the one given, would move the answer; in
+    COVARIANCE_ORDER,
+    and in the covariance. None where nothing speaks against the intrinsics."""
     refinement: "Refinement | None" = None
     """None where camera poses alone decided."""
     systematic_p: float | None = None
@@ -444,12 +445,12 @@ class Attempt:
 
     backend: str
     images_registered: int | None
-    """None where it gave nothing."""
+    """None where it failed."""
     reconstruct_s: float
     calibrate_s: float
     """0 where there was nothing to calibrate."""
     why_not: str | None
-    """Why the run does not go on with it; None where it does."""
+    """Why the run does not keep it; None where it does."""
     features: str | None = None
     """What was matched between images, where the back end has a choice."""
 

@@ -1,4 +1,4 @@
-"""What the whole job is told, and what it hands to the report, the command line and the caller."""
+"""What the whole job is given, and what it hands to the report, the command line and the caller."""
 
 from dataclasses import dataclass, field
 from html import escape

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """The number with so many significant digits, never in powers of ten; at most six decimals."""
+    """The number with this many significant digits, never in powers of ten; at most six decimals."""
     if not np.isfinite(value):
         return "unknown"
     if abs(value) < 0.5e-6:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 LOCK = ".lock"
 """Held by the run that writes there."""
 MOVING = "moving"
-"""Pictures of a fixed camera without what stands still, of which a carried thing is reconstructed."""
+"""Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
 CAPTURE = "capture"
 """Images and poses that were read from another format than capture.json."""
 STATE = "run.json"
@@ -131,7 +131,7 @@ class RunFolder:
             )
         if calibration.gripper_from_camera is None:
             raise InputError(
-                f"{self.path}: found no calibration ({calibration.doubt}); mend the capture, run it again"
+                f"{self.path}: found no calibration ({calibration.doubt}); fix the capture, run it again"
             )
         reconstruction = self.reconstruction()
         if len(calibration.images) <= reconstruction.image_index.max(initial=-1):
@@ -262,7 +262,7 @@ def state_of(capture: Capture, reconstruct: ReconstructOptions, calibrate: Calib
 
 
 def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
-    """A hash of all that a stage's result depends on: pictures, poses, lens, options and version."""
+    """A hash of all that a stage's result depends on: images, poses, intrinsics, options and version."""
     digest = hashlib.sha256()
     for name in capture.images:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())

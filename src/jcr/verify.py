@@ -68,7 +68,7 @@ class Verification:
 
     @property
     def drift_rad(self) -> float:
-        """By how much it is turned."""
+        """By how much it is rotated."""
         return float(np.linalg.norm(self.offset[3:]))
 
     @property
@@ -84,17 +84,17 @@ class Verification:
         """What to do, where something has moved."""
         if self.fixed is not None:
             return (
-                f"{self.fixed} has moved; fasten it, and place it anew (jcr add-camera, under another name)"
+                f"{self.fixed} has moved; fasten it, and place it again (jcr add-camera, under another name)"
             )
-        anew = "tighten the mount, then calibrate anew from 8 or more images (jcr run)"
+        anew = "tighten the mount, then calibrate again from 8 or more images (jcr run)"
         if self.cause == "scene":
             return (
                 "the scene or the robot's base was moved as a whole; the map is no longer true, the camera still "
-                "fits: build the map anew (jcr run)"
+                "fits: build the map again (jcr run)"
             )
         if self.cause == "either":
             return (
-                f"moved: the camera on the gripper, or the whole scene; two more images with the wrist turned tell "
+                f"moved: the camera on the gripper, or the whole scene; two more images with the wrist rotated tell "
                 f"which; if it is the camera, {anew}"
             )
         return f"the camera has moved on the gripper; {anew}"
@@ -106,7 +106,7 @@ def verify(
     """Hold the calibration in the run folder `out` against the few images of `new`.
 
     Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
-    when the images show too little of the old scene, or too few of another, to tell.
+    when the images share too few features with the old scene, or too few of another, to tell.
     """
     report = progress or silent
     if not 0 < options.alpha < 0.5:
@@ -114,9 +114,7 @@ def verify(
     folder = RunFolder(out)
     calibration, reconstruction = folder.calibrated()
     if not calibration.converged:
-        raise InputError(
-            f"{out}: its calibration is not to be trusted, so that nothing can be held against it"
-        )
+        raise InputError(f"{out}: its calibration is rejected, so that nothing can be held against it")
     capture, options_then = folder.capture(), folder.options()
     if [image.image for image in calibration.images] != list(capture.images):
         raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")
@@ -168,11 +166,11 @@ def verify_camera(
     options: VerifyOptions = VerifyOptions(),
     progress: Progress | None = None,
 ) -> Verification:
-    """Hold the place of a fixed camera of the run folder `out` against new pictures of the same scene by it.
+    """Hold the place of a fixed camera of the run folder `out` against new images of the same scene by it.
 
     Both places are found together, so that what the wrist camera's calibration leaves open moves them alike. Raises
-    InputError where the run has placed no fixed camera of that name, or the pictures cannot be its; NotTrustedError
-    where they show too little of the scene.
+    InputError where the run has placed no fixed camera of that name, or the images cannot be its; NotTrustedError
+    where they share too few features with the scene.
     """
     from jcr.cell.stage import place_cameras  # pycolmap, which help need not wait for
 

@@ -10,9 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import BENCHES
+from benchmarks.__main__ import BENCHES, paths_of
+from benchmarks.freshness import (
+    COMMIT,
+    changed_since_measured,
+    essence,
+    has_history,
+    marked,
+    says_it_is_old,
+)
 from benchmarks.peers import grid_search
-from benchmarks.suite import CLAIM, MARKS, Outcome, between_marks, claims, run, write_index
+from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
@@ -23,23 +31,58 @@ RESULTS = ROOT / "docs" / "results"
 MEASURED = re.compile(r"(\d[\d,.]*\d|\d)\s?(mm|cm|°|%|ms|s|dB|GiB|GB|MiB|M|minutes|times)(?![\w])")
 
 
-def test_the_readme_claims_what_the_benches_found_and_nothing_else():
-    readme = (ROOT / "README.md").read_text()
-    assert between_marks(readme, RESULTS, list(BENCHES), "docs/results") == readme
+def test_the_index_claims_what_the_benches_found_and_nothing_else():
+    index = (RESULTS / "README.md").read_text()
+    assert with_claims(index, RESULTS) == index, "write it again: jcr bench stale --write"
 
 
 def test_every_number_of_the_readme_is_in_the_results():
-    section = (ROOT / "README.md").read_text().split("## What it measures")[1].split("\n## ")[0]
-    pages = "\n".join(page.read_text() for page in RESULTS.glob("*.md") if page.name != "README.md")
-    quoted, found = MEASURED.findall(section), set(MEASURED.findall(pages))
-    assert len(quoted) > 10
-    assert [number for number in quoted if number not in found] == []
+    section = (ROOT / "README.md").read_text().split("## Evidence")[1].split("\n## ")[0]
+    quoted = 0
+    for row in section.splitlines():
+        pages = re.findall(r"\((docs/results/\w+\.md)\)", row)
+        found = {number for page in pages for number in MEASURED.findall((ROOT / page).read_text())}
+        assert [number for number in MEASURED.findall(row) if number not in found] == [], row
+        quoted += len(MEASURED.findall(row))
+    assert quoted >= 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted(RESULTS.glob("*.md")), ids=lambda page: page.stem)
+def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page: Path):
+    paths = paths_of(page.stem)
+    if paths is None:
+        assert page.name == "README.md", "a page of no bench"
+        return
+    assert all((ROOT / path).exists() for path in paths)
+    text = page.read_text()
+    assert COMMIT.search(text), "names no commit"
+    if not has_history():
+        pytest.skip("a shallow clone, or no repository: git cannot tell what changed since")
+    old = bool(changed_since_measured(page, paths, at_most=1))
+    assert old is says_it_is_old(text), "measure it again, or: jcr bench stale --write"
+
+
+def test_what_code_says_does_not_make_a_page_old():
+    code = (
+        "def f(x):\n    'Two.'\n    if x < 0:\n        raise ValueError(f'{x} too low')\n    return x + 1\n"
+    )
+    said_otherwise = code.replace("Two", "2").replace("too low", "below zero") + "# more\n"
+    assert essence(code) == essence(said_otherwise)
+    assert essence(code) != essence(code.replace("x + 1", "x + 2"))
+
+
+def test_a_page_says_that_it_is_old_below_its_commit_and_once():
+    page = "# jcr bench map\n\n2026-11-22, commit `abcdef0`. A machine.\n\n> found\n"
+    once = marked(page, ["src/jcr/a.py"])
+    assert says_it_is_old(once) and once.splitlines()[4].endswith("`src/jcr/a.py` changed since.")
+    assert marked(once, ["src/jcr/a.py"]) == once and marked(once, []) == page
 
 
 def test_every_page_of_results_says_which_command_writes_it():
     named = set(re.findall(r"\((\w+)\.md\)", (RESULTS / "README.md").read_text()))
-    assert named and named <= set(BENCHES)
-    for name in named:
+    assert named and named <= {*BENCHES, "real_all"}
+    for name in named - {"real_all"}:
         text = (RESULTS / f"{name}.md").read_text()
         assert f"\n    jcr bench {name}" in text and claims(RESULTS / f"{name}.md"), name
         pictures = re.findall(r"\]\((\w+\.png)\)", text)
@@ -64,7 +107,7 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     write_index(outcomes, tmp_path, "jcr bench all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
     assert "2 of 3 benches were run this time, in 1.5 minutes" in index
-    assert "- the map is good ([map](map.md))" in index
+    assert "| map | the map is good | [`jcr bench map`](map.md) |" in index
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 
 
@@ -77,14 +120,15 @@ def test_a_page_older_than_the_sources_is_measured_again(tmp_path: Path):
     assert outcome.seconds is not None
 
 
-def test_claims_go_between_the_marks_and_a_readme_without_them_is_refused(tmp_path: Path):
-    (tmp_path / "map.md").write_text(f"# map\n{CLAIM}1 mm off\n{CLAIM}2 s long\n")
-    readme = f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n"
-    written = between_marks(readme, tmp_path, ["map", "limits"], "results")
-    link = "([`jcr bench map`](results/map.md))"
-    assert written == f"before\n{MARKS[0]}\n- 1 mm off {link}\n- 2 s long {link}\n{MARKS[1]}\nafter\n"
+def test_claims_go_between_the_marks_as_a_table_and_an_index_without_them_is_refused(tmp_path: Path):
+    about = "# map\n\nof things\n\n    jcr bench map\n\n2026-11-22, commit `abcdef0`.\n"
+    (tmp_path / "map.md").write_text(f"{about}{CLAIM}the map: 1 mm off\n{CLAIM}2 s long\n")
+    written = with_claims(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n", tmp_path)
+    command = "[`jcr bench map`](map.md) | `abcdef0` |"
+    assert f"| the map | 1 mm off | {command}\n| of things | 2 s long | {command}\n" in written
+    assert written.startswith("before\n") and written.endswith("after\n") and "old" not in written
     with pytest.raises(InputError, match="marks|lines"):
-        between_marks("no marks", tmp_path, ["map"], "results")
+        with_claims("no marks", tmp_path)
 
 
 def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there():

@@ -1,4 +1,4 @@
-"""Given intrinsics that the pictures contradict are named, and those that are right never."""
+"""Given intrinsics that the images contradict are named, and those that are right never."""
 
 import re
 from dataclasses import replace
@@ -18,7 +18,7 @@ from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 def pictured(
     seed: int, images: int, lens: Intrinsics | None, **motion
 ) -> tuple[HandEyeProblem, Capture, Reconstruction]:
-    """Pictures that LENS made, of which it is told that `lens` did; None: told nothing."""
+    """Images that LENS made, of which it is told that `lens` did; None: told nothing."""
     rng = np.random.default_rng([seed, images])
     problem = hand_eye_problem(
         rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
@@ -53,8 +53,8 @@ def scaled(factor: float) -> Intrinsics:
 
 
 def said(hand_eye: HandEye) -> str:
-    """What is said of the lens."""
-    return next((text for text in hand_eye.warnings if text.startswith("the pictures show ")), "")
+    """What is said of the intrinsics."""
+    return next((text for text in hand_eye.warnings if text.startswith("the images show ")), "")
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
 def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images: int) -> None:
     _, hand_eye = calibrated(0, images, scaled(factor))
     found = re.match(
-        r"the pictures show a focal length of ([\d.]+) ± \S+ px where ([\d.]+) is given", said(hand_eye)
+        r"the images show a focal length of ([\d.]+) ± \S+ px where ([\d.]+) is given", said(hand_eye)
     )
     assert found is not None
     assert float(found[1]) == pytest.approx(LENS.fx, rel=0.01)
@@ -112,7 +112,7 @@ def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:
     turned = said(calibrated(0, 10, replace(LENS, distortion=(-k1, *others)))[1])
     assert "distortion" in turned and "focal" not in turned and "principal" not in turned
     shifted = said(calibrated(0, 10, replace(LENS, cx=LENS.cx + 30))[1])
-    found = re.match(r"the pictures show a principal point of \(([\d.]+), ([\d.]+)\) ± ", shifted)
+    found = re.match(r"the images show a principal point of \(([\d.]+), ([\d.]+)\) ± ", shifted)
     assert found is not None and "focal" not in shifted and "distortion" not in shifted
     assert [float(found[1]), float(found[2])] == pytest.approx([LENS.cx, LENS.cy], abs=4)
 

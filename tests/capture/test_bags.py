@@ -83,7 +83,7 @@ def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Ca
 
 @pytest.mark.slow
 def test_further_cameras_of_a_bag_are_told_by_tf_or_by_name(tmp_path: Path, capture: Capture):
-    """Four stops; a fixed camera's picture, and one of a second camera on the gripper for each stop."""
+    """Four stops; a fixed camera's image, and one of a second camera on the gripper for each stop."""
     for k, name in enumerate(capture.images[:9]):
         small = cv2.resize(cv2.imread(str(capture.folder / name)), (80, 60))
         cv2.imwrite(str(tmp_path / f"{k}.png"), small)
@@ -284,7 +284,7 @@ def test_messages_that_are_not_the_standard_ones_are_refused(
 
 
 def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
-    """A steady turn with a steady advance along x is its own interpolation."""
+    """A steady rotate with a steady advance along x is its own interpolation."""
     start = 1_700_000_000_000_000_001
     time_s = np.arange(5.0)
     turn = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
@@ -326,7 +326,7 @@ def test_the_best_frames_are_still_sharp_and_spread():
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "bayer_gbrg8", "yuv422_yuy2"])
 def test_colours_of_raw_images(encoding: str):
-    """A picture that is red above and blue below stays so, with rows padded to a multiple of 64 bytes."""
+    """An image that is red above and blue below stays so, with rows padded to a multiple of 64 bytes."""
     height, width = 8, 16
     picture = np.zeros((height, width, 3), np.uint8)
     picture[:4, :, 0] = picture[4:, :, 2] = 200
@@ -362,7 +362,7 @@ def test_colours_of_raw_images(encoding: str):
     assert np.abs(pixels[1, 2:-2].mean(0) - [200, 0, 0]).max() < 20
     assert np.abs(pixels[6, 2:-2].mean(0) - [0, 0, 200]).max() < 20
     vars(message).update(encoding="16UC1")
-    with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour picture"):
+    with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour image"):
         picture_of(message, "bag")
 
 

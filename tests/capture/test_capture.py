@@ -1,4 +1,4 @@
-"""Reading a capture: what is sound is read as it is, and each fault is named with its place and cure."""
+"""Reading a capture: what is sound is read as it is, and each fault is named with its place and remedy."""
 
 import json
 import shutil
@@ -183,9 +183,9 @@ FAULTS = {
     "image empty": (lambda c: (c / "images/01.jpg").write_bytes(b""), r"01\.jpg: not a readable image"),
     "text as image": (lambda c: (c / "images/01.jpg").write_text("hello"), r"01\.jpg: not a readable image"),
     "wrong size": (shrink, r"01\.jpg: 320x240 pixels, but images/00\.jpg has 640x480"),
-    "same picture": (
+    "same image": (
         lambda c: shutil.copy(c / "images/00.jpg", c / "images/01.jpg"),
-        r"01\.jpg: the same picture as images/00\.jpg",
+        r"01\.jpg: the same image as images/00\.jpg",
     ),
     "pose missing": (
         lambda c: edit(c, lambda j: j["frames"][1].pop("base_from_gripper")),
@@ -215,12 +215,15 @@ FAULTS = {
         lambda c: edit(c, lambda j: j["frames"][1].update(base_from_gripper="here")),
         "frame 1 .*4x4",
     ),
-    "lens outside": (lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)), "outside the 640x480"),
-    "lens short": (
+    "intrinsics outside": (
+        lambda c: edit(c, lambda j: j["intrinsics"].update(cx=900)),
+        "outside the 640x480",
+    ),
+    "intrinsics short": (
         lambda c: edit(c, lambda j: j["intrinsics"].update(distortion=[0, 0])),
         "not the 5 of a pinhole",
     ),
-    "lens negative": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)), "must be positive"),
+    "intrinsics negative": (lambda c: edit(c, lambda j: j["intrinsics"].update(fx=-600)), "must be positive"),
     "path outside": (
         lambda c: edit(c, lambda j: j["frames"][1].update(image="../x.jpg")),
         r"frame 1: '\.\./x\.jpg' leads out",
@@ -257,7 +260,7 @@ def test_a_decompression_bomb_is_refused_before_it_is_unpacked(tmp_path: Path):
 def test_an_animation_is_refused(tmp_path: Path):
     frames = [Image.new("RGB", (64, 48), color) for color in ("red", "green")]
     frames[0].save(tmp_path / "two.gif", save_all=True, append_images=frames[1:])
-    with pytest.raises(jcr.InputError, match="holds 2 pictures"):
+    with pytest.raises(jcr.InputError, match="holds 2 images"):
         read_image(tmp_path / "two.gif")
 
 

@@ -1,4 +1,4 @@
-"""Lens models through every reader and writer that knows them."""
+"""Intrinsics models through every reader and writer that knows them."""
 
 import json
 from dataclasses import replace
@@ -70,15 +70,15 @@ def test_other_lenses_are_refused_by_name(model: str, count: int, words: str):
 def test_a_capture_names_the_models_that_there_are():
     lens = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
     with pytest.raises(
-        jcr.InputError, match="lens model 'omni' is not known; give one of pinhole, rational, fisheye"
+        jcr.InputError, match="distortion model 'omni' is not known; give one of pinhole, rational, fisheye"
     ):
         lens_json.read_lens(lens | {"model": "omni"}, SIZE, Path("capture.json"))
-    with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye lens, k1,k2,k3,k4"):
+    with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye intrinsics, k1,k2,k3,k4"):
         lens_json.read_lens(lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json"))
 
 
 def through(lens: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:
-    """The picture that a camera with another lens takes from the same place."""
+    """The image that a camera with another intrinsics takes from the same place."""
     from jcr.camera import project, unproject
 
     u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))

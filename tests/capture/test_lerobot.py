@@ -1,4 +1,4 @@
-"""LeRobot data sets, v2.1 and v3.0: the right pictures with the right poses, out of AV1 videos."""
+"""LeRobot data sets, v2.1 and v3.0: the right images with the right poses, out of AV1 videos."""
 
 import json
 from importlib.util import find_spec
@@ -40,7 +40,7 @@ def walked(states: np.ndarray) -> np.ndarray:
 
 
 def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
-    """The bundled pictures, small, each as often as its view lasts; row and view are told by grey bars."""
+    """The bundled images, small, each as often as its view lasts; row and view are told by grey bars."""
     capture = jcr.read_capture(tabletop)
     pictures = []
     for k in range(count):
@@ -56,13 +56,13 @@ def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
 
 
 def view_of(capture: Capture) -> np.ndarray:
-    """Which view each picture shows, read from its bar."""
+    """Which view each image shows, read from its bar."""
     bars = [read_image(capture.folder / name)[4:12, 8:72].mean() for name in capture.images]
     return np.round(np.array(bars) / 15).astype(int)
 
 
 def assert_paired(capture: Capture, poses: np.ndarray) -> None:
-    """Every picture has the pose of the view that it shows."""
+    """Every image has the pose of the view that it shows."""
     assert len(capture) == len(poses)
     assert sorted(view_of(capture)) == list(range(len(poses)))
     assert np.allclose(capture.base_from_gripper, poses[view_of(capture)], atol=1e-6)

@@ -1,4 +1,4 @@
-"""One capture in every format is read as the same capture; each fault is named with its place and cure."""
+"""One capture in every format is read as the same capture; each fault is named with its place and remedy."""
 
 import json
 import shutil
@@ -31,14 +31,14 @@ def problem() -> HandEyeProblem:
 
 @pytest.fixture(scope="module")
 def capture(tabletop: Path, problem: HandEyeProblem) -> Capture:
-    """The bundled pictures, with poses whose cameras are known exactly and a lens with distortion."""
+    """The bundled images, with poses whose cameras are known exactly and a intrinsics with distortion."""
     bundled = jcr.read_capture(tabletop)
     lens = replace(bundled.intrinsics, distortion=(0.01, -0.02, 1e-3, -2e-3, 0.003))
     return replace(bundled, base_from_gripper=problem.base_from_gripper, intrinsics=lens)
 
 
 def assert_same(got: Capture, capture: Capture) -> None:
-    """The same pictures, poses to 1e-9, and lens."""
+    """The same images, poses to 1e-9, and intrinsics."""
     assert len(got) == len(capture)
     for name, expected in zip(got.images, capture.images, strict=True):
         assert (got.folder / name).read_bytes() == (capture.folder / expected).read_bytes()
@@ -285,21 +285,21 @@ FAULTS = {
         "rotation vector .* or angles",
     ),
     "gzip": (lambda f: f.write_bytes(b"\x1f\x8b\x08\x00rest"), {}, "compressed by gzip"),
-    "a picture": (lambda f: f.write_bytes((f.parent / "images/00.jpg").read_bytes()), {}, "not UTF-8"),
+    "an image": (lambda f: f.write_bytes((f.parent / "images/00.jpg").read_bytes()), {}, "not UTF-8"),
     "empty": (lambda f: f.write_text(""), {}, "holds no poses"),
     "two frames": (
         lambda f: f.write_text("\n".join(f.read_text().splitlines()[:3])),
         {},
         "2 frames; at least 3",
     ),
-    "lens of another size": (
+    "intrinsics of another size": (
         lambda f: (f.parent / "camera_info.yaml").write_text(
             (f.parent / "camera_info.yaml").read_text().replace("image_width: 640", "image_width: 1280")
         ),
         {},
         "calibrated at 1280x480, the images are 640x480",
     ),
-    "fisheye lens": (
+    "fisheye intrinsics": (
         lambda f: (f.parent / "camera_info.yaml").write_text(
             (f.parent / "camera_info.yaml").read_text().replace("plumb_bob", "equidistant")
         ),

@@ -1,4 +1,4 @@
-"""Further cameras of a cell: the truth of simulated cells within sigma, pictures placed or refused with the reason."""
+"""Further cameras of a cell: the truth of simulated cells within sigma, images placed or refused with the reason."""
 
 import json
 import os
@@ -40,7 +40,7 @@ SCALE = 0.37
 
 
 def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Answer:
-    """As the stage does it, from starts that are near; lenses off by what is usual."""
+    """As the stage does it, from starts that are near; intrinsics off by what is usual."""
     rng = np.random.default_rng(5)
     cameras, priors = [], []
     for camera in problem.cameras:
@@ -205,13 +205,13 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert "must see the same scene" in found.cameras[0].warnings[0]
     assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
     untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
-    assert "not to be trusted" in untrusted.cameras[0].warnings[0]
+    assert "rejected" in untrusted.cameras[0].warnings[0]
 
 
 def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictures(
     calibrated, monkeypatch, tabletop: Path
 ):
-    """Its reconstruction has a frame and a unit of its own; two of its pictures were left out."""
+    """Its reconstruction has a frame and a unit of its own; two of its images were left out."""
     old, reconstruction, hand_eye = calibrated
     frame = np.array([0, 1, 3, 4, 5, 7, 8])
     second = CellCamera(
@@ -260,7 +260,7 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
 def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera(
     calibrated, monkeypatch, tmp_path: Path
 ):
-    """One capture has both: of eight of its nine poses there is a picture of what the gripper carries."""
+    """One capture has both: of eight of its nine poses there is an image of what the gripper carries."""
     old, reconstruction, _ = calibrated
     frame = np.array([0, 1, 2, 3, 5, 6, 7, 8])
     front = CellCamera(
@@ -290,7 +290,7 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, turned: bool):
-    """Of a picture 40 points by SIFT are shared; a network finds 60 more, or the same board turned by half a turn."""
+    """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board turned by 180°."""
     rng = np.random.default_rng(3)
     lens = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
     ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))
@@ -323,7 +323,7 @@ def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, tur
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Pictures of two sizes, all different."""
+    """Images of two sizes, all different."""
     for k in range(8):
         picture = np.full((48, 64, 3) if k < 7 else (24, 32, 3), 20 * k, np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
@@ -378,7 +378,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     [
         ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
         ({"mount": "base", "images": []}, "no images"),
-        ({"mount": "base", "images": ["3.png", "7.png"]}, "all pictures of a camera must have one size"),
+        ({"mount": "base", "images": ["3.png", "7.png"]}, "all images of a camera must have one size"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
         ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
         ({"mount": "base", "images": ["7.png"], "intrinsics": LENS}, "another resolution"),

@@ -212,7 +212,7 @@ def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: 
     content = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert content["converged"] is False and content["gripper_from_camera"] is None
     report = (tmp_path / "out" / "report.html").read_text()
-    assert "No calibration" in report and "the pictures show one colour and no edges" in report
+    assert "No calibration" in report and "the images show one colour and no edges" in report
     assert all(html.escape(attempt["why_not"]) in report for attempt in content["attempts"])
 
 

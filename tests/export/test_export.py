@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from jcr.export.views import PosedImages
     from jcr.represent.scene import SceneMap
 
-DOUBT = "scale: every view turns about <one> point -- vary the distance"
+DOUBT = "scale: every view rotates about <one> point -- vary the distance"
 """With what ends an XML comment in it."""
 PARENT_FROM_CHILD = transform(rotation_exp(np.array([0.4, -2.1, 1.3])), np.array([-0.0524, 0.0407, 1 / 3]))
 
@@ -145,7 +145,7 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     np.testing.assert_allclose(read(path), PARENT_FROM_CHILD, atol=1e-9)
     first = path.read_text()[:300]
     assert "optical in tool0" in first and "metres, radians" in first
-    assert ("NOT TO BE TRUSTED: scale: every view" in first) == (doubt is not None)
+    assert ("REJECTED: scale: every view" in first) == (doubt is not None)
 
 
 def test_static_transform_publisher_line_holds_the_transform():
@@ -229,7 +229,7 @@ LENS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3, -2e-3
 
 @pytest.fixture
 def views(tmp_path: Path) -> "PosedImages":
-    """Three noisy pictures through a lens with all five coefficients, and the exact pixels of 60 points."""
+    """Three noisy images through a intrinsics with all five coefficients, and the exact pixels of 60 points."""
     from jcr.export.views import PosedImages
 
     rng = np.random.default_rng(5)
@@ -286,7 +286,7 @@ def test_colmap_model_reprojects_its_points_exactly(
     camera = next(iter(model.cameras.values()))
     assert camera.model_name == ("PINHOLE" if undistorted else "FULL_OPENCV")
     about = (out / "README.txt").read_text()
-    assert "frame: base_link\nunit: m\n" in about and "NOT TO BE TRUSTED" in about
+    assert "frame: base_link\nunit: m\n" in about and "REJECTED" in about
 
 
 @pytest.mark.parametrize("undistorted", [False, True])
@@ -332,7 +332,7 @@ def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
 
 @pytest.fixture
 def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
-    """A fixed camera of two pictures, and a second one on the gripper at the first and the last image."""
+    """A fixed camera of two images, and a second one on the gripper at the first and the last image."""
     from jcr.export.views import PosedImages
 
     second = transform(rotation_exp(np.array([0.05, 0.1, -0.2])), np.array([0.06, 0.01, 0.0]))
@@ -571,7 +571,7 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
             continue  # needs an extra; tested where it is
         assert dispatch(["export", str(run), row.name]) == 3
         complaint = capsys.readouterr().err
-        assert DOUBT in complaint and "not to be trusted" in complaint
+        assert DOUBT in complaint and "rejected" in complaint
         path = run / "export" / row.file
         files = (
             [path] if path.is_file() else [path / "README.txt", path / "transforms.json", path / "points.ply"]
@@ -584,7 +584,7 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
                     text = str(arrays["warning"]).encode()
             else:
                 text = file.read_bytes()
-            assert b"NOT TO BE TRUSTED: scale: every view turns" in text, row.name
+            assert b"REJECTED: scale: every view rotates" in text, row.name
     assert not [path for path in run.rglob("*") if ".part" in path.name]
 
 

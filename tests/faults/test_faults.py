@@ -1,6 +1,6 @@
 """The catalogue of faults: what is fed to the command line, with which status it ends, and what it says.
 
-After each the message is one line with a cure, no traceback, nothing is half-written, and the results that were
+After each the message is one line with a remedy, no traceback, nothing is half-written, and the results that were
 there are what they were.
 """
 
@@ -74,7 +74,7 @@ class Case:
 
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small capture with nothing wrong but its pictures, which are noise."""
+    """A small capture with nothing wrong but its images, which are noise."""
     folder = tmp_path_factory.mktemp("sound")
     (folder / "images").mkdir()
     draw = np.random.default_rng(0)
@@ -100,7 +100,7 @@ Plant = Callable[[Case], list[str]]
 
 
 def picture(change: Callable[[Path], Any]) -> Plant:
-    """A fault of the first picture."""
+    """A fault of the first image."""
 
     def plant(case: Case) -> list[str]:
         change(case.first)
@@ -124,7 +124,7 @@ def posed(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -
 
 
 def by_colmap(plant: Plant) -> Plant:
-    """One back end tries, and not each in turn: they read the same pictures."""
+    """One back end tries, and not each in turn: they read the same images."""
     return lambda case: [*plant(case), "--backend", "colmap"]
 
 
@@ -274,61 +274,61 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     "empty folder": (written(lambda c: (shutil.rmtree(c.capture), c.capture.mkdir())), 2, "no capture.json"),
     "no such folder": (written(lambda c: shutil.rmtree(c.capture)), 2, "no such"),
     # The pictures.
-    "zero-byte picture": (picture(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
-    "truncated picture": (picture(cut), 2, "not a readable image"),
+    "zero-byte image": (picture(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
+    "truncated image": (picture(cut), 2, "not a readable image"),
     "text file named .png": (picture(lambda p: p.write_text("hello")), 2, "not a readable image"),
-    "16-bit picture": (
+    "16-bit image": (
         picture(lambda p: Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96)).save(p)),
         3,
         "registered 0 of 6",  # read as it should be: the other pictures are noise
     ),
-    "CMYK picture": (
+    "CMYK image": (
         by_colmap(picture(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),
         3,
         "registered 0 of 6",
     ),
-    "animated picture": (picture(animated), 2, "holds 2 pictures"),
-    "100-megapixel picture": (
+    "animated image": (picture(animated), 2, "holds 2 images"),
+    "100-megapixel image": (
         picture(lambda p: Image.new("1", (10_000, 10_000)).save(p)),
         2,
         "million pixels",
     ),
-    "picture of fractions": (
+    "image of fractions": (
         picture(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")),
         2,
         "fractions",
     ),
-    "32-bit picture": (
+    "32-bit image": (
         picture(lambda p: Image.new("I", SIZE, 1 << 20).save(p, format="TIFF")),
         2,
         "more than 16 bits",
     ),
     "decompression bomb": (picture(bomb), 2, "million pixels"),
-    "one picture under two names": (
+    "one image under two names": (
         written(lambda c: shutil.copy(c.first, c.first.with_name("1.png"))),
         2,
-        "same picture",
+        "same image",
     ),
-    "all pictures equal": (
+    "all images equal": (
         written(lambda c: [shutil.copy(c.first, c.first.with_name(f"{k}.png")) for k in range(1, COUNT)]),
         2,
-        "same picture",
+        "same image",
     ),
-    "one black picture": (
+    "one black image": (
         by_colmap(picture(lambda p: Image.new("RGB", SIZE).save(p))),
         3,
         "registered 0 of 6",
     ),
-    "one picture of another size": (
+    "one image of another size": (
         picture(lambda p: Image.new("RGB", (48, 36)).save(p)),
         2,
         "96x72|48x36",
     ),
-    "missing picture": (picture(Path.unlink), 2, "no such image"),
-    "picture that is a folder": (picture(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
-    "picture that is a pipe": (picture(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
-    "picture that is a link to itself": (picture(linked_to_itself), 2, "leads back to itself"),
-    "folder of pictures that is a link to itself": (
+    "missing image": (picture(Path.unlink), 2, "no such image"),
+    "image that is a folder": (picture(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
+    "image that is a pipe": (picture(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
+    "image that is a link to itself": (picture(linked_to_itself), 2, "leads back to itself"),
+    "folder of images that is a link to itself": (
         picture(lambda p: (shutil.rmtree(p.parent), linked_to_itself(p.parent))),
         2,
         "leads back to itself",

@@ -48,7 +48,7 @@ class Run:
             time.sleep(0.01)
 
     def kill_after(self, seconds: float) -> bool:
-        """Kill it after so many seconds of work; False where it was done before."""
+        """Kill it after this many seconds of work; False where it was done before."""
         self.wait_for_lock()
         self.process.join(seconds)
         return self._kill()

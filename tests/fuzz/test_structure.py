@@ -76,7 +76,7 @@ def link(folder: Path) -> None:
 FRAME = {"image": "0.png", "base_from_gripper": np.eye(4).tolist()}
 MANY = {
     "the same image": ("capture.json", {"frames": [FRAME] * 30_000}, "0.png more than once"),
-    "so many images": (
+    "this many images": (
         "capture.json",
         {"frames": [FRAME | {"image": f"l{k}.png"} for k in range(1001)]},
         "1001 frames; choose 1000 at most",

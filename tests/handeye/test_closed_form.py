@@ -16,14 +16,14 @@ angles = st.sampled_from([0.0, 1e-9, 0.7, np.pi - 1e-9, np.pi]) | st.floats(0, n
 
 
 def noisy(seed: int, count: int):
-    """Gripper and camera poses that belong together up to the robot's noise, and the generator for what follows."""
+    """Gripper and camera poses that belong together up to the robot pose noise, and the generator for what follows."""
     rng = np.random.default_rng(seed)
     problem = hand_eye_problem(rng, count, robot_noise=(1e-4, 2e-4))
     return problem.base_from_gripper, problem.recon_from_camera, rng
 
 
 def any_rigid(rng: np.random.Generator, angle: float):
-    """A transform that turns by `angle` about some axis."""
+    """A transform that rotates by `angle` about some axis."""
     axis = rng.normal(size=3)
     return transform(rotation_exp(angle * axis / np.linalg.norm(axis)), rng.normal(size=3))
 
@@ -103,7 +103,7 @@ def test_half_turns_between_images_are_like_any_other_motion(seed, count, short_
 @repeatable
 @given(seeds)
 def test_half_turns_alone_are_solved(seed):
-    """About axes at right angles, which makes all motions half turns: the sines of all vanish together."""
+    """About axes at right angles, which makes all motions rotations by 180°: the sines of all vanish together."""
     turns = np.pi * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     rng = np.random.default_rng(seed)
     gripper = any_rigid(rng, 1.0) @ transform(rotation_exp(turns), rng.normal(size=(3, 3)))

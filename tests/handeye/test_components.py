@@ -161,7 +161,7 @@ def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
 @pytest.mark.parametrize(
     ("joints", "robot", "words"),
     [
-        (np.zeros((8, 6)), None, "of which robot"),
+        (np.zeros((8, 6)), None, "which robot"),
         (None, "ur99", "not known; choose one of"),
         (np.zeros((8, 7)), "ur5e", r"8 poses of a ur5e need \(8, 6\)"),
         (np.full((8, 6), np.nan), "ur5e", "NaN"),

@@ -259,7 +259,7 @@ UNSEEN = {
     "planar": "planar or SCARA",
     "orbit": "look-at orbit",
     # A tool point that happens to lie on the optical axis makes an orbit of the pivot.
-    "pivot": "all views turn about one",
+    "pivot": "all views rotate about one",
     "camera-centre": "its own centre",
 }
 

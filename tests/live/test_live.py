@@ -103,7 +103,7 @@ def test_each_pose_gets_the_picture_that_was_still_there_and_a_stopped_capture_g
         assert np.allclose(capture.base_from_gripper[k], pose[k])
         assert (capture.folder / LiveFolder.thumbnail(name)).is_file()
     page = (tmp_path / "c" / "live.html").read_text()
-    assert "5 pictures of 5" in page and page.count('<img src="thumbnails/') == 5 and "Next pose" in page
+    assert "5 images of 5" in page and page.count('<img src="thumbnails/') == 5 and "Next pose" in page
     assert (tmp_path / "c" / "live" / "now.jpg").is_file()
 
 

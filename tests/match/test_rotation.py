@@ -29,7 +29,7 @@ def test_exact_pairs_give_the_exact_rotation():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_are_found_out(seed: int):
-    """Half of the pairs turned by the angle of the gripper about an axis of chance, which the angle does not show."""
+    """Half of the pairs rotated by the angle of the gripper about an axis of chance, which the angle does not show."""
     rng = np.random.default_rng(seed)
     gripper, camera, x = pairs(seed)
     camera = rotation_exp(rng.normal(scale=2e-3, size=(len(camera), 3))) @ camera

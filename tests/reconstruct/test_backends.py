@@ -15,6 +15,7 @@ from jcr import run_folder
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import call, dispatch, models, run
 from jcr.errors import InputError
+from jcr.pages import page
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import (
     BACKENDS,
@@ -25,7 +26,6 @@ from jcr.reconstruct.backends import (
     with_cameras_of,
 )
 from jcr.records import Capture
-from places import ROOT
 
 MINE = """
         Backend(
@@ -234,10 +234,10 @@ def test_the_page_of_back_ends_is_the_table_and_its_numbers_are_measured(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert dispatch(["models", "--markdown"]) == 0
-    assert capsys.readouterr().out in (ROOT / "docs" / "backends.md").read_text()
+    assert capsys.readouterr().out in page("backends")
     for row in BACKENDS.values():
         if row.accuracy:
-            numbers, page = re.fullmatch(r"(.*) \((docs/.*\.md)\)", row.accuracy).groups()
-            text = (ROOT / page).read_text()
+            numbers, where = re.fullmatch(r"(.*) \(jcr docs (.*)\)", row.accuracy).groups()
+            text = page(where)
             for number in re.findall(r"\d+\.\d+(?= mm|°)", numbers):
                 assert number in text, (row.name, number)

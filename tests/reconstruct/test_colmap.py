@@ -1,4 +1,4 @@
-"""The COLMAP back end on the bundled capture, against its truth, and on captures it must refuse or mend."""
+"""The COLMAP back end on the bundled capture, against its truth, and on captures it must refuse or fix."""
 
 import json
 import shutil

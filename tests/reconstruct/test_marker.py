@@ -1,4 +1,4 @@
-"""The marker back end on pictures of boards drawn where the truth is known."""
+"""The marker back end on images of boards drawn where the truth is known."""
 
 import json
 from functools import cache
@@ -159,7 +159,7 @@ def test_a_board_told_in_the_wrong_size_is_not_trusted(tmp_path, capsys):
         "chessboard:8x5:0.028",
     ]
     assert dispatch(command) == 3
-    assert "smaller than told; measure its squares" in capsys.readouterr().err
+    assert "smaller than given; measure its squares" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert not found["converged"] and found["backend"] == "marker"
 
@@ -198,7 +198,7 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
     ("spec", "says"),
     [
         ("chessboard:8x5:25", "30 mm is 0.030"),
-        ("chessboard:8x6:0.025", "half a turn"),
+        ("chessboard:8x6:0.025", "a rotation by 180°"),
         ("chessboard:8by5:0.025", "no size such as 7x5"),
         ("charuco:7x6:0.030:0.032:DICT_4X4_50", "does not fit"),
         ("charuco:7x6:0.030:0.022:DICT_9X9", "DICT_4X4_50"),

@@ -52,7 +52,7 @@ def truth() -> dict[str, Any]:
 
 @pytest.fixture
 def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
-    """Pictures five times the size of the grid, with a lens, taken by a camera on a gripper."""
+    """Images five times the size of the grid, with a intrinsics, taken by a camera on a gripper."""
     names = tuple(f"{k}.png" for k in range(COUNT))
     for k, name in enumerate(names):
         Image.new("RGB", (5 * WIDTH, 5 * HEIGHT), (40 * k, 0, 0)).save(tmp_path / name)

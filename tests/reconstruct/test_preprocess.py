@@ -1,4 +1,4 @@
-"""Preprocessing against the published one, and the path of a pixel through resize, crop and lens."""
+"""Preprocessing against the published one, and the path of a pixel through resize, crop and intrinsics."""
 
 from pathlib import Path
 

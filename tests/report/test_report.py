@@ -264,7 +264,7 @@ def test_page_is_one_small_file(page: str):
 
 
 def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
-    """A fixed one, one on the gripper of whose pictures two were used, one on another arm; each where it was."""
+    """A fixed one, one on the gripper of whose images two were used, one on another arm; each where it was."""
     size, poses = run.capture.image_size, run.capture.base_from_gripper
     mount, base = transform(np.eye(3), np.array([0.0, 0.1, 0.0])), transform(np.eye(3), np.array([1.0, 0, 0]))
     others = (

@@ -112,7 +112,7 @@ def known_reconstruction(
 
 
 def beside(truth: Truth, row: int, count: int) -> np.ndarray:
-    """Camera places 7 cm apart, the first that of an image: near enough for their pictures to be compared."""
+    """Camera places 7 cm apart, the first that of an image: near enough for their images to be compared."""
     aside = transform(np.eye(3), np.array([[0.07, 0, 0]]) * np.arange(count)[:, None])
     return truth.base_from_camera[row] @ aside
 
@@ -120,7 +120,7 @@ def beside(truth: Truth, row: int, count: int) -> np.ndarray:
 def added_views(
     folder: Path, truth: Truth, capture: Capture, scene: Scene, base_from_camera: np.ndarray
 ) -> Capture:
-    """Pictures of a scene from new places, added to a run in `folder`."""
+    """Images of a scene from new places, added to a run in `folder`."""
     pairs = []
     for k, view in enumerate(render(scene, truth.intrinsics, base_from_camera, with_truth=False)):
         image, pose = folder / f"new{k}.png", folder / f"new{k}.json"

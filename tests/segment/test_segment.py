@@ -210,7 +210,7 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
 
 @pytest.mark.slow
 def test_the_stated_sigma_of_a_height_covers_its_error(rng: np.random.Generator):
-    """Depth errs together within an image: plane and top are off by 2 mm each, anew in every image."""
+    """Depth errs together within an image: plane and top are off by 2 mm each, again in every image."""
     misses, stated = [], []
     for _ in range(25):
         cloud = cloud_of(rng, table(rng, 0.1, 0.1), box(rng, (0.05, 0.05, 0.06)), noise=3e-4)

@@ -1,4 +1,4 @@
-"""Simulated captures: the truth agrees with the geometry, pictures with the truth, files with both."""
+"""Simulated captures: the truth agrees with the geometry, images with the truth, files with both."""
 
 import json
 import os

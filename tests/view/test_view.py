@@ -36,7 +36,7 @@ def truth(tabletop: Path) -> Truth:
 
 @pytest.fixture(scope="module")
 def gantry(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A URDF that slides along x, y, z and then turns about z, y, x: it can bring its tool anywhere."""
+    """A URDF that slides along x, y, z and then rotates about z, y, x: it can bring its tool anywhere."""
     parts, parent = ['<robot name="gantry"><link name="floor"/>'], "floor"
     for kind, axes, reach in (("prismatic", "xyz", 2.0), ("revolute", "zyx", 3.1)):
         for axis in axes:
@@ -339,7 +339,7 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
         viewer.move_sphere()
         before = red(picture)
         while red(chromium.picture("canvas")) < before + 500:
-            assert time.monotonic() < deadline, "the sphere does not turn red"
+            assert time.monotonic() < deadline, "the sphere does not rotate red"
             time.sleep(1)
         bad = [
             event["params"]

@@ -111,7 +111,7 @@ class Session:
         self.frames.push(Frame(np.asarray(pixels, np.uint8), time_s, depth_mm))
 
     def camera_info(self, message: Any) -> None:
-        """A sensor_msgs/CameraInfo; refused in words where jcr does not know its lens."""
+        """A sensor_msgs/CameraInfo; refused in words where jcr does not know its intrinsics."""
         size = (message.width, message.height)
         lens = lens_of_ros(
             list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"

@@ -49,7 +49,7 @@ class Bundle:
 
     gripper_from_camera: Float[ndarray, "4 4"]
     base_from_gripper: Float[ndarray, "m 4 4"]
-    """Where the images say the gripper was, against the robot's word."""
+    """Where the images say the gripper was, against the reported pose."""
     points_in_base: Float[ndarray, "p 3"]
     camera: Intrinsics
 
@@ -83,7 +83,7 @@ class Adjusted:
     systematic_left: tuple[float, float]
     """m, rad per axis: what of these is left in the poses."""
     given_noise: tuple[float, float] | None
-    """As `adjust` was told it."""
+    """As `adjust` was given it."""
     intrinsics_covariance: Float[ndarray, "q q"]
     """In the order of camera.parameters."""
     pixels: PixelErrors
@@ -99,7 +99,7 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What stays fixed: measurements sorted by point, priors, and how the lens may move."""
+    """What stays fixed: measurements sorted by point, priors, and how the intrinsics may move."""
 
     reported: Float[ndarray, "m 4 4"]
     image: Int[ndarray, " k"]
@@ -151,7 +151,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Normal:
-    """The normal equations after the points are eliminated; cameras are X (6), lens (c), grippers (6m)."""
+    """The normal equations after the points are eliminated; cameras are X (6), intrinsics (c), grippers (6m)."""
 
     schur: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
@@ -358,7 +358,7 @@ def _cost(
 
 
 def _lens_step(bundle: Bundle, problem: _Problem) -> Float[ndarray, " c"]:
-    """How far the free lens parameters have moved from where they began."""
+    """How far the free intrinsics parameters have moved from where they began."""
     return np.linalg.pinv(problem.free.directions) @ (
         parameters(bundle.camera) - parameters(problem.intrinsics)
     )
@@ -538,7 +538,7 @@ def freed_intrinsics(
 def median_reprojection(
     adjusted: Adjusted, base_from_gripper: Float[ndarray, "m 4 4"] | None = None
 ) -> Float[ndarray, " m"]:
-    """Median reprojection error (px) of every image, with the gripper where adjusted or where told."""
+    """Median reprojection error (px) of every image, with the gripper where adjusted or as reported."""
     bundle = adjusted.bundle
     if base_from_gripper is not None:
         bundle = replace(bundle, base_from_gripper=base_from_gripper)

@@ -103,7 +103,7 @@ class Uncertainty(_Part):
     covariance: Covariance
     order: Annotated[list[str], AfterValidator(_order)]
     worst: str
-    """The least certain direction of the offset in words, and its size."""
+    """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
 
 
@@ -173,7 +173,8 @@ class Lens(IntrinsicsJson):
     def _one_of_each(self) -> "Lens":
         if self.std is not None and len(self.std) != 4 + len(self.distortion):
             raise ValueError(
-                f"{len(self.std)} standard deviations, but a {self.model} lens has {4 + len(self.distortion)} parameters"
+                f"{len(self.std)} standard deviations, but a {self.model} model has "
+                f"{4 + len(self.distortion)} parameters"
             )
         return self
 
@@ -211,7 +212,7 @@ class CalibrationFile(_Part):
     robot_noise: Noise | None
     intrinsics: Lens | None
     warnings: list[str]
-    """What speaks against it first, where it is not to be trusted; then what the user must act on."""
+    """What speaks against it first, where it is rejected; then what the user must act on."""
     timings_s: dict[str, float]
     version: str
     next_poses: list[Proposal] = []
@@ -257,7 +258,7 @@ class CalibrationFile(_Part):
 
     @property
     def doubt(self) -> str | None:
-        """Why the calibration is not to be trusted; None when it is."""
+        """Why the calibration is rejected; None when it is."""
         return None if self.converged else self.warnings[0]
 
     @property
@@ -445,7 +446,7 @@ def _share(covariance: Float[ndarray, "7 7"]) -> Share:
 
 
 def worst_direction(hand_eye: HandEye) -> str:
-    """The least certain direction of the offset in words, e.g. "along the optical axis: ±4.0 mm"."""
+    """The least certain direction of the translation in words, e.g. "along the optical axis: ±4.0 mm"."""
     variance, vectors = np.linalg.eigh(hand_eye.covariance[:3, :3])
     direction = vectors[:, 2]
     std_mm = 1e3 * float(np.sqrt(variance[2]))

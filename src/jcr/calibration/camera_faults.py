@@ -29,9 +29,9 @@ AT_ONCE = 2
 CAMERA_FAULT = "p = "
 """In the words of every fault, and of no other warning."""
 MOST_POINTS, WELL_SEEN = 800, 3
-"""Points that take part, first those in so many images: more tell a fault no better, and take time."""
+"""Points that take part, first those in this many images: more tell a fault no better, and take time."""
 LEAST_SHEAR_PX = 3.0
-"""From top to bottom; less of it than this is what a lens model leaves over."""
+"""From top to bottom; less of it than this is what a distortion model leaves over."""
 MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
@@ -45,7 +45,7 @@ NEARLY_ALL = 0.9
 """Of the squares of what the focal length differs by."""
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 SURE = 4.0
-"""Standard deviations from which a parameter of the lens is named by itself."""
+"""Standard deviations from which a parameter of the intrinsics is named by itself."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,8 @@ def _settled(
 ) -> tuple[Adjusted, Nuisance, Float[ndarray, " e"]]:
     """The adjustment with what was found corrected in its observations and intrinsics, until it moves no more.
 
-    Not in one step: the robot's noise was estimated with the fault in it, and the cameras are far from where they were.
+    Not in one step: the robot pose noise was estimated with the fault in it, and the cameras are far from where
+    they were.
     """
     free, lens = _all(found, equations), any(one.of_lens for one in found)
     intrinsics = adjusted.problem.intrinsics
@@ -343,7 +344,7 @@ def _in_words(
 
 
 def _freed(kind: str, equations: Nuisance) -> tuple[str, ...]:
-    """Parameters of the lens that a hypothesis frees, of those that the model has."""
+    """Parameters of the intrinsics that a hypothesis frees, of those that the model has."""
     return tuple(name for name in (LENS if kind == "lens" else ASPECT) if name in equations.names)
 
 
@@ -372,7 +373,7 @@ def _lens_in_words(error: dict[str, float], given: Intrinsics, now: Intrinsics, 
             said.append(f"{what} ({found}) ± {most}{px} where ({was}) is given")
     said = said or ["other intrinsics than those used, no one of them surely by itself"]
     return (
-        f"the pictures show {' and '.join(said)} ({p}); calibrate the lens again at this resolution, or give no "
+        f"the images show {' and '.join(said)} ({p}); calibrate the intrinsics again at this resolution, or give no "
         "intrinsics (null) to have them estimated"
     )
 

@@ -18,7 +18,7 @@ from jcr.handeye.fit import Cues, fit_poses
 from jcr.records import HandEye, Intrinsics, Tracks
 
 FEWEST = 6
-"""Observations of an image whose camera's motion with the intrinsics can be told."""
+"""Observations of an image whose camera's motion with the intrinsics can be found."""
 
 
 def with_intrinsics_considered(

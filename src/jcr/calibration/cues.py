@@ -13,7 +13,7 @@ from jcr.records import Capture, HandEye, Reconstruction
 LENGTH_STD = 0.01
 """Relative: a pixel's breadth at either end of a length of a hundred pixels."""
 HEIGHT_STD = 1e-3
-"""m, of a ruler held to a lens."""
+"""m, of a ruler held to a camera."""
 CONTRADICTED = (4.0, 0.02)
 """Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
 ONE_AXIS = np.radians(6)
@@ -32,7 +32,7 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
     turn = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
     if np.sqrt((wander**2).mean()) > ONE_AXIS or turn.max() < ONE_AXIS:
         raise InputError(
-            "--known-height: the gripper does not turn about one common axis, along which a height could be "
+            "--known-height: the gripper does not rotate about one common axis, along which a height could be "
             "known; leave the option out"
         )
     return axis_in_gripper, height, HEIGHT_STD
@@ -75,7 +75,7 @@ def surface_at(
 def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
     """What to tell the user where the robot's motion excludes that the reconstruction is in metres.
 
-    `free` is a calibration that was not told so; `metric_std` is how well the metre is known (relative one
+    `free` is a calibration that was not given it; `metric_std` is how well the metre is known (relative one
     sigma).
     """
     if not free.converged:
@@ -86,6 +86,6 @@ def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
         return None
     return (
         f"by the robot's motion the board is {100 * abs(np.expm1(off)):.1f} ± {100 * std:.1f} % "
-        f"{'larger' if off > 0 else 'smaller'} than told; measure its squares, and check that the gripper poses "
+        f"{'larger' if off > 0 else 'smaller'} than given; measure its squares, and check that the gripper poses "
         "are in metres"
     )

@@ -1,6 +1,6 @@
-"""Are the intrinsics that were given those of the pictures?
+"""Are the intrinsics that were given those of the images?
 
-Given intrinsics are held. The pictures and the robot's motion determine them all the same: freed in the bundle
+Given intrinsics are held. The images and the robot's motion determine them all the same: freed in the bundle
 adjustment, focal length, principal point and two radial coefficients have an estimate and a covariance, in which what
 few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
 """
@@ -21,9 +21,9 @@ from jcr.rounding import significant
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
-true lens, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
+true intrinsics, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
 OFF = 0.01
-"""Relative. Lenses stored with real captures are up to 1.2 % from those of a board (docs/results/real.md)."""
+"""Relative. Intrinsics stored with real captures are up to 1.2 % from those of a board (jcr docs results/real)."""
 OFF_CENTRE = ESTIMATED["cx"]
 """Share of the width: centres of cheap cameras scatter by so much, and an offset that was found with a wrong one is
 right where it is used with the same."""
@@ -32,7 +32,7 @@ CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 @dataclass(frozen=True)
 class LensDoubt:
-    """Why the given intrinsics cannot be those of the pictures, and what this does."""
+    """Why the given intrinsics cannot be those of the images, and what this does."""
 
     text: str
     shift: Float[ndarray, "7"]
@@ -49,10 +49,11 @@ def lens_doubt(
     systematic: Float[ndarray, "s s"],
     adjusted: Adjusted | None,
 ) -> LensDoubt | None:
-    """What the used images say against the lens that was held; None where they say nothing.
+    """What the used images say against the intrinsics that were held; None where they say nothing.
 
-    `adjusted` is the adjustment with that lens, where there is one: only when one Gauss-Newton step from it, the lens
-    freed, leaves some doubt is the lens adjusted until it settles.
+    `adjusted` is the adjustment with those intrinsics, where there is one: only when one Gauss-Newton step from
+    it, the intrinsics
+    freed, leaves some doubt are the intrinsics adjusted until they settle.
     """
     if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
         return None
@@ -73,7 +74,8 @@ def lens_doubt(
         key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
     )
     return LensDoubt(
-        f"the pictures show {' and '.join(found)}; calibrate the lens again at this resolution, or give no intrinsics "
+        f"the images show {' and '.join(found)}; calibrate the intrinsics again at this resolution, "
+        f"or give no intrinsics "
         "(null) to have them estimated",
         shift,
     )
@@ -87,7 +89,7 @@ def _shift(gripper_from_camera: Float[ndarray, "4 4"], scale: float, freed: Adju
 
 
 def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
-    """Each part of the lens that is off by `sure` standard deviations and by `share` of what matters, in words."""
+    """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters, in words."""
     camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED))
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))

@@ -21,7 +21,7 @@ MEASURED = {
 }
 """Standard deviations of intrinsics that were given without any: focal length and its aspect relative, principal point
 relative to the width, distortion absolute. Factory values and calibrations of another day are off by 0.3 to 0.9 % and a
-few pixels (docs/architecture.md)."""
+few pixels (jcr docs architecture)."""
 ESTIMATED = {
     "f": 0.5,
     "aspect": 3e-3,
@@ -44,7 +44,7 @@ FROM_FEATURES = {
     "p2": 5e-4,
 }
 """By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
-from other features of the same pictures differ by the square root of two times that (docs/architecture.md)."""
+from other features of the same images differ by the square root of two times that (jcr docs architecture)."""
 HELD: dict[str, float] = {}
 """Of intrinsics that are exact."""
 LEAST = 1e-12
@@ -65,7 +65,7 @@ def prior_of(
 ) -> IntrinsicsPrior:
     """The prior about `intrinsics`: relative sizes as in MEASURED, or a standard deviation for each of its `parameters`.
 
-    One that is not a number is that of MEASURED. Coefficients that a lens model does not have are left out.
+    One that is not a number is that of MEASURED. Coefficients that a distortion model does not have are left out.
     """
     if not isinstance(std, dict):
         usual = prior_of(intrinsics)

@@ -4,7 +4,7 @@ At the optimum of the adjustment its normal equations are written once more, wit
 parameter of the camera, a shear of the image, and a focal length and a shear for each image by itself. A hypothesis
 is a few combinations of these columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the
 dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the
-robot's noise was estimated from few residuals. The same step says how large they are and how far X would move.
+robot pose noise was estimated from few residuals. The same step says how large they are and how far X would move.
 """
 
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ tip of a finger of 100 mm by 2 mm."""
 PROPOSED = 2
 """Gripper poses proposed after a calibration, if that is enough."""
 MOST = 12
-"""Poses that are proposed to reach what is required; of more, nobody is told a number."""
+"""Poses that are proposed to reach what is required; of more, no number is given."""
 
 
 def advised(
@@ -88,8 +88,9 @@ def _worthwhile(
     """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
 
     What they leave is the reported covariance, less by the share by which their information shrinks that expected of
-    the poses alone: bundle adjustment, lens and correlated errors make the two differ. No views make up for a given
-    lens that is wrong, nor for systematic errors of the robot where they are most of it; a smaller part may be that
+    the poses alone: bundle adjustment, intrinsics and correlated errors make the two differ. No views make up for
+    given intrinsics that are
+    wrong, nor for systematic errors of the robot where they are most of it; a smaller part may be that
     their size is hardly known, and more views tell it.
     """
     x, noise = hand_eye.gripper_from_camera, (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)

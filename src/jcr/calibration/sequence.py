@@ -35,7 +35,7 @@ LEAST_PART = 3
 """Images on either side of a change."""
 MIN_IMAGES = 7
 MANY_PLACES = 60
-"""Of a longer capture changes are looked for at so many places."""
+"""Of a longer capture changes are looked for at this many places."""
 
 
 @dataclass(frozen=True)

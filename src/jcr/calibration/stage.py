@@ -1,4 +1,4 @@
-"""The calibration stage: poses first, robustly; then images, points, lens and robot adjusted together."""
+"""The calibration stage: poses first, robustly; then images, points, intrinsics and robot adjusted together."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -280,7 +280,7 @@ def _in_sequence(
 
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
-    """Whether images left out are missed by less; not, where too few images tell."""
+    """Whether the leave-one-out error is smaller; not, where there are too few images."""
     return other is not None and missed_m(one) < missed_m(other)
 
 
@@ -388,7 +388,7 @@ def _investigated(
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
-    """The observations of the used images, whose rows are counted anew."""
+    """The observations of the used images, whose rows are counted again."""
     kept = used[tracks.image]
     row = np.cumsum(used) - 1
     return replace(tracks, image=row[tracks.image[kept]], x_px=tracks.x_px[kept], point=tracks.point[kept])

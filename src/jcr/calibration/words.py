@@ -50,7 +50,7 @@ def summary(content: "CalibrationFile") -> str:
         required = content.requirement
         reach = required is not None and bool(required.more_images)
         lines.append(
-            f"{len(content.next_poses)} more views, like {near} but turned (next_poses in calibration.json), "
+            f"{len(content.next_poses)} more views, like {near} but rotated (next_poses in calibration.json), "
             f"would give ± {then} mm{', within what is needed' if reach else ''}"
         )
     return "\n".join(lines) + "\n"
@@ -75,7 +75,7 @@ def found(content: "CalibrationFile") -> list[str]:
     ]
     if uncertainty.budget is not None:
         parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
-        lines.insert(-1, f"  of which: {parts}")
+        lines.insert(-1, f"  from: {parts}")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
     if content.depth_check is not None:
@@ -126,7 +126,8 @@ def angles_in_words(ratio: float, std: float) -> list[str]:
         return []
     more = "more" if ratio > 1 else "less"
     return [
-        f"the camera turns {100 * abs(ratio - 1):.2f} ± {100 * std:.2f} % {more} than the gripper: the focal length or "
+        f"the camera rotates {100 * abs(ratio - 1):.2f} ± {100 * std:.2f} % {more} than the "
+        f"gripper: the focal length or "
         "the robot's joints are off"
     ]
 
@@ -164,7 +165,7 @@ def _joined(words: list[str]) -> str:
 
 
 def more_images_help(budget: "UncertaintyBudget") -> bool:
-    """Whether more images of the same region shrink the uncertainty, most of which is then not systematic."""
+    """Whether more images of the same region shrink the uncertainty, which is then mostly not systematic."""
     others = [budget.robot_random, budget.intrinsics, budget.images]
     return budget.robot_systematic.translation_mm**2 < sum(share.translation_mm**2 for share in others)
 
@@ -208,7 +209,7 @@ def log(content: "CalibrationFile") -> str:
 
 
 def attempt_in_words(attempt: Attempt, images: int) -> str:
-    """The back end, what it registered of so many images, whether it was kept, and how long it took."""
+    """The back end, what it registered of this many images, whether it was kept, and how long it took."""
     registered = (
         "nothing" if attempt.images_registered is None else f"{attempt.images_registered} of {images} images"
     )
@@ -224,7 +225,7 @@ def missed(held_out: "HeldOut | HeldOutError") -> str:
 
 
 def pixels(held_out: "HeldOut | HeldOutError") -> str:
-    """The same in their pictures, to follow it; empty where no picture tells."""
+    """The same in their images, to follow it; empty where no image tells."""
     return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
 
 

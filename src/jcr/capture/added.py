@@ -68,7 +68,7 @@ def with_images(added: Capture, images_and_poses: Sequence[tuple[Path, Path]]) -
             )
         content = image.read_bytes()
         if content in known:
-            raise InputError(f"{image}: this picture was added before; take a new one")
+            raise InputError(f"{image}: this image was added before; take a new one")
         known.add(content)
         base_from_gripper = read_pose(pose)
         names.append(f"{len(names):03d}{image.suffix.lower()}")

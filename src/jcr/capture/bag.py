@@ -33,7 +33,7 @@ ALIGNED = "aligned_depth"
 SAME_MOMENT_NS = 20_000_000
 """Colour and depth of one exposure have stamps nearer than this."""
 SAME_POSE = 1e-3
-"""m, turning counted at ARM: by which the arm may move between the exposures of two cameras on it."""
+"""m, rotation counted at ARM: by which the arm may move between the exposures of two cameras on it."""
 LOOKED_AT = 50
 """Images of a topic at whose stamps tf is asked what carries their camera."""
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

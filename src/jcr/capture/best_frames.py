@@ -13,11 +13,11 @@ from jcr.geometry import inverse, motion_length
 from jcr.handeye.equation import ASSUMED_NOISE, most_informative, pose_information
 
 STILL = 0.005
-"""m/s, turning counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""
+"""m/s, rotation counted at ARM: a tenth of a pixel in an exposure of 20 ms, half a metre away."""
 LOOKS = 5
 """Frames of one moment that are compared for sharpness."""
 SAME_VIEW = 0.005
-"""m, turning counted at ARM: of frames nearer to each other the sharpest is kept."""
+"""m, rotation counted at ARM: of frames nearer to each other the sharpest is kept."""
 
 Rows = Int[ndarray, " _"]
 Poses = Float[ndarray, "n 4 4"]
@@ -32,7 +32,7 @@ def best_frames(
 ) -> tuple[Rows, tuple[str, ...]]:
     """Rows of the best `count` frames in order of time, and remarks on the choice.
 
-    `speed` is m/s with turning counted at ARM. `sharpness_of` is asked once, about ascending rows. A moment of
+    `speed` is m/s with rotation counted at ARM. `sharpness_of` is asked once, about ascending rows. A moment of
     standing still gives one frame at most; where there are too few, the slowest frames in between fill up. Raises
     InputError when fewer than three frames are left.
     """

@@ -22,7 +22,7 @@ from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
 MOST_TURNS = 6 * np.pi + 0.01
-"""rad: no joint turns farther to either side."""
+"""rad: no joint rotates farther to either side."""
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Capture:

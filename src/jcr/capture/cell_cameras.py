@@ -1,7 +1,7 @@
 """Further cameras of a capture: "cameras" of a capture.json, by name.
 
-A camera bolted to the gripper or watching it has one picture for each frame, or null; a fixed one that sees the scene
-has any number; one on another arm has frames of its own. The entry without pictures names the camera of the capture's
+A camera bolted to the gripper or watching it has one image for each frame, or null; a fixed one that sees the scene
+has any number; one on another arm has frames of its own. The entry without images names the camera of the capture's
 own frames and says what it is bolted to.
 """
 
@@ -48,8 +48,8 @@ def with_cameras(capture: Capture, cameras: Any, file: Path) -> Capture:
             watches = camera.get("watches", "gripper" if camera["mount"] == "base" else "scene")
             if (camera["mount"] == "base") is not (watches == "gripper"):
                 raise InputError(
-                    f"{where}: the frames have gripper poses, so a fixed camera's pictures in them must show what the "
-                    "gripper carries; list pictures of the scene as its images"
+                    f"{where}: the frames have gripper poses, so a fixed camera's images in them must show what the "
+                    "gripper carries; list images of the scene as its images"
                 )
             capture = replace(capture, camera_name=name, mount=camera["mount"])
         else:
@@ -107,7 +107,7 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
         k = next(k for k, size in enumerate(sizes) if size != sizes[0])
         raise InputError(
             f"{where}: {images[k]} has {sizes[k][0]}x{sizes[k][1]} pixels, {images[0]} {sizes[0][0]}x{sizes[0][1]}; "
-            "all pictures of a camera must have one size"
+            "all images of a camera must have one size"
         )
     lens = read_lens_of_these(camera.get("intrinsics"), sizes[0], where)
     std = read_std(camera.get("intrinsics_std"), lens, where)

@@ -95,7 +95,7 @@ def checked_lens(
         ) from None
     if len(coefficients) != len(names):
         raise InputError(
-            f"{where}: distortion has {len(coefficients)} numbers, not the {len(names)} of a {model} lens, "
+            f"{where}: distortion has {len(coefficients)} numbers, not the {len(names)} of a {model} intrinsics, "
             f'{",".join(names)}; "model" may be {", ".join(COEFFICIENTS)}'
         )
     if not np.isfinite([fx, fy, cx, cy, *coefficients]).all() or fx <= 0 or fy <= 0:
@@ -141,7 +141,7 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
         same = digests.setdefault(hashlib.sha256(pixels.tobytes()).digest(), name)
         if same != name:
             raise InputError(
-                f"{folder / name}: the same picture as {same}; drop one of the frames or take it again"
+                f"{folder / name}: the same image as {same}; drop one of the frames or take it again"
             )
     first = sizes[images[0]]
     for name, size in sizes.items():
@@ -154,7 +154,7 @@ def _common_size(folder: Path, images: Sequence[str]) -> tuple[int, int]:
 
 
 def image_sizes(folder: Path, images: Sequence[str]) -> list[tuple[int, int]]:
-    """Width and height of every image, each decoded once; InputError where one is no picture."""
+    """Width and height of every image, each decoded once; InputError where one is no image."""
     return [read_image(folder / name).shape[1::-1] for name in images]
 
 
@@ -164,7 +164,7 @@ def _common_orientation(folder: Path, images: Sequence[str]) -> int:
     for name in images[1:]:
         if (other := how_stored(folder / name).orientation) != first:
             raise InputError(
-                f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: turned to be shown, their "
+                f"{folder / name}: EXIF orientation {other}, but {images[0]} has {first}: rotated to be shown, their "
                 "cameras' axes differ; remove the tag from all images (exiftool -Orientation= FILES)"
             )
     if first in MIRRORED:
@@ -176,7 +176,7 @@ def _common_orientation(folder: Path, images: Sequence[str]) -> int:
 
 
 def how_turned(capture: Capture) -> str | None:
-    """What a user must know of a capture whose images are turned to be shown."""
+    """What a user must know of a capture whose images are rotated to be shown."""
     if capture.orientation == 1:
         return None
     return (
@@ -191,4 +191,4 @@ def how_scaled(capture: Capture) -> str | None:
     bits = {how_stored(capture.folder / name).bits for name in capture.images}
     if max(bits) == 8:
         return None
-    return f"images of 16 bits of which {' or '.join(map(str, sorted(bits)))} are used: read by the upper eight of those"
+    return f"images of 16 bits, {' or '.join(map(str, sorted(bits)))} of them used: read by the upper eight of those"

@@ -162,7 +162,8 @@ def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], F
 
 
 def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
-    """The one lens of all images, of the given size; InputError when there are several, or a strange one."""
+    """The one set of intrinsics of all images, of the given size; InputError when there are several, or a strange
+    one."""
     found = read_model(folder)
     cameras = [found.camera(found.image(k).camera_id) for k in found.reg_image_ids()]
     kinds = {

@@ -37,13 +37,13 @@ PNG_DEPTH = 24
 BITS_PER_SAMPLE = 258
 """The TIFF tag."""
 DEFECTIVE = 10_000
-"""One pixel in so many may be one that the sensor does not read."""
+"""One pixel in this many may be one that the sensor does not read."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """RGB (h,w,3) uint8, turned upright by its EXIF tag; InputError when the file is no readable image."""
+    """RGB (h,w,3) uint8, rotated upright by its EXIF tag; InputError when the file is no readable image."""
     require_file(path)
     try:
         with warnings.catch_warnings():
@@ -54,7 +54,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
                 # Phones write MPO: a JPEG with previews behind it, whose first picture is the photograph.
                 pictures = getattr(opened, "n_frames", 1)
                 if opened.format != "MPO" and pictures > 1:
-                    raise InputError(f"{path}: holds {pictures} pictures; save one as PNG or JPEG")
+                    raise InputError(f"{path}: holds {pictures} images; save one as PNG or JPEG")
                 opened.load()
                 if (deep := _sixteen_bit(path, opened)) is not None:
                     eight = np.minimum(deep >> (_bits(deep) - 8), 255)
@@ -116,7 +116,7 @@ class HowStored:
     """What a file says of its pixels beside what they show."""
 
     orientation: int
-    """EXIF: 1 as the sensor has it; others are turned, or mirrored, to be shown."""
+    """EXIF: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
     bits: int
     """Used of each colour."""
 

@@ -12,11 +12,11 @@ from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Intrinsics
 
 FAR_OFF_CENTRE = 0.3
-"""Of the width or height: no lens has its principal point so far from the middle, unless pictures were cropped."""
+"""Of the width or height: no model has its principal point so far from the middle, unless images were cropped."""
 
 
 def read_lens(lens: Any, size: tuple[int, int], where: Path | str) -> Intrinsics | None:
-    """The lens of images of `size` from the "intrinsics" of a capture.json; InputError if it cannot be.
+    """The intrinsics of images of `size` from the "intrinsics" of a capture.json; InputError if it cannot be.
 
     `where` begins its message: the file, or the file and a camera of it.
     """
@@ -28,7 +28,9 @@ def read_lens(lens: Any, size: tuple[int, int], where: Path | str) -> Intrinsics
     focal_and_centre = [lens[key] for key in ("fx", "fy", "cx", "cy")]
     model = lens.get("model", "pinhole")
     if model not in COEFFICIENTS:
-        raise InputError(f"{where}: lens model {model!r} is not known; give one of {', '.join(COEFFICIENTS)}")
+        raise InputError(
+            f"{where}: distortion model {model!r} is not known; give one of {', '.join(COEFFICIENTS)}"
+        )
     distortion = lens.get("distortion") or [0.0] * len(COEFFICIENTS[model])
     if not isinstance(distortion, list):
         raise InputError(f"{where}: distortion must be a list [{','.join(COEFFICIENTS[model])}]")
@@ -59,7 +61,7 @@ def read_lens_of_these(lens: Any, size: tuple[int, int], where: Path | str) -> I
             else f"centre ({found.cx:.4g}, {found.cy:.4g})"
         )
         raise InputError(
-            f"{where}: intrinsics of another resolution ({sign}) than its {size[0]}x{size[1]} pictures; give those of "
+            f"{where}: intrinsics of another resolution ({sign}) than its {size[0]}x{size[1]} images; give those of "
             "this resolution, or null to estimate them"
         )
     return found

@@ -1,4 +1,4 @@
-"""LeRobot data sets v2.1 and v3.0: videos or pictures of a wrist camera, with poses or joint angles frame by frame."""
+"""LeRobot data sets v2.1 and v3.0: videos or images of a wrist camera, with poses or joint angles frame by frame."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -100,7 +100,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
 def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str], path: Path) -> str:
     """The key of the wrist's camera, where there are others too or not; InputError with the keys that there are."""
     cameras = [key for key, feature in features.items() if feature.dtype in ("video", "image")]
-    listed = ", ".join(cameras) or "no videos or pictures"
+    listed = ", ".join(cameras) or "no videos or images"
     if unknown := [key for key in asked if key not in cameras]:
         raise InputError(f"{path}: --further-cameras {unknown[0]}: there are {listed}")
     if options.camera_topic in asked:

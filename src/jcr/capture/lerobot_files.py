@@ -37,7 +37,7 @@ Template = Annotated[str, Field(max_length=1000), AfterValidator(_template)]
 
 
 class Feature(BaseModel):
-    """One kind of number or picture that the set records."""
+    """One kind of number or image that the set records."""
 
     dtype: str = ""
     names: Any = None
@@ -80,14 +80,14 @@ def read_info(path: Path) -> Info:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording of the set: its rows, and where its pictures are."""
+    """One recording of the set: its rows, and where its images are."""
 
     index: int
     time_s: Float[ndarray, " n"]
     state: Float[ndarray, "n k"]
     table: Path
     video: Path | None
-    """None where the pictures are in the table."""
+    """None where the images are in the table."""
     video_start_s: float
 
 
@@ -133,7 +133,7 @@ def _episode_v3(path: Path, info: Info, camera: str, key: str, index: int) -> Ep
 
 
 def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
-    """The picture files of ascending rows of an episode that has them in its table, read a few rows at a time.
+    """The image files of ascending rows of an episode that has them in its table, read a few rows at a time.
 
     Raises InputError where one cannot be read or is not in the table.
     """
@@ -150,7 +150,7 @@ def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -
                         if not file_of_row:
                             raise InputError(
                                 f"{episode.table}: holds no {camera} of frame {row}; write the data set again with "
-                                "its pictures embedded"
+                                "its images embedded"
                             )
                         yield file_of_row
                     row += 1
@@ -188,11 +188,11 @@ def _table(parquet: Any, file: Path, columns: list[str]) -> dict[str, list[Any]]
 
 def _file(path: Path, template: str | None, fields: dict[str, Any]) -> Path:
     if template is None:
-        raise InputError(f"{path / INFO}: has videos and no video_path; of which version is it?")
+        raise InputError(f"{path / INFO}: has videos and no video_path; which version is it?")
     try:
         name = template.format(**fields)
     except (KeyError, ValueError) as error:
         raise InputError(
-            f"{path / INFO}: {template} cannot be filled in ({error}); of which version is it?"
+            f"{path / INFO}: {template} cannot be filled in ({error}); which version is it?"
         ) from None
     return contained(path, name, str(path / INFO))

@@ -21,7 +21,7 @@ from jcr.geometry import step_between
 from jcr.records import Capture, CellCamera, Intrinsics
 
 ONE_PLACE = (0.02, np.radians(1.0))
-"""Of the model's extent, and rad: pictures of one fixed camera differ by less."""
+"""Of the model's extent, and rad: images of one fixed camera differ by less."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class ReadOptions:
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there."""
     format: FormatName = "auto"
-    """What the capture is, where looking at its files does not tell (docs/captures.md)."""
+    """What the capture is, where looking at its files does not tell (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
     """How many frames to take from a recording: still, sharp and spread so that they show most."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None

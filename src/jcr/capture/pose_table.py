@@ -82,7 +82,7 @@ def poses_of_columns(
 
 
 def stamp_ns(text: str, where: str) -> int:
-    """A time stamp in nanoseconds; seconds, milli-, micro- and nanoseconds are told apart by their size.
+    """A time stamp in nanoseconds; seconds, milli-, micro- and nanoseconds are distinguished by their size.
 
     Exact: a float holds 16 of the 19 digits that nanoseconds since 1970 have.
     """

@@ -59,7 +59,7 @@ def bracket(
 
 
 def speed(poses_at: PosesAt, stamp_ns: Stamps) -> Float[ndarray, " n"]:
-    """How fast the frame moves (m/s), turning counted at ARM; ends of the recording count one side."""
+    """How fast the frame moves (m/s), rotation counted at ARM; ends of the recording count one side."""
     start, end = poses_at(stamp_ns - SPEED_OVER_NS), poses_at(stamp_ns + SPEED_OVER_NS)
     motion = inverse(start[0]) @ end[0]
     return np.asarray(motion_length(motion)) / (2e-9 * SPEED_OVER_NS)

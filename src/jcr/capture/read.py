@@ -56,10 +56,10 @@ def read_capture(
     into: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Capture:
-    """The capture at a path, in any format of docs/captures.md.
+    """The capture at a path, in any format of the page `captures`.
 
     The images of a recording (bag, LeRobot) are put in the new folder `into`, which is a capture folder itself.
-    Raises InputError naming the file, the fault and its cure: anything missing, unreadable, of another size,
+    Raises InputError naming the file, the fault and its remedy: anything missing, unreadable, of another size,
     not rigid, in millimetres, or fewer than three frames.
     """
     found = read_source(path, options, into=into, progress=progress)
@@ -151,7 +151,7 @@ def _of_folder(folder: Path) -> str:
         raise InputError(f"{folder}: holds bags; name one of them")
     raise InputError(
         f"{folder}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); "
-        "see docs/captures.md"
+        "see jcr docs captures"
     )
 
 
@@ -173,5 +173,5 @@ def _of_file(file: Path) -> str:
             return "industrial"
     raise InputError(
         f"{file}: nothing that jcr reads by its name or content; say what it is with --format "
-        f"({', '.join(FORMATS)}), see docs/captures.md"
+        f"({', '.join(FORMATS)}), see jcr docs captures"
     )

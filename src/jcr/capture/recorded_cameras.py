@@ -1,4 +1,4 @@
-"""Further cameras of a recording: which were asked for, and their pictures beside the frames that were chosen."""
+"""Further cameras of a recording: which were asked for, and their images beside the frames that were chosen."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +22,7 @@ Pictures = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndar
 Lens = Callable[[tuple[int, int]], Intrinsics | None]
 """Intrinsics of images of a size."""
 OF_FIXED = 3
-"""Pictures of a fixed camera: more show the same again, fewer may have the arm in the way."""
+"""Images of a fixed camera: more show the same again, fewer may have the arm in the way."""
 FOLDER = "cameras"
 NOT_ITS_NAME = re.compile(
     r"^(observation\.)?(images?[./])?|[./](color|rgb|image(_raw|_rect|_rect_color|_color)?|compressed)(?=[./]|$)"
@@ -73,7 +73,7 @@ def camera_names(keys: Sequence[str]) -> list[str]:
 def kept_pictures(
     cameras: Sequence[RecordedCamera], rows: Int[ndarray, " n"], names: Sequence[str], into: Path, where: str
 ) -> tuple[CellCamera, ...]:
-    """The cameras with pictures in the folder `into`: of one on the gripper at each of the chosen `rows` that it has, of
+    """The cameras with images in the folder `into`: of one on the gripper at each of the chosen `rows` that it has, of
     a fixed one a few; `names` are those of all frames. InputError where one has none, or of several sizes.
     """
     out = []
@@ -88,12 +88,12 @@ def kept_pictures(
             write_bytes(into / images[-1], picture if isinstance(picture, bytes) else encode_png(picture))
         if not images:
             raise InputError(
-                f"{where}: camera {camera.name} has no picture of a moment at which the frames were taken; leave it out"
+                f"{where}: camera {camera.name} has no image of a moment at which the frames were taken; leave it out"
             )
         sizes = set(image_sizes(into, images))
         if len(sizes) > 1:
             raise InputError(
-                f"{where}: the pictures of camera {camera.name} are of several sizes; leave it out"
+                f"{where}: the images of camera {camera.name} are of several sizes; leave it out"
             )
         (size,) = sizes
         frame = np.searchsorted(rows, found) if camera.mount == "gripper" else None

@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage to pictures, and to depth."""
+"""sensor_msgs/Image and CompressedImage to images, and to depth."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ _TO_RGB = {
 def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """An encoded file's bytes as they are, or RGB pixels; and the file's ending.
 
-    Raises InputError for encodings that are no picture (depth) or that jcr does not know.
+    Raises InputError for encodings that are no image (depth) or that jcr does not know.
     """
     if hasattr(message, "format"):
         data = message.data.tobytes()
@@ -43,7 +43,7 @@ def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"
     encoding = message.encoding
     if encoding != "rgb8" and encoding not in _TO_RGB:
         raise InputError(
-            f"{where}: encoding {encoding!r} is no colour picture that jcr knows; choose another topic"
+            f"{where}: encoding {encoding!r} is no colour image that jcr knows; choose another topic"
         )
     channels = _CHANNELS.get(encoding, 2 if "yu" in encoding else 1)
     used = message.width * channels

@@ -84,7 +84,7 @@ def gripper_poses(
 
 
 def _plain(name: str) -> str:
-    """A picture's name without folder and ending: tools differ in both."""
+    """An image's name without folder and ending: tools differ in both."""
     return Path(name).stem
 
 

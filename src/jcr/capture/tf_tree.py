@@ -15,7 +15,7 @@ from jcr.geometry import inverse, motion_length
 from jcr.records import Mount
 
 RIGID = 2e-3
-"""m, turning counted at ARM: a frame that moves less beside another is bolted to it."""
+"""m, rotation counted at ARM: a frame that moves less beside another is bolted to it."""
 
 
 class TfTree:

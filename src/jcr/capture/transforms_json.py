@@ -86,7 +86,7 @@ def _located(file: Path, name: str, k: int) -> str:
 
 
 def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
-    """The one lens of all frames, of the given size; InputError when there are several, or a strange one."""
+    """The one set of intrinsics of all frames, of the given size; InputError for several or a strange one."""
     return _lens(read_json(file), file, size)
 
 
@@ -97,7 +97,7 @@ def _lens(content: dict[str, Any], file: Path, size: tuple[int, int]) -> Intrins
     ]
     first = lenses[0]
     if any(lens != first for lens in lenses):
-        raise InputError(f"{file}: its frames have different lenses; jcr needs images of one camera")
+        raise InputError(f"{file}: its frames have different intrinsics; jcr needs images of one camera")
     model = content.get("camera_model", "OPENCV")
     if model not in (
         "OPENCV",

@@ -1,4 +1,4 @@
-"""Cameras added to a run after its calibration: copies of their pictures in the run folder."""
+"""Cameras added to a run after its calibration: copies of their images in the run folder."""
 
 import json
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ FOLDER, FILE = "cameras", "cameras.json"
 
 
 def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, ...]:
-    """The cameras added to a run so far; InputError where their file or a picture was damaged."""
+    """The cameras added to a run so far; InputError where their file or an image was damaged."""
     folder = run_folder / FOLDER
     if not is_written(folder / FILE):
         return ()
@@ -34,7 +34,7 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
 def camera_of(
     name: str, pictures: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]
 ) -> CellCamera:
-    """A fixed camera of pictures where they lie; InputError for pictures that cannot be those of one camera.
+    """A fixed camera of images where they lie; InputError for images that cannot be those of one camera.
 
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
     that other cameras have.
@@ -47,7 +47,7 @@ def camera_of(
     for picture, size in zip(pictures, sizes, strict=True):
         if size != sizes[0]:
             raise InputError(
-                f"{picture}: {size[0]}x{size[1]} pixels, but {pictures[0]} has {sizes[0][0]}x{sizes[0][1]}; pictures of "
+                f"{picture}: {size[0]}x{size[1]} pixels, but {pictures[0]} has {sizes[0][0]}x{sizes[0][1]}; images of "
                 "one camera have one size: add each camera by itself"
             )
     lens = None
@@ -61,7 +61,7 @@ def camera_of(
 
 
 def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellCamera:
-    """Make the camera part of the run: its pictures copied, its entry written."""
+    """Make the camera part of the run: its images copied, its entry written."""
     folder = run_folder / FOLDER
     images = []
     for k, image in enumerate(camera.images):

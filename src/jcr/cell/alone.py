@@ -1,4 +1,4 @@
-"""A further camera with a capture of its own: its pictures, and the gripper's poses at which they were taken.
+"""A further camera with a capture of its own: its images, and the gripper's poses at which they were taken.
 
 So is calibrated what sees nothing that the capture's own camera saw: a fixed camera that watches the gripper, and a
 second camera on the gripper that looks elsewhere. One robot joins them; scene, scale and transform are each its own.
@@ -20,7 +20,7 @@ from jcr.reconstruct.relocate import MIN_POINTS
 from jcr.records import Capture, CellCamera, HandEye, Reconstruction
 
 LEAST_POSES = 3
-"""With fewer pictures nothing is reconstructed."""
+"""With fewer images nothing is reconstructed."""
 
 
 def of_camera(capture: Capture, camera: CellCamera) -> Capture:
@@ -65,14 +65,14 @@ def calibrated_elsewhere(
         reconstruction = reconstruct(own, replace(reconstruct_options, backend="auto"), progress)
         found = calibrate(own, reconstruction, options)
     except NotTrustedError as error:
-        why = f"it shares nothing with the {capture.camera_name} camera's images, and by its own pictures: {error}"
+        why = f"it shares nothing with the {capture.camera_name} camera's images, and by its own images: {error}"
         return replace(shared, warnings=(why,))
     depth = [
         float(np.median(apply(inverse(pose), reconstruction.tracks.points_in_recon)[:, 2]))
         for pose in reconstruction.recon_from_camera
     ]
     note = (
-        f"it shares nothing with the {capture.camera_name} camera's images: calibrated by its own {len(own)} pictures, "
+        f"it shares nothing with the {capture.camera_name} camera's images: calibrated by its own {len(own)} images, "
         "and what it sees is not in the map"
     )
     alone = found_alone(own, camera, reconstruction, found, found.scale * float(np.median(depth)))
@@ -82,7 +82,7 @@ def calibrated_elsewhere(
 def found_alone(
     own: Capture, camera: CellCamera, reconstruction: Reconstruction, found: HandEye, scene_distance: float
 ) -> CameraFound:
-    """What the calibration of a camera by its own pictures says of it."""
+    """What the calibration of a camera by its own images says of it."""
     pictures = []
     for verdict, pixels in image_verdicts(own, reconstruction, found):
         row = own.images.index(verdict.image)
@@ -105,6 +105,6 @@ def found_alone(
 
 
 def not_registered(camera: CellCamera, why: str) -> CameraFound:
-    """Of a camera whose pictures gave no reconstruction."""
+    """Of a camera whose images gave no reconstruction."""
     pictures = tuple(PictureFound(image, False, 0, None, "not registered") for image in camera.images)
     return CameraFound(camera.name, camera.mount, camera.arm, pictures, warnings=(why,))

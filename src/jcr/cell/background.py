@@ -1,7 +1,7 @@
-"""What moves before a fixed camera, by itself: the pictures with all that stands still taken out.
+"""What moves before a fixed camera, by itself: the images with all that stands still taken out.
 
-Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many pictures
-show the same colour at a pixel, that is what stands there; a picture keeps what differs from it, and fades to grey
+Behind a thing in the gripper stands the rest of the cell, with more features than the thing has. Where many images
+show the same colour at a pixel, that is what stands there; an image keeps what differs from it, and fades to grey
 elsewhere, softly, for a sharp border would be a feature of its own.
 """
 
@@ -19,16 +19,16 @@ from jcr.files import write_bytes
 LEVELS = 14.0
 """Of 255, by which colours differ that are not the same; noise and JPEG are less, after averaging."""
 REDUCED = 320
-"""px across, at which pictures are compared."""
+"""px across, at which images are compared."""
 LEAST_SHARE, LEAST = 0.3, 3
-"""Of the pictures, and how many at least, that must agree on a pixel for it to be background."""
+"""Of the images, and how many at least, that must agree on a pixel for it to be background."""
 GREY = 128
 GROWN, SOFT = 0.012, 0.008
 """Of the width: by how much what moves is grown, and sigma of the fading around it."""
 
 
 def moving_parts(pictures: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
-    """The pictures of a fixed camera with what stands still faded to grey."""
+    """The images of a fixed camera with what stands still faded to grey."""
     height, width = pictures[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))
     reduced = np.stack(
@@ -51,7 +51,7 @@ def moving_parts(pictures: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndar
 def _background(
     reduced: Float[ndarray, "n h w 3"],
 ) -> tuple[Float[ndarray, "h w 3"], ndarray]:
-    """At each pixel the colour on which most pictures agree, and whether enough of them do."""
+    """At each pixel the colour on which most images agree, and whether enough of them do."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
     )  # (n,h,w): pictures like each
@@ -62,6 +62,6 @@ def _background(
 
 
 def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
-    """Write those of the pictures of a folder under the same names in another; PNG, whatever the names end with."""
+    """Write those of the images of a folder under the same names in another; PNG, whatever the names end with."""
     for name, picture in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
         write_bytes(folder / name, encode_png(picture))

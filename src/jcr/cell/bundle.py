@@ -1,4 +1,4 @@
-"""Bundle adjustment of a cell's pictures by themselves: rigid groups of cameras, one scene, one similarity left open.
+"""Bundle adjustment of a cell's images by themselves: rigid groups of cameras, one scene, one similarity left open.
 
 A rig is what moves as one: the wrist of an arm at one instant, with all cameras on it, or a fixed camera. Whose rigs
 they are is not asked here; the robots have their say in ties.py. Until then the scene has no metre and no base, and what
@@ -36,12 +36,12 @@ ROUNDS, STEPS = 8, 40
 
 @dataclass(frozen=True)
 class Pictures:
-    """Which rig and which camera each picture is of, and what is seen in them."""
+    """Which rig and which camera each image is of, and what is seen in them."""
 
     rig: Int[ndarray, " n"]
     camera: Int[ndarray, " n"]
     picture: Int[ndarray, " k"]
-    """Of each observation; no point twice in one picture."""
+    """Of each observation; no point twice in one image."""
     x_px: Float[ndarray, "k 2"]
     """In the original image, distorted."""
     point: Int[ndarray, " k"]
@@ -74,7 +74,7 @@ class Freedom:
 
     @property
     def lenses_end(self) -> int:
-        """Column after the last of the lenses."""
+        """Column after the last of the intrinsics."""
         return sum(len(lens.std) for lens in self.lenses)
 
     @property
@@ -94,26 +94,26 @@ class Freedom:
 
 @dataclass(frozen=True)
 class Imaged:
-    """What the pictures alone say, up to one similarity of the world."""
+    """What the images alone say, up to one similarity of the world."""
 
     scene: Scene
     freedom: Freedom
     covariance: Float[ndarray, "d d"]
-    """Of steps: lenses in the directions of their priors, mounts (rig axes), rigs (world axes); nothing along the
+    """Of steps: intrinsics in the directions of their priors, mounts (rig axes), rigs (world axes); nothing along the
     similarity."""
     sigma_px: Float[ndarray, " c"]
     """Of one image coordinate, by camera."""
     reprojection_px: Float[ndarray, " n"]
-    """Median of each picture; not a number where it took no part."""
+    """Median of each image; not a number where it took no part."""
 
 
 def adjust_images(
     scene: Scene, pictures: Pictures, freedom: Freedom, held: Float[ndarray, "r r"] | None = None
 ) -> Imaged:
-    """Least reprojection error under a Cauchy loss over lenses, mounts, rigs and points, from a start that is near.
+    """Least reprojection error under a Cauchy loss over intrinsics, mounts, rigs and points, from a start that is near.
 
-    Points that fewer than two pictures see are left out. `held` is information on steps of the first rigs from where
-    they start, where others than these pictures know them; the similarity is then theirs.
+    Points that fewer than two images see are left out. `held` is information on steps of the first rigs from where
+    they start, where others than these images know them; the similarity is then theirs.
     """
     seen = np.bincount(pictures.point, minlength=len(scene.points_in_world))
     order = np.argsort(pictures.point, kind="stable")
@@ -215,7 +215,7 @@ def _pixel_errors(
 
     As in calibration/bundle.py; the ratio between cameras from their sums of squares over what is left of them after
     the points took their part (their leverage), for a camera whose residuals are small because points follow it is
-    not the better one. The pictures of a fixed camera show the same features with the same errors: their cells are one.
+    not the better one. The images of a fixed camera show the same features with the same errors: their cells are one.
     """
     pictures, count = problem.pictures, len(scene.cameras)
     camera = pictures.camera[pictures.picture]
@@ -278,7 +278,7 @@ def _weights(view: _View, errors: _PixelErrors, problem: _Problem) -> Float[ndar
 
 
 def _lens_step(scene: Scene, problem: _Problem) -> Float[ndarray, " l"]:
-    """How far the lenses have moved from where they began, in the directions of their priors."""
+    """How far the intrinsics have moved from where they began, in the directions of their priors."""
     steps = [
         np.linalg.pinv(free.directions) @ (parameters(camera) - start)
         for free, camera, start in zip(problem.freedom.lenses, scene.cameras, problem.started, strict=True)
@@ -401,7 +401,7 @@ def _moved(scene: Scene, problem: _Problem, normal: _Normal) -> Scene:
 
 
 def stepped(scene: Scene, freedom: Freedom, step: Float[ndarray, " d"]) -> Scene:
-    """Lenses, mounts and rigs after a step in the order of Imaged.covariance."""
+    """Intrinsics, mounts and rigs after a step in the order of Imaged.covariance."""
     cameras = tuple(
         with_parameters(camera, parameters(camera) + free.directions @ step[columns])
         for camera, free, columns in zip(scene.cameras, freedom.lenses, freedom.lens_columns, strict=True)

@@ -93,7 +93,7 @@ class CameraPlaced(_Part):
 
     @property
     def doubt(self) -> str | None:
-        """Why it is not to be trusted; None when it is."""
+        """Why it is rejected; None when it is."""
         return None if self.converged else self.warnings[0]
 
 
@@ -199,7 +199,7 @@ def in_words(content: CamerasFile) -> list[str]:
         name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
         used = sum(picture.used for picture in camera.pictures)
         points = sum(picture.points for picture in camera.pictures if picture.used)
-        pictures = f"{used} of {len(camera.pictures)} pictures, {points} points"
+        pictures = f"{used} of {len(camera.pictures)} images, {points} points"
         lines.append(f"{camera.name}: {name} ({pictures})")
         with np.printoptions(precision=6, suppress=True):
             lines += [f"  {row}" for row in str(np.array(camera.parent_from_camera)).splitlines()]
@@ -210,7 +210,7 @@ def in_words(content: CamerasFile) -> list[str]:
         )
         lines.append(f"  {_plus_minus(sure)}{scene}")
         lines += [
-            f"  {'not to be trusted: ' if k == 0 and camera.doubt else ''}{text}"
+            f"  {'rejected: ' if k == 0 and camera.doubt else ''}{text}"
             for k, text in enumerate(camera.warnings)
         ]
         lines += [f"  not used: {p.image}: {p.reason}" for p in camera.pictures if not p.used]

@@ -52,7 +52,7 @@ def calibrated_alone(
     options: CalibrateOptions,
     progress: Progress,
 ) -> CameraFound:
-    """A further camera that watches the gripper of a capture; `moving` is a folder for pictures of what moves."""
+    """A further camera that watches the gripper of a capture; `moving` is a folder for images of what moves."""
     own = of_camera(capture, camera)
     write_moving_parts(own.folder, own.images, moving)
     seen = replace(exchanged(own), folder=moving)
@@ -75,7 +75,7 @@ def refined(
     """The calibration of the exchanged capture with the robot's errors where they are.
 
     Its gripper_from_camera is base_from_camera, its base_from_recon gripper_from_recon; residuals are of the gripper
-    poses as they were reported. One that is not trusted stays as it was, with what explains it where that is known.
+    poses as they were reported. One that is rejected stays as it was, with what explains it where that is known.
     """
     options = options or CalibrateOptions()
     if not found.converged:
@@ -126,13 +126,13 @@ def refined(
 
 
 def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye) -> HandEye:
-    """A failure, with the reason where the pictures are those of a camera on the gripper."""
+    """A failure, with the reason where the images are those of a camera on the gripper."""
     rows = reconstruction.image_index
     on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
     if not on_gripper.converged:
         return found
     why = (
-        f"the pictures fit a camera that the gripper carries, not a fixed one: write mount gripper for "
+        f"the images fit a camera that the gripper carries, not a fixed one: write mount gripper for "
         f"{capture.camera_name}"
     )
     return replace(found, warnings=(why, *found.warnings))

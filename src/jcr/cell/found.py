@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PictureFound:
-    """What became of one picture."""
+    """What became of one image."""
 
     image: str
     used: bool
@@ -46,7 +46,7 @@ class CameraFound:
     intrinsics_std: Float[ndarray, " q"] | None = None
     converged: bool = False
     warnings: tuple[str, ...] = ()
-    """The first says why it is not to be trusted, where it is not."""
+    """The first says why it is rejected, where it is not."""
 
     @property
     def std_at_scene(self) -> float | None:

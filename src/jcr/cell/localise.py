@@ -1,10 +1,10 @@
-"""Where a picture of another camera was taken from, in the reconstruction of the capture's own camera.
+"""Where an image of another camera was taken from, in the reconstruction of the capture's own camera.
 
-Features that it shares with two or more images of known pose become points; the picture's place follows from those that
+Features that it shares with two or more images of known pose become points; the image's place follows from those that
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
-bundle adjustment of all pictures. A place that rests on few points by SIFT is refined with learned features, where these
+bundle adjustment of all images. A place that rests on few points by SIFT is refined with learned features, where these
 are installed. They alone place nothing: to a network another board of the same kind is the same board, and so is a board
-turned by half a turn (docs/cameras.md).
+rotated by a rotation by 180° (docs/cameras.md).
 """
 
 import math
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from jcr.match.learned import LearnedFeatures
 
 FOCAL_OF_WIDTH = 0.9
-"""Of a camera of which nothing is known: where the search for its focal length starts."""
+"""Of a camera without known intrinsics: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
 """Of the image's area that the points must span; crowded ones say little of the place."""
 TRIALS = 20_000
 FEW = 120
 """Points by SIFT below which networks look for more."""
 SAME_VIEW = np.radians(5.0)
-"""By which the place with these may be turned against that without."""
+"""By which the place with these may be rotated against that without."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Known:
 
 
 class Learned:
-    """Matches by a network between the images of known pose, turned alike, and a picture."""
+    """Matches by a network between the images of known pose, rotated alike, and an image."""
 
     def __init__(
         self, images: Sequence[UInt8[ndarray, "h w 3"]], recon_from_camera: Float[ndarray, "m 4 4"]
@@ -69,7 +69,7 @@ class Learned:
     def matched(
         self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
     ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
-        """Keypoints of a picture (px), and for each image of known pose which of them it shows, and where.
+        """Keypoints of an image (px), and for each image of known pose which of them it shows, and where.
 
         `near` is about its recon_from_camera.
         """
@@ -87,13 +87,13 @@ class Learned:
 
 @dataclass(frozen=True)
 class Shared:
-    """The points that a picture shares with images of known pose, and where it was taken from."""
+    """The points that an image shares with images of known pose, and where it was taken from."""
 
     recon_from_camera: Float[ndarray, "4 4"]
     lens: Intrinsics
     points_in_recon: Float[ndarray, "p 3"]
     x_px: Float[ndarray, "p 2"]
-    """In the picture."""
+    """In the image."""
     row: Int[ndarray, " k"]
     """Image of known pose of each further observation."""
     row_x_px: Float[ndarray, "k 2"]
@@ -122,7 +122,7 @@ def guessed_lens(size: tuple[int, int]) -> Intrinsics:
 def localised(
     known: Known, picture: UInt8[ndarray, "h w 3"], lens: Intrinsics, lens_is_known: bool, seed: int = 0
 ) -> Shared | int:
-    """The picture's place, or how few points it shares with the known images where these do not show it."""
+    """The image's place, or how few points it shares with the known images where these do not show it."""
     found = features(picture, lens)
     of_image = [matches(found.descriptors, other.descriptors) for other in known.found]
     seen = _Matched(
@@ -144,7 +144,7 @@ def localised(
 
 @dataclass(frozen=True)
 class _Matched:
-    """Keypoints of a picture, and which image of known pose shows which of them where."""
+    """Keypoints of an image, and which image of known pose shows which of them where."""
 
     x_px: Float[ndarray, "n 2"]
     feature: Int[ndarray, " c"]
@@ -215,7 +215,7 @@ def _placed(
     lens_is_known: bool,
     seed: int,
 ) -> tuple[Float[ndarray, "4 4"], Intrinsics, ndarray] | None:
-    """Pose, lens and inliers; None where no pose has enough of these."""
+    """Pose, intrinsics and inliers; None where no pose has enough of these."""
     estimation, refinement = (
         pycolmap.AbsolutePoseEstimationOptions(),
         pycolmap.AbsolutePoseRefinementOptions(),
@@ -242,7 +242,7 @@ def _placed(
 
 
 def spread(shared: Shared) -> float:
-    """Share of the picture's area within which its points lie, as their standard deviations span it."""
+    """Share of the image's area within which its points lie, as their standard deviations span it."""
     sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(shared.x_px.T)))
     return float(sides.prod() / (shared.lens.width * shared.lens.height))
 

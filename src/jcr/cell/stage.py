@@ -1,6 +1,6 @@
-"""Further cameras of a cell, placed with the calibration of the capture's own: pictures first, then robots.
+"""Further cameras of a cell, placed with the calibration of the capture's own: images first, then robots.
 
-Every picture of another camera is localised in the reconstruction (localise.py); all pictures are adjusted together
+Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together
 (bundle.py), and the arms' poses tie them to their bases (ties.py). The calibration of the capture's own camera stays as
 it was found: what is said here of others rests on the same images.
 """
@@ -39,11 +39,11 @@ from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
 from jcr.rounding import significant
 
 SAME_PLACE = (0.02, np.radians(2.0))
-"""m, rad: pictures of one fixed camera, or places of a camera on its gripper, differ by no more."""
+"""m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
 SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
-"""Of the distance of the scene, rad: the same where a focal length estimated from one picture is in it."""
+"""Of the distance of the scene, rad: the same where a focal length estimated from one image is in it."""
 MEDIAN_PX = 3.0
-"""Pictures of a camera that miss by more, of one 1600 px wide, do not fit one place."""
+"""Images of a camera that miss by more, of one 1600 px wide, do not fit one place."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 EXACT = 1e-6
@@ -56,7 +56,7 @@ NOTHING: dict[str, ndarray] = {
 }
 """Fields of tracks without an observation."""
 LEAST_POSES = 3
-"""Of another arm, or of another camera on the gripper: pictures."""
+"""Of another arm, or of another camera on the gripper: images."""
 
 
 def place_cameras(
@@ -75,7 +75,7 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.converged:
-        why = f"the {capture.camera_name} camera's own calibration is not to be trusted"
+        why = f"the {capture.camera_name} camera's own calibration is rejected"
         return CellFound(tuple(_Seen.nothing_of(camera).refused(why) for camera in others), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]
@@ -121,7 +121,7 @@ def place_cameras(
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the pictures of one camera share with the images of known pose, in the order of its images."""
+    """What the images of one camera share with the images of known pose, in the order of its images."""
 
     camera: CellCamera
     shared: tuple[Shared | None, ...]
@@ -132,7 +132,7 @@ class _Seen:
 
     @staticmethod
     def of(camera: CellCamera, found: Sequence[Shared | int]) -> "_Seen":
-        """Of what localised() said of each picture."""
+        """Of what localised() said of each image."""
         return _Seen(
             camera,
             tuple(one if isinstance(one, Shared) else None for one in found),
@@ -151,7 +151,7 @@ class _Seen:
 
     @property
     def rows(self) -> Int[ndarray, " k"]:
-        """Pictures that were localised."""
+        """Images that were localised."""
         return np.flatnonzero([one is not None for one in self.shared])
 
     @property
@@ -166,13 +166,13 @@ class _Seen:
 
     @property
     def lens(self) -> Intrinsics:
-        """Given, or as the picture with most points has it."""
+        """Given, or as the image with most points has it."""
         lens, _ = usable_lens(self.camera.intrinsics)
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
         return lens or best.lens
 
     def without(self, reasons: Mapping[int, str]) -> "_Seen":
-        """With why some pictures are not used."""
+        """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
     def refused(self, why: str) -> CameraFound:
@@ -187,11 +187,11 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Member:
-    """A camera with the pictures that are used."""
+    """A camera with the images that are used."""
 
     seen: _Seen
     rig: Int[ndarray, " k"]
-    """Of each picture; -1 where it is not used."""
+    """Of each image; -1 where it is not used."""
     rig_from_camera: Float[ndarray, "4 4"] | None
     """Where it is not the rig's first camera."""
     arm: int | None
@@ -215,7 +215,7 @@ class _Rigs:
         self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
 
     def add(self, seen: _Seen) -> _Member | CameraFound:
-        """The camera's pictures among the rigs; or why it cannot be placed."""
+        """The camera's images among the rigs; or why it cannot be placed."""
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
             return seen.refused(
@@ -255,7 +255,7 @@ class _Rigs:
         if len(near):
             at = self._capture.images[self._rows[near[0]]]
             notes.append(
-                f"it stands where the {self._capture.camera_name} camera was at {at}: if its picture is one of that "
+                f"it stands where the {self._capture.camera_name} camera was at {at}: if its image is one of that "
                 "camera, it is not fixed"
             )
         return _Member(seen, rig, None, None, tuple(notes))
@@ -273,7 +273,7 @@ class _Rigs:
         seen = seen.without(unused)
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
-            return seen.refused("none of its pictures was taken with an image that is used")
+            return seen.refused("none of its images was taken with an image that is used")
         on_rig = inverse(np.stack(self.poses)[rig[taken]]) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -284,11 +284,11 @@ class _Rigs:
         if astray.mean() > 0.4:
             return seen.refused(
                 f"its place beside the {self._capture.camera_name} camera differs by up to "
-                f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between pictures: the two are not rigid, or "
-                "the pictures are not of the frames that they stand for"
+                f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between images: the two are not rigid, or "
+                "the images are not of the frames that they stand for"
             )
         rig[taken[astray]] = -1
-        why = "its place on the gripper is not that of its other pictures"
+        why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
         return _Member(seen, rig, on_rig[middle], 0)
 
@@ -298,7 +298,7 @@ class _Rigs:
             return seen.refused(f"a second camera on arm {arm}: one each is supported")
         if len(seen.rows) < LEAST_POSES:
             return seen.refused(
-                f"{len(seen.rows)} of its pictures share enough of the mapped scene; {LEAST_POSES} are needed"
+                f"{len(seen.rows)} of its images share enough of the mapped scene; {LEAST_POSES} are needed"
             )
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
@@ -340,7 +340,7 @@ def _adjusted(
     members: Sequence[_Member],
     rigs: _Rigs,
 ) -> tuple[Imaged, dict[tuple[str, int], float]]:
-    """All pictures adjusted together, and the median reprojection error (px) of each camera's by their number."""
+    """All images adjusted together, and the median reprojection error (px) of each camera's by their number."""
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     held = None
@@ -404,7 +404,7 @@ def _as_given(reconstruction: Reconstruction, hand_eye: HandEye) -> Float[ndarra
 
 
 def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"]]:
-    """Where the camera, the c-th of the pictures', is on its parent."""
+    """Where the camera, the c-th of the images', is on its parent."""
     rig, arm = int(member.rig[member.rig >= 0][0]), member.arm
 
     def parent_from_camera(placed: Placed) -> Float[ndarray, "4 4"]:
@@ -455,7 +455,7 @@ def _found(
     widest = max(spread(one) for one in member.seen.shared if one is not None)
     if widest < LEAST_SPREAD:
         notes.append(
-            f"its points lie in {100 * widest:.0f} % of the picture; more of the scene in view would help"
+            f"its points lie in {100 * widest:.0f} % of the image; more of the scene in view would help"
         )
     warnings = notes if doubt is None else [doubt, *notes]
     return replace(found, converged=doubt is None, warnings=tuple(warnings))
@@ -464,7 +464,7 @@ def _found(
 def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: HandEye) -> Float[ndarray, "6 6"]:
     """What the calibration of the capture's own camera counts beside its images and robot, carried over.
 
-    A wrong lens, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.
+    Wrong intrinsics, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.
     """
     size = np.sqrt(np.diag(hand_eye.covariance))
     more = (hand_eye.covariance - answer.covariance[:7, :7]) / np.outer(size, size)
@@ -475,13 +475,13 @@ def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: Hand
 
 
 def _doubt(found: CameraFound, member: _Member) -> str | None:
-    """Why the camera's place is not to be trusted, and the cure."""
+    """Why the camera's place is rejected, and the remedy."""
     missed = {picture.image: picture.reprojection_px or 0.0 for picture in found.pictures}
     worst = max(missed, key=lambda image: missed[image])
     if missed[worst] > MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
         moved = "it is not fixed" if found.mount == "base" else "it is not rigid on the gripper"
         return (
-            f"{worst} misses the place that fits its pictures together by {missed[worst]:.0f} px (median): {moved}, the "
+            f"{worst} misses the place that fits its images together by {missed[worst]:.0f} px (median): {moved}, the "
             "scene changed, or the intrinsics are wrong"
         )
     assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
@@ -494,7 +494,7 @@ def _doubt(found: CameraFound, member: _Member) -> str | None:
     if member.camera.intrinsics is None:
         percent = 100 * found.intrinsics_std[0] / found.intrinsics.fx
         return (
-            f"{known_to}, for its pictures do not show its intrinsics (focal length ± {significant(percent)} %): give "
-            "them, or pictures with more of the scene, at other depths"
+            f"{known_to}, for its images do not show its intrinsics (focal length ± {significant(percent)} %): give "
+            "them, or images with more of the scene, at other depths"
         )
     return f"{known_to}; let it see more of the mapped scene, or add images to the wrist camera's capture"

@@ -1,11 +1,11 @@
-"""The robots' say: each arm ties rigs of the pictures' scene to its base, and gives it the metre.
+"""The robots' say: each arm ties rigs of the images' scene to its base, and gives it the metre.
 
 The rigs that an arm moves obey `base_from_gripper[i] · X = base_from_world · S_λ(world_from_rig[i])`
 (handeye/equation.py), with one X and one base_from_world an arm and one λ for the whole scene. Where the camera stands
 fixed and what it sees is carried by the gripper, the roles are exchanged: the world is the carried thing, and the
 equation is that of the inverse poses, with base_from_camera in place of X and gripper_from_world in place of
 base_from_world; the errors are still those of the reported poses. Every other transform of the cell follows from these
-and from what the pictures say.
+and from what the images say.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,7 +59,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Answer:
-    """The cell as robots and pictures have it together."""
+    """The cell as robots and images have it together."""
 
     placed: Placed
     covariance: Float[ndarray, "p p"]
@@ -69,7 +69,7 @@ class Answer:
     systematic_left: tuple[float, float]
     imaged: Imaged
     free: Int[ndarray, " e"]
-    """Columns of Imaged.covariance that are unknowns here: lenses, mounts, and rigs that no arm moves."""
+    """Columns of Imaged.covariance that are unknowns here: intrinsics, mounts, and rigs that no arm moves."""
 
     def moved(self, step: Float[ndarray, " p"]) -> Placed:
         """Everything after a step: X, log scale, base of the first arm; X and base of others; then the `free` ones."""
@@ -101,7 +101,7 @@ class Answer:
 def tied(
     imaged: Imaged, ties: Sequence[Tie], scale: float, noise: tuple[float, float] | None = None
 ) -> Answer:
-    """The cell from its pictures and the arms' poses, averaged over the sizes of the robots' errors.
+    """The cell from its images and the arms' poses, averaged over the sizes of the robots' errors.
 
     `scale` is where the search starts; `noise` (m, rad) is that of the gripper poses, at least. All arms are taken to be
     equally exact.
@@ -159,7 +159,7 @@ def _columns(arm: int) -> Int[ndarray, "12"]:
 
 
 def _equations(placed: Placed, given: _Given) -> tuple[Equations, Region]:
-    """Residuals of the reported gripper poses, linear in all unknowns; what the pictures say of the rigs is in them."""
+    """Residuals of the reported gripper poses, linear in all unknowns; what the images say of the rigs is in them."""
     ties, covariance = given.ties, given.imaged.covariance
     rows, robots = len(given.by_arm), 12 * len(ties) + 1
     residual, jacobian, by_rig = np.zeros(rows), np.zeros((rows, robots)), np.zeros((rows, rows))
@@ -242,7 +242,7 @@ def _moved(placed: Placed, step: Float[ndarray, " p"], imaged: Imaged, free: Int
 
 
 def _with_lenses_off(covariance: Float[ndarray, "p p"], imaged: Imaged, first: int) -> Float[ndarray, "p p"]:
-    """With what features of the pictures leave wrong in the lenses, and all that follows them."""
+    """With what features of the images leave wrong in the intrinsics, and all that follows them."""
     freedom = imaged.freedom
     off = np.zeros((freedom.lenses_end, freedom.lenses_end))
     for free, camera, columns in zip(freedom.lenses, imaged.scene.cameras, freedom.lens_columns, strict=True):

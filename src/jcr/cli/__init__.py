@@ -2,7 +2,7 @@
 
 A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
 field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
-status: 0 done, 2 the user's input is wrong, 3 not to be trusted, 1 a bug. Each has an `output` (output.py): with
+status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output` (output.py): with
 --json its result is one JSON object on stdout, with --quiet nothing but an error comes on stderr.
 """
 
@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 from jcr.errors import InputError, NotTrustedError, printable
 
@@ -28,24 +29,25 @@ COMMANDS = {
     "align": "global alignment of pairwise pointmaps alone",
     "map": "(re)build the map of a run",
     "query": "occupancy, distance, colour, label at points",
-    "add-camera": "where a fixed camera is, from its pictures of the scene of a run",
+    "add-camera": "where a fixed camera is, from its images of the scene of a run",
     "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
     "measure": "support plane and the objects on it: height, footprint, label",
     "view": "a run in 3D, in the browser",
     "compare": "difference of two calibrations, and whether their errors explain it",
-    "verify": "is a calibration still true of today's few images",
-    "touch": "is the map where the robot's tip feels it",
+    "verify": "has the camera moved? a calibration against a few new images",
+    "touch": "touch test: the map against points touched with the robot's tip",
     "batch": "many captures, on this machine or a Ray cluster",
     "simulate": "a simulated capture with ground truth",
     "bench": "the tables and timings of the README (in the source)",
     "models": "back ends, weights present or not, licences",
+    "docs": "the pages of the manual, in the terminal",
 }
 
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-From pictures of a robot's wrist camera and the gripper pose of each: where the camera sits on the gripper,
-the metric scale, and a map in the robot's base frame.
+Eye-in-hand calibration without a target: from images of a wrist camera and the gripper pose at each, the hand-eye
+transform, the metric scale, and a map in the robot's base frame.
 
 {commands}
 
@@ -72,7 +74,7 @@ _DISK = {
     errno.ELOOP: "a link leads back to itself; put a file or a folder there",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-"""What the machine, not the program, has wrong, and the cure."""
+"""What the machine, not the program, has wrong, and the remedy."""
 
 
 NO_DEFAULT = re.compile(r"\(default:(?:[\s│]|\x1b\[[0-9;]*m)+(?:None|True|False)\)")
@@ -151,7 +153,7 @@ def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str])
     except BaseException as error:
         if not _interrupted(error):
             raise
-        return _fail(130, "interrupted; finished stages are kept and the same command goes on from them")
+        return _fail(130, "interrupted; finished stages are kept and the same command resumes")
 
 
 def _write_no_more() -> None:
@@ -169,6 +171,18 @@ def _interrupted(error: BaseException | None) -> bool:
     return False
 
 
+def configuration() -> tuple[Any, ...]:
+    """How tyro makes options of the fields of a command's `Arguments`."""
+    import tyro
+
+    return (
+        tyro.conf.OmitArgPrefixes,
+        tyro.conf.FlagCreatePairsOff,
+        tyro.conf.PositionalMetavarFromFieldName,
+        tyro.conf.DisallowNone,
+    )
+
+
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
@@ -180,12 +194,7 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
                 command.Arguments,
                 prog=program,
                 args=list(arguments),
-                config=(
-                    tyro.conf.OmitArgPrefixes,
-                    tyro.conf.FlagCreatePairsOff,
-                    tyro.conf.PositionalMetavarFromFieldName,
-                    tyro.conf.DisallowNone,
-                ),
+                config=configuration(),
             )
     except SystemExit as stop:
         if not stop.code:

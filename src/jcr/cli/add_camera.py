@@ -11,11 +11,11 @@ from jcr.cli.output import Output
 
 @dataclass(frozen=True)
 class Arguments:
-    """Place a fixed camera by pictures of the scene that a run calibrated and mapped with the wrist's: base_from_camera.
+    """Place a fixed camera by images of the scene that a run calibrated and mapped with the wrist's: base_from_camera.
 
-    OUT is the run folder, whose capture must still be where it was. No marker is needed: what the pictures share with
-    those of the wrist camera tells. One picture will do; of a camera whose intrinsics are not given the focal length is
-    estimated with the rest, and the answer says when the picture does not show it. The camera becomes part of the run
+    OUT is the run folder, whose capture must still be where it was. No marker is needed: what the images share with
+    those of the wrist camera tells. One image will do; of a camera whose intrinsics are not given the focal length is
+    estimated with the rest, and the answer says when the image does not show it. The camera becomes part of the run
     (OUT/cameras.json, the report, `jcr export`). Exit status 3 where it cannot be placed; nothing is kept then.
 
     examples:
@@ -26,11 +26,11 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     pictures: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Pictures of one fixed camera, all of one size."""
+    """Images of one fixed camera, all of one size."""
     name: str | None = None
-    """Of the camera; by default that of the first picture's file."""
+    """Of the camera; by default that of the first image's file."""
     intrinsics: Path | None = None
-    """JSON with fx, fy, cx, cy and distortion as in capture.json, in pixels of these pictures; unset: estimated."""
+    """JSON with fx, fy, cx, cy and distortion as in capture.json, in pixels of these images; unset: estimated."""
     output: Output = field(default_factory=Output)
 
 
@@ -44,7 +44,7 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
 
     if not arguments.pictures:
-        raise InputError("no picture; name one or more of the camera to place")
+        raise InputError("no image; name one or more of the camera to place")
     name = arguments.name or re.sub(r"^[^A-Za-z]+|[^A-Za-z0-9_]+", "_", arguments.pictures[0].stem).strip("_")
     name = name or "camera"
     with progress_bars() as progress:

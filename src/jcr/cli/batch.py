@@ -22,7 +22,7 @@ class Arguments:
     """Run many captures, each into a folder of its own in OUT, and rank them in OUT/summary.csv and .html.
 
     A capture that fails fails alone. The same command again runs what is missing or has changed. Exit status 3
-    when one or more failed or are not to be trusted.
+    when one or more failed or are rejected.
 
     examples:
       jcr batch captures/* out/all
@@ -60,7 +60,7 @@ def main(arguments: Arguments) -> int:
     doubtful = sum(row.status != "done" for row in rows)
     if doubtful:
         raise NotTrustedError(
-            f"{doubtful} of {len(rows)} captures failed or are not to be trusted; see {out / 'summary.html'}"
+            f"{doubtful} of {len(rows)} captures failed or are rejected; see {out / 'summary.html'}"
         )
     return 0
 

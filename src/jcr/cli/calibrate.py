@@ -27,7 +27,7 @@ class Arguments:
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture, or another format (docs/captures.md)."""
+    """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)

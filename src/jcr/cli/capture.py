@@ -1,4 +1,4 @@
-"""`jcr capture`: a capture taken live, picture by picture, with advice while one works."""
+"""`jcr capture`: a capture taken live, image by image, with advice while one works."""
 
 import os
 import sys
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class Arguments:
     """Collect a capture with a camera and the gripper poses of a robot, and see what is still missing.
 
-    Each picture is taken when the arm rests, and kept when it is sharp and still; OUT/live.html shows the
-    pictures, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command goes on.
+    Each image is taken when the arm rests, and kept when it is sharp and still; OUT/live.html shows the
+    images, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command resumes.
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -45,19 +45,19 @@ class Arguments:
     optics: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
     """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
-    hand), or tcp (a program sends them, docs/capture.md)."""
+    hand), or tcp (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
-    """How poses are typed, and how the next pose is told; auto: as the arm writes them."""
+    """How poses are typed, and how the next pose is printed; auto: as the arm writes them."""
     pose_units: UnitsName = "auto"
-    """Units of typed and told poses; auto: those of the convention."""
+    """Units of typed and printed poses; auto: those of the convention."""
     robot: RobotName | None = None
-    """The arm: the next pose is told as joint angles too, within its limits."""
+    """The arm: the next pose is printed as joint angles too, within its limits."""
     listen: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "127.0.0.1:7464"
     """With tcp: address and port to listen on; any but this machine's own needs a token."""
     token: str | None = None
     """With tcp: what the client must send first; better given as JCR_TOKEN, which other users do not see."""
     timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
-    """With tcp: end when no pose came for so many seconds."""
+    """With tcp: end when no pose came for this many seconds."""
     intrinsics_from: Path | None = None
     """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else those that the camera
     stores (RealSense), else estimated."""
@@ -66,7 +66,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Collect until there are enough pictures."""
+    """Collect until there are enough images."""
     from jcr.live.camera import opened
     from jcr.live.collect import collect
     from jcr.live.folder import LiveFolder
@@ -80,13 +80,11 @@ def main(arguments: Arguments) -> int:
     lens = _lens(arguments.intrinsics_from)
     with opened(arguments.camera, arguments.optics) as camera:
         live = LiveFolder(arguments.out, lens or camera.intrinsics, arguments.robot)
-        _say(
-            f"{len(live.names)} pictures in {arguments.out}; watch {arguments.out / 'live.html'} in a browser"
-        )
+        _say(f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
         collect(live, camera, _asks(arguments), arguments.collect, tell, _words(arguments, live))
-    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command goes on"
+    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command resumes"
     arguments.output.result(
-        f"{len(live.names)} pictures in {arguments.out}{more}; next: jcr check {arguments.out}\n",
+        f"{len(live.names)} images in {arguments.out}{more}; next: jcr check {arguments.out}\n",
         {"capture": str(arguments.out), "images": live.names, "answers": answers},
     )
     return 0
@@ -115,7 +113,7 @@ def _asks(arguments: Arguments) -> "Iterator[Ask]":
             _say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
     elif kind in _SPOKEN and address:
-        _say(f"move the arm; a picture is taken whenever it rests ({address})")
+        _say(f"move the arm; an image is taken whenever it rests ({address})")
         if kind == "ur":
             host, port = _address(address, 30003, "--poses ur:")
             yield from asks_at_rest(lambda: ur.states(host, port))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Arguments:
     """Judge a capture: files, units, motion, observability, convention of the poses, what to add.
 
-    Exit status 3 when a calibration of it would not be trusted, with the reason and the cure.
+    Exit status 3 when a calibration of it would be rejected, with the reason and the remedy.
 
     examples:
       jcr check captures/table
@@ -31,10 +31,10 @@ class Arguments:
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture, or another format (docs/captures.md)."""
+    """Folder of the capture, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     suggest: int = 0
-    """Propose so many gripper poses that would shrink the uncertainty most."""
+    """Propose this many gripper poses that would shrink the uncertainty most."""
     poses_only: bool = False
     """Look at no features: files, units and motion alone."""
     thorough: bool = False
@@ -88,7 +88,7 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     turn = np.degrees(found.largest_turn_rad)
     lines = [
         _as_read(capture),
-        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and turns by up to {turn:.0f}°",
+        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {turn:.0f}°",
         f"expected uncertainty: {_std(found.expected_std)}",
     ]
     if found.hand_eye is not None:

@@ -20,7 +20,7 @@ class Argument:
     """What can be completed of one argument."""
 
     flag: str | None
-    """--name; None for one that is told by its place."""
+    """--name; None for one that is given by its place."""
     takes_value: bool
     values: tuple[str, ...]
     """Empty where any value will do: files are offered."""

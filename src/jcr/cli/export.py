@@ -71,7 +71,7 @@ class Arguments:
         tyro.conf.arg(metavar="X Y Z QX QY QZ QW"),
     ] = None
     """Of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL` prints
-    it; by default they share their origin and are turned as REP-103 has it."""
+    it; by default they share their origin and are rotated as REP-103 has it."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Metres, for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None
@@ -97,7 +97,7 @@ class Format:
 
 
 def main(arguments: Arguments) -> int:
-    """Write the file, say where, and warn where the calibration is not to be trusted: exit status 0 or 3."""
+    """Write the file, say where, and warn where the calibration is rejected: exit status 0 or 3."""
     if arguments.format is None:
         lines = "".join(f"{row.name:<14} {row.about}\n" for row in FORMATS)
         arguments.output.result(
@@ -114,7 +114,7 @@ def main(arguments: Arguments) -> int:
         facts["line"] = line
     arguments.output.result(line and line + "\n", facts)
     if run.doubt is not None:
-        raise NotTrustedError(f"not to be trusted, and the file says so: {run.doubt}")
+        raise NotTrustedError(f"rejected, and the file says so: {run.doubt}")
     return 0
 
 
@@ -138,7 +138,7 @@ def _written(arguments: Arguments) -> "tuple[Run, Format, Path]":
             f"{arguments.format}: no such format; choose one of {', '.join(get_args(FormatName))}"
         )
     if arguments.root_from_optical and not arguments.to_root:
-        raise InputError("--root-from-optical: needs --to-root LINK, the link it is told in")
+        raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     run = Run(arguments)
     path = arguments.path or arguments.out / "export" / row.file
     if path.is_dir() and not row.file.endswith("/"):
@@ -156,7 +156,7 @@ class Run:
         self.arguments, self.folder = arguments, RunFolder(arguments.out)
         if self.calibration.parent_from_camera is None:
             raise InputError(
-                f"{arguments.out}: found no calibration to export ({self.doubt}); run it on a mended capture"
+                f"{arguments.out}: found no calibration to export ({self.doubt}); run it on a fixed capture"
             )
 
     @cached_property
@@ -166,7 +166,7 @@ class Run:
 
     @property
     def doubt(self) -> str | None:
-        """Why the calibration is not to be trusted; None when it is."""
+        """Why the calibration is rejected; None when it is."""
         return self.calibration.doubt
 
     @property
@@ -302,7 +302,7 @@ class Run:
 
     @property
     def other_views(self) -> "list[PosedImages]":
-        """The pictures of further cameras that see the scene, in the base frame."""
+        """The images of further cameras that see the scene, in the base frame."""
         from jcr.cell.added import read_added_cameras
         from jcr.export.cell_views import posed_cameras
 

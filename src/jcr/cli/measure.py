@@ -29,7 +29,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Print the sizes; 3 when the calibration they rest on is not to be trusted."""
+    """Print the sizes; 3 when the calibration they rest on is rejected."""
     from jcr.errors import NotTrustedError
     from jcr.pipeline import measure
     from jcr.run_folder import RunFolder
@@ -37,7 +37,7 @@ def main(arguments: Arguments) -> int:
     measured = measure(arguments.out)
     arguments.output.result(table(measured), content(measured))
     if (doubt := RunFolder(arguments.out).calibration().doubt) is not None:
-        raise NotTrustedError(f"sizes not to be trusted: {doubt}")
+        raise NotTrustedError(f"sizes rejected: {doubt}")
     return 0
 
 

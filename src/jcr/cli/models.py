@@ -1,5 +1,6 @@
 """`jcr models`: networks and other back ends, their licences, and the weights on this machine; `get` downloads some."""
 
+import re
 import sys
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
@@ -8,6 +9,7 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
+from jcr.pages import pages
 from jcr.progress import progress_bars, silent
 from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
 
@@ -34,7 +36,7 @@ class Arguments:
     revision: str | None = None
     """For get: a commit of the weights (unset: the one that was downloaded first, or the newest)."""
     markdown: bool = False
-    """Print the table of docs/backends.md."""
+    """Print the table of the page `jcr docs backends`."""
     output: Output = field(default_factory=Output)
 
 
@@ -126,10 +128,16 @@ def as_markdown() -> str:
             f"{row.parameters} M" if row.parameters else "",
             f"{row.download_gb:g} GB" if row.download_gb else "",
             row.licence,
-            row.accuracy,
+            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _link(named: re.Match[str]) -> str:
+    """From the page of back ends to the one that a command prints."""
+    file = pages()[named[1]]
+    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
 
 
 def main(arguments: Arguments) -> int:

@@ -25,7 +25,7 @@ class Arguments:
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder of the capture."""
     out: Annotated[Path, tyro.conf.Positional]
-    """npz file to write (docs/predictions.md)."""
+    """npz file to write (jcr docs predictions)."""
     backend: PairBackendName = "dust3r"
     """Whose weights, where --weights names none."""
     weights: str | None = None

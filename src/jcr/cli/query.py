@@ -20,7 +20,7 @@ _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,re
 
 @dataclass(frozen=True)
 class Arguments:
-    """Ask the map of a run about points: occupancy, unknown, distance, its gradient, colour and label.
+    """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
 
     Points are metres in the robot's base frame. Distances are NaN outside of the mapped workspace.
 

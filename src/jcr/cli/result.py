@@ -1,4 +1,4 @@
-"""How a calibration is told on the terminal, the same for every command that ends with one."""
+"""How a calibration is printed on the terminal, the same for every command that ends with one."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -31,10 +31,10 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     for note in content.notes if isinstance(result, RunResult) else ():
         sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
-        raise NotTrustedError(f"not to be trusted: {content.doubt}")
+        raise NotTrustedError(f"rejected: {content.doubt}")
     for camera in () if cameras is None else cameras.cameras:
         if camera.doubt is not None:
-            raise NotTrustedError(f"camera {camera.name} is not to be trusted: {camera.doubt}")
+            raise NotTrustedError(f"camera {camera.name} is rejected: {camera.doubt}")
     if (short := shortfall(content)) is not None:
         if content.requirement is not None and content.requirement.asked:
             raise NotTrustedError(short)

@@ -20,7 +20,7 @@ from jcr.segment.options import SegmentOptions
 class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
-    CAPTURE is a folder with capture.json and images, or any of docs/captures.md: images and a table of poses,
+    CAPTURE is a folder with capture.json and images, or what `jcr docs captures` lists: images and a table of poses,
     bags, LeRobot data sets, COLMAP models … OUT gets calibration.json, reconstruction.npz,
     cloud.ply, map.safetensors, report.html and log.txt. The same command resumes an interrupted run.
 
@@ -33,7 +33,7 @@ class Arguments:
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture, or another format (docs/captures.md)."""
+    """Folder of the capture, or another format (jcr docs captures)."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for the results."""
     read: ReadOptions = field(default_factory=ReadOptions)

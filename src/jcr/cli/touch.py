@@ -59,6 +59,6 @@ def main(arguments: Arguments) -> int:
     if found.p_value < UNLIKELY:
         raise NotTrustedError(
             "the tip and the map are farther apart than the reported uncertainty: check the tip's calibration "
-            "(a constant error), then calibrate the camera anew (jcr run)"
+            "(a constant error), then calibrate the camera again (jcr run)"
         )
     return 0

@@ -34,9 +34,9 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the run that calibrated the camera."""
     capture: Annotated[Path, tyro.conf.Positional]
-    """The new images and their poses: a capture folder, or another format (docs/captures.md)."""
+    """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     camera: str | None = None
-    """A fixed camera of the run, to be held against a picture of the same scene by it, in place of CAPTURE: has it
+    """A fixed camera of the run, to be held against an image of the same scene by it, in place of CAPTURE: has it
     moved?"""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)

@@ -159,7 +159,7 @@ def as_svg(sheet: Sheet) -> str:
 
 
 def as_pdf(sheet: Sheet) -> bytes:
-    """The sheet as a PDF of one page (ISO 32000-1, 7.5 and 8.5); a viewer is told not to scale it when it prints."""
+    """The sheet as a PDF of one page (ISO 32000-1, 7.5 and 8.5); a viewer is asked not to scale it when it prints."""
     width, height = sheet.paper_mm
     # From here on millimetres, y up from the lower left corner.
     lines = [f"{1 / POINT_MM:.10f} 0 0 {1 / POINT_MM:.10f} 0 0 cm"]

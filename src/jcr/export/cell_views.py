@@ -1,4 +1,4 @@
-"""The pictures of a cell's further cameras in the base frame, beside those of the capture's own."""
+"""The images of a cell's further cameras in the base frame, beside those of the capture's own."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ def posed_cameras(
     rows: Int[ndarray, " m"],
     gripper_from_camera: Float[ndarray, "4 4"],
 ) -> list[PosedImages]:
-    """Those of the used pictures of every camera that sees the scene; `views` are the own camera's, at `rows`."""
+    """Those of the used images of every camera that sees the scene; `views` are the own camera's, at `rows`."""
     grippers = dict(zip(rows.tolist(), views.base_from_camera @ inverse(gripper_from_camera), strict=True))
     placed = {camera.name: camera for camera in cameras.cameras}
     out = []

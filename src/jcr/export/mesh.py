@@ -18,7 +18,7 @@ def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:
     """
     vertices, faces, colors = surface_mesh(scene)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
-    axes = {"axes": "the robot's, z up (not turned to glTF's y up)"}
+    axes = {"axes": "the robot's, z up (not rotated to glTF's y up)"}
     exported = trimesh.Scene({"map": mesh}, metadata=provenance.notes | axes).export(file_type="glb")
     assert isinstance(exported, bytes)
     write_bytes(path, exported)

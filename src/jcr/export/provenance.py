@@ -7,7 +7,7 @@ from jcr import __version__
 
 @dataclass(frozen=True)
 class Provenance:
-    """Of which frame a file's numbers are, and why they are not to be trusted, where they are not."""
+    """Whose frame a file's numbers are in, and why they are rejected, where they are not."""
 
     frame: str
     doubt: str | None = None
@@ -19,4 +19,4 @@ class Provenance:
         about = {"frame": self.frame, "unit": "m", "made_by": f"jcr {__version__}"}
         if self.doubt is None:
             return about
-        return about | {"warning": f"NOT TO BE TRUSTED: {' '.join(self.doubt.split())}"}
+        return about | {"warning": f"REJECTED: {' '.join(self.doubt.split())}"}

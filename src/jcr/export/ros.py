@@ -1,6 +1,6 @@
 """The camera's place on the gripper as ROS tools take it: tf2, URDF, xacro, easy_handeye2, MoveIt, camera_info.
 
-Every text names its frames and units, and says so where the calibration is not to be trusted.
+Every text names its frames and units, and says so where the calibration is rejected.
 """
 
 import re
@@ -41,7 +41,7 @@ class CameraMount:
     base: str = BASE
     """The robot's base, for the formats that ask for it."""
     doubt: str | None = None
-    """Why the calibration is not to be trusted; None when it is."""
+    """Why the calibration is rejected; None when it is."""
 
 
 def camera_mount(
@@ -222,7 +222,7 @@ def joint_offsets(
         "true joint angle = reported + offset; what no pose shows keeps the standard deviation of any joint"
     )
     if doubt is not None:
-        about += f"\n# NOT TO BE TRUSTED: {doubt}"
+        about += f"\n# REJECTED: {doubt}"
     return f"# {about}\n{yaml.safe_dump(content, sort_keys=False)}"
 
 
@@ -264,7 +264,7 @@ def camera_info(mount: CameraMount, lens: Intrinsics) -> str:
 def notes(mount: CameraMount) -> list[str]:
     """What every file says of itself."""
     about = f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"
-    return [about] if mount.doubt is None else [about, f"NOT TO BE TRUSTED: {mount.doubt}"]
+    return [about] if mount.doubt is None else [about, f"REJECTED: {mount.doubt}"]
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:

@@ -1,4 +1,4 @@
-"""A recording for the Rerun viewer: cloud, surface, cameras with their pictures, grippers."""
+"""A recording for the Rerun viewer: cloud, surface, cameras with their images, grippers."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The pictures with their camera poses in the robot's metric frame: for splats, radiance fields and COLMAP."""
+"""The images with their camera poses in the robot's metric frame: for splats, radiance fields and COLMAP."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ from jcr.represent.cloud_ply import write_cloud
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112
-"""The EXIF tag that says how a picture is to be turned."""
+"""The EXIF tag that says how an image is to be rotated."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,10 @@ def write_nerfstudio(
 ) -> None:
     """Write transforms.json, images/ and points.ply (where a splat starts from) into a new folder.
 
-    `others` are pictures of further cameras; every frame then has intrinsics of its own.
+    `others` are images of further cameras; every frame then has intrinsics of its own.
 
-    Cameras are camera-to-world with OpenGL's axes (x right, y up, z backward). nerfstudio turns, shifts and scales
-    the scene unless told not to: `--orientation-method none --center-method none --auto-scale-poses False`.
+    Cameras are camera-to-world with OpenGL's axes (x right, y up, z backward). nerfstudio rotates, shifts and scales
+    the scene unless asked not to: `--orientation-method none --center-method none --auto-scale-poses False`.
     """
     with _new_folder(folder) as made:
         (made / "images").mkdir()
@@ -95,7 +95,7 @@ def write_nerfstudio(
                 for name, base_from_camera in zip(names, one.base_from_camera, strict=True)
             ]
         if len({_nerfstudio_model(lens) for lens in lenses}) > 1:
-            raise InputError("nerfstudio has one kind of lens for all cameras; export with --undistort")
+            raise InputError("nerfstudio has one kind of distortion for all cameras; export with --undistort")
         content = {
             "camera_model": _nerfstudio_model(lenses[0]),
             **_nerfstudio_lens(lenses[0]),
@@ -139,7 +139,7 @@ def write_colmap(
 ) -> None:
     """Write images/ and sparse/0, as binary and as text, with every track into a new folder.
 
-    `others` are pictures of further cameras, which see no tracks.
+    `others` are images of further cameras, which see no tracks.
     """
     with _new_folder(folder) as made:
         (made / "images").mkdir()
@@ -243,7 +243,7 @@ def _undistorted_px(
 def _place_images(
     folder: Path, views: PosedImages, undistorted: bool, link: bool
 ) -> tuple[list[str], Intrinsics]:
-    """Copy, link or undistort the images into a folder; their names there, and the lens that then holds."""
+    """Copy, link or undistort the images into a folder; their names there, and the intrinsics that then hold."""
     folder.mkdir(exist_ok=True)
     names = [Path(image).name for image in views.images]
     if len(set(names)) < len(names):

@@ -1,6 +1,6 @@
 """The map's space as planners load it: OctoMap, a voxel grid of distances, spheres.
 
-All ask the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
+All query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
 """
 
 from pathlib import Path

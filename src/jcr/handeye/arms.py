@@ -190,7 +190,7 @@ def _from_origins(
     limits: Sequence[tuple[float, float]],
     rest: Sequence[float],
 ) -> Arm:
-    """An arm whose joints turn about z, from x, y, z, roll, pitch, yaw of each joint as a URDF has them."""
+    """An arm whose joints rotate about z, from x, y, z, roll, pitch, yaw of each joint as a URDF has them."""
     rows = np.array(origins)
     frames = transform(Rotation.from_euler("xyz", rows[:, 3:]).as_matrix(), rows[:, :3])
     axes = np.tile([0.0, 0.0, 1.0], (len(rows), 1))

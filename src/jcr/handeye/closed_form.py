@@ -3,7 +3,7 @@
 For every image `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`. Summing the squared
 differences of this equation over all pairs of images is the same as summing over images with
 `base_from_recon` free, so all n(n-1)/2 motions are used at the cost of n. No rotation's logarithm is taken, so
-that half turns are like any other.
+that rotations by 180° are like any other.
 """
 
 import numpy as np
@@ -76,9 +76,10 @@ def rotations(
 ) -> tuple[Rotations, Rotations]:
     """R_X and the rotation of base_from_recon (...,3,3) from R_G · R_X = R_Z · R_C.
 
-    Park and Martin's sum over pairs (1994), on sine-weighted axes instead of logarithms. Where a motion is near a half
-    turn, and its sine small, another solution competes: the equation is linear in R_X and R_Z, and the leading singular
-    pair of Σ w R_C ⊗ R_G solves it (Shah 2013); alone it is ambiguous where all motions are half turns.
+    Park and Martin's sum over pairs (1994), on sine-weighted axes instead of logarithms. Where a motion is near a
+    rotation by
+    180°, and its sine small, another solution competes: the equation is linear in R_X and R_Z, and the leading singular
+    pair of Σ w R_C ⊗ R_G solves it (Shah 2013); alone it is ambiguous where all motions are rotations by 180°.
     """
     batch, n = weights.shape[:-1], weights.shape[-1]
     gripper, camera, weights = (

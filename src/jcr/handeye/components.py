@@ -147,7 +147,7 @@ class Solution:
 
     @property
     def gain(self) -> Float[ndarray, "*k p s"]:
-        """By which errors of the residuals pass into the unknowns, with the sign turned: C JᵀV⁻¹."""
+        """By which errors of the residuals pass into the unknowns, with the sign reversed: C JᵀV⁻¹."""
         return over(self.information_root, np.swapaxes(self.weighed, -1, -2))
 
     @property

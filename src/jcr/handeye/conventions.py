@@ -1,4 +1,4 @@
-"""The convention detective: gripper poses that do not fit the pictures, read in other ways people write them.
+"""Pose-convention diagnosis: gripper poses that do not fit the images, read in other ways people write them.
 
 Readings are ranked by screw congruence (a gripper's rotation between two images has the angle of its
 camera's), and the best of them solved. Nothing is ever applied: a reading that fits is named.
@@ -21,15 +21,15 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.least_squares import minimise
 
 SOLVED = 24
-"""At most so many readings are solved in full, the most congruent ones."""
+"""At most this many readings are solved in full, the most congruent ones."""
 SAME_ANGLE = np.radians(0.1)
 """Relabelled axes keep every angle: among readings this alike, the usual mistakes are solved first."""
 FITS = 3.0
-"""mm; poses that agree with the pictures to this need no other reading."""
+"""mm; poses that agree with the images to this need no other reading."""
 CONGRUENT = np.radians(1.5)
 """Readings whose angles miss the cameras' by less than this are worth solving."""
 BETTER = 3.0
-"""A reading is named when it fits so many times better than the poses as given."""
+"""A reading is named when it fits this many times better than the poses as given."""
 ROUGHLY = 2.0
 """A closed form tells how well a reading fits to this factor."""
 MIN_SHARE = 0.8
@@ -201,7 +201,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
 
 
 def _vectors_taken_as_radians(base_from_gripper: Poses, camera_angle: Float[ndarray, "n n"]) -> _Candidate:
-    """Rotation vectors in degrees that were taken as radians: whole turns were lost, and are found again.
+    """Rotation vectors in degrees that were taken as radians: whole rotations were lost, and are found again.
 
     Each image leaves some sixty angles; those of two images that are congruent decide the others.
     """

@@ -1,7 +1,7 @@
 """The hand-eye equation of one image as residuals with Jacobians, and what its pose tells of the unknowns.
 
 `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`: the information of a pose depends on where it
-is and not on what its picture shows, so poses can be chosen before any picture is looked at.
+is and not on what its image shows, so poses can be chosen before any image is looked at.
 """
 
 import numpy as np
@@ -78,7 +78,7 @@ def residuals_by_camera(
 def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"], noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:
-    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its picture shows."""
+    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its image shows."""
     # Any frame and unit of the reconstruction will do: the base's, in metres.
     camera = base_from_gripper @ gripper_from_camera
     _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)

@@ -8,7 +8,7 @@ hand. Working with images instead of motions keeps the random errors independent
 order.
 
 Camera poses are taken as exact beside the robot's, unless their joint covariance is given: then both errors count
-(generalised least squares), which is what kinematic alignment does, to first order and with the robot's noise
+(generalised least squares), which is what kinematic alignment does, to first order and with the robot pose noise
 estimated. Few images, or a robot better than the cameras, need it.
 """
 

@@ -174,7 +174,7 @@ def _missed(
 
 
 def _starts(arm: Arm, n: int, rng: np.random.Generator) -> Float[ndarray, "n s dof"]:
-    """The rest posture, and random angles within the limits (within the middle turn of wider ones)."""
+    """The rest posture, and random angles within the limits (within the middle rotation of wider ones)."""
     middle = arm.limits.mean(1)
     half = np.minimum(np.diff(arm.limits)[:, 0] / 2, np.pi)
     starts = middle + half * rng.uniform(-1, 1, (n, STARTS, arm.dof))
@@ -205,7 +205,7 @@ def _path(arm: Arm, found: Float[ndarray, "n s dof"], missed: Float[ndarray, "n 
 def _change(
     arm: Arm, a: Float[ndarray, "... dof"], b: Float[ndarray, "... dof"]
 ) -> Float[ndarray, "... dof"]:
-    """Change from angles a to b, the shorter way where the joint has a full turn."""
+    """Change from angles a to b, the shorter way where the joint has a full rotation."""
     return np.where(np.diff(arm.limits)[:, 0] >= 2 * np.pi, unwrapped(b - a), b - a)
 
 

@@ -1,4 +1,4 @@
-"""Which joints of an arm seem off: the systematic part of the residuals, told apart by the arm's own geometry."""
+"""Which joints of an arm seem off: the systematic part of the residuals, separated by the arm's own geometry."""
 
 import numpy as np
 from scipy.linalg import cho_solve

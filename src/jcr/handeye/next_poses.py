@@ -1,4 +1,4 @@
-"""Which gripper poses to add: those that shrink the reported standard deviations most, before any picture.
+"""Which gripper poses to add: those that shrink the reported standard deviations most, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
 the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design).
@@ -84,7 +84,7 @@ def looked_at(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]
 
 
 def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-    """The rotations with their z axis brought onto a direction by the shortest turn."""
+    """The rotations with their z axis brought onto a direction by the shortest rotation."""
     z, goal = rotation[:, :, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True)
     cross = np.cross(z, goal)
     sine = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Which parts of the calibration the motions can see, in words, with the cure.
+"""Which parts of the calibration the motions can see, in words, with the remedy.
 
 The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
 the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
@@ -56,13 +56,13 @@ def observability(
     recon_from_camera: Poses | None = None,
     cues: Cues | None = None,
 ) -> Observability:
-    """The unseen directions named, one cure each; camera poses, if given, tell an orbit from a fixed tool."""
+    """The unseen directions named, one remedy each; camera poses, if given, tell an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
         return Observability(
             False,
-            ("offset along, and turn about, the one axis that two images share",),
-            ("add one image or more, turned by 20° or more about another axis",),
+            ("translation along, and rotation about, the one axis that two images share",),
+            ("add one image or more, rotated by 20° or more about another axis",),
         )
     found = excitation(base_from_gripper, gripper_from_camera, cues)
     # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
@@ -76,7 +76,7 @@ def observability(
 
 
 Words = tuple[tuple[str, ...], tuple[str, ...]]
-"""Names of what is unseen, and cures."""
+"""Names of what is unseen, and remedies."""
 
 
 def _explain(
@@ -89,7 +89,7 @@ def _explain(
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():
-        return ("offset of the camera in x, y and z: the gripper never rotates (pure translation)",), (
+        return ("translation of the camera in x, y and z: the gripper never rotates (pure translation)",), (
             "tilt the wrist by 20° or more, about two different axes, in at least three images",
         )
     loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
@@ -103,7 +103,7 @@ def _explain(
         names = (
             f"offset along {axis}: all rotations are about it (one fixed axis)",
             "scale: the camera moves on circles about one axis only",
-            f"turn of the camera about {axis}",
+            f"rotation of the camera about {axis}",
         )
         return names[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height as well")
     if loses_scale:
@@ -113,7 +113,7 @@ def _explain(
         (("offset", weakest[:3]), ("turn", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
     )
     return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
-        "turn the wrist more, about axes at right angles to each other, in three or more images",
+        "rotate the wrist more, about axes at right angles to each other, in three or more images",
     )
 
 
@@ -122,19 +122,19 @@ def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Wo
     tool = ", ".join(f"{1e3 * x:.0f}" for x in still_point(base_from_gripper)[0])
     nearer = "take two or more images 20 % nearer to or farther from the point you look at"
     if recon_from_camera is None:
-        return (f"scale: all views turn about the one point ({tool}) mm in the gripper frame",), (nearer,)
+        return (f"scale: all views rotate about the one point ({tool}) mm in the gripper frame",), (nearer,)
     # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
     in_camera, moves, spread = still_point(recon_from_camera)
     if moves > 0.5 * spread:
-        return ("scale: the camera only turns about its own centre",), (
+        return ("scale: the camera only rotates about its own centre",), (
             "move the camera sideways by 10 cm or more between images",
         )
     if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
         return (
-            "scale and the offset along the optical axis: all views turn about one point on it "
+            "scale and the translation along the optical axis: all views rotate about one point on it "
             "(look-at orbit at a constant radius)",
         ), (nearer,)
-    return (f"scale: all views turn about one tool point fixed at ({tool}) mm in the gripper frame",), (
+    return (f"scale: all views rotate about one tool point fixed at ({tool}) mm in the gripper frame",), (
         "move that point too: take two or more images with it 10 cm away from where it was",
     )
 

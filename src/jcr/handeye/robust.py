@@ -1,6 +1,6 @@
 """Which images to believe: a stale or shuffled gripper pose spoils one image, not one motion.
 
-Candidates come from triples of images whose motions are congruent (a rotation and its conjugate turn by the
+Candidates come from triples of images whose motions are congruent (a rotation and its conjugate rotate by the
 same angle, whatever X is: the screw congruence of Chen 1991). The candidate with the least trimmed squares
 over images (Rousseeuw 1984) starts a maximum-likelihood fit, which images join as long as the evidence grows:
 the density of all residuals, averaged over what is unknown, where those of wrong poses may be of any size
@@ -198,7 +198,7 @@ def _squared_error(
 
 
 def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"]) -> Int[ndarray, "h 3"]:
-    """Triples of images whose three motions turn by the same angle in gripper and camera, best first."""
+    """Triples of images whose three motions rotate by the same angle in gripper and camera, best first."""
     n = len(a)
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
     i, j, k = np.array(list(combinations(range(n), 3))).T

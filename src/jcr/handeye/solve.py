@@ -1,4 +1,4 @@
-"""From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, held-out error."""
+"""From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, leave-one-out error."""
 
 from dataclasses import replace
 
@@ -19,14 +19,14 @@ from jcr.handeye.systematic import systematic_errors
 from jcr.records import HandEye, HeldOut, RobotNoise
 
 MAX_NOISE = (0.02, np.radians(3.0))
-"""m, rad: worse than the worst servo arm; poses and pictures then do not belong together."""
+"""m, rad: worse than the worst servo arm; poses and images then do not belong together."""
 MAX_STD = (0.02, np.radians(3.0), 0.05)
 """m, rad, relative scale: an answer less certain than this is none."""
 MIN_SHARE_USED = 0.6
 SCALE_STD = 0.002
 """Relative; of a printed marker's size."""
 FEW = 5
-"""Images, below which a wrong one cannot be outvoted and the robot's noise is hardly known."""
+"""Images, below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
 SURPRISE = 1.5
 """Times the robot noise that was given; more is worth saying."""
 
@@ -60,7 +60,7 @@ def solve_hand_eye(
     it the scale is found.
 
     Raises InputError on shapes, values or counts that cannot be poses, and on poses or angles that are not of the robot;
-    motion that shows too little is an answer (`observability`, `converged`), not an exception.
+    degenerate motion is an answer (`observability`, `converged`), not an exception.
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
@@ -132,7 +132,7 @@ def judged(hand_eye: HandEye) -> HandEye:
 
 
 def _doubts(hand_eye: HandEye):
-    """Reasons not to trust the answer, worst first, each with its cure."""
+    """Reasons not to trust the answer, worst first, each with its remedy."""
     for name, cure in zip(hand_eye.observability.unobservable, hand_eye.observability.advice, strict=False):
         yield f"the motions do not show the {name}; {cure}"
     used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
@@ -146,14 +146,14 @@ def _doubts(hand_eye: HandEye):
     metres, radians = noise.together
     if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
         yield (
-            f"gripper poses and pictures disagree by {1e3 * metres:.0f} mm and "
+            f"gripper poses and images disagree by {1e3 * metres:.0f} mm and "
             f"{np.degrees(radians):.1f}° per axis; check the pairing and the convention of the poses "
             "(jcr check)"
         )
     if hand_eye.observability.observable:
         std = np.sqrt(np.diag(hand_eye.covariance))
         for value, limit, text in (
-            (std[:3].max(), MAX_STD[0], f"the offset is known to ±{1e3 * std[:3].max():.0f} mm only"),
+            (std[:3].max(), MAX_STD[0], f"the translation is known to ±{1e3 * std[:3].max():.0f} mm only"),
             (
                 std[3:6].max(),
                 MAX_STD[1],
@@ -165,7 +165,7 @@ def _doubts(hand_eye: HandEye):
                 # Of few images half the uncertainty may be that the robot's noise is hardly known.
                 tell = ", or say how well the robot repeats (--robot-noise MM DEG)"
                 unknown = noise.given is None and used < FEW
-                yield f"{text}; add images, turned by 20° or more about different axes{tell if unknown else ''}"
+                yield f"{text}; add images, rotated by 20° or more about different axes{tell if unknown else ''}"
 
 
 def _remarks(hand_eye: HandEye):
@@ -176,7 +176,7 @@ def _remarks(hand_eye: HandEye):
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
         yield (
-            f"gripper poses and pictures disagree by {1e3 * metres:.2g} mm and "
+            f"gripper poses and images disagree by {1e3 * metres:.2g} mm and "
             f"{np.degrees(radians):.2g}° per axis, more than the robot noise that was given "
             f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
         )
@@ -185,7 +185,7 @@ def _remarks(hand_eye: HandEye):
         typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.together[0]
         if held_out.translation_mm > max(3 * typical, 2.0):
             yield (
-                f"images left out are missed by {held_out.translation_mm:.1f} mm though the fit's residual "
+                f"the leave-one-out error is {held_out.translation_mm:.1f} mm though the fit's residual "
                 f"is {typical:.1f} mm: too few images for this motion; add some"
             )
     if len(hand_eye.inliers) < FEW:
@@ -235,7 +235,7 @@ def _checked_arm(
 ) -> tuple[Arm | None, Joints | None]:
     if robot is None:
         if joints is not None:
-            raise InputError("joints: of which robot? name it (robot=), or leave the joint angles out")
+            raise InputError("joints: which robot? name it (robot=), or leave the joint angles out")
         return None, None
     arm = arm_named(robot) if isinstance(robot, str) else robot
     if joints is None:

@@ -61,7 +61,7 @@ def smooth_errors(base_from_gripper: Poses) -> Float[ndarray, "s s"]:
     """Covariance (6n,6n) of errors that vary smoothly over gripper poses, where they are 1 rad per axis and REACH m.
 
     A Gaussian random field over poses, of steps of geometry.retract: half of an error keeps its direction in the
-    base, half of it turns with the gripper.
+    base, half of it rotates with the gripper.
     """
     n = len(base_from_gripper)
     rotation, position = base_from_gripper[:, :3, :3], base_from_gripper[:, :3, 3]

@@ -1,4 +1,4 @@
-"""Where gripper poses come from while a capture is taken: each is a request to take a picture there, now."""
+"""Where gripper poses come from while a capture is taken: each is a request to take an image there, now."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,13 +18,13 @@ Answer = dict[str, Any]
 
 @dataclass(frozen=True)
 class Ask:
-    """The gripper rests here: take a picture."""
+    """The gripper rests here: take an image."""
 
     base_from_gripper: Float[ndarray, "4 4"]
     answer: Callable[[Answer], None] = field(default=lambda answer: None)
-    """Told what came of it, by whoever asked and can listen."""
+    """Gets what came of it, for whoever asked and can listen."""
     current: Callable[[], Float[ndarray, "4 4"]] | None = None
-    """Reads the pose once more after the picture; None where whoever asked vouches for it."""
+    """Reads the pose once more after the image; None where whoever asked vouches for it."""
     joints: Float[ndarray, " dof"] | None = None
     """Joint angles (rad) at rest, where the arm tells them."""
 

@@ -1,4 +1,4 @@
-"""Pictures from a camera while it runs: a V4L2 index, a stream, a RealSense, or a video file in its place."""
+"""Images from a camera while it runs: a V4L2 index, a stream, a RealSense, or a video file in its place."""
 
 import os
 import threading
@@ -16,14 +16,14 @@ from numpy import ndarray
 from jcr.errors import InputError
 
 TIMEOUT_S = 10.0
-"""Without a picture for so long, a camera is gone."""
+"""Without an image for so long, a camera is gone."""
 REALSENSE = "realsense"
 V4L2_MANUAL_EXPOSURE = 1
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What a camera keeps to while pictures are taken."""
+    """What a camera keeps to while images are taken."""
 
     camera_size: tuple[int, int] | None = None
     """Resolution in pixels, WIDTH HEIGHT; unset: what the camera gives (a RealSense: 1280 720)."""
@@ -35,7 +35,7 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture and when it was taken, on a clock of the camera's own."""
+    """One image and when it was taken, on a clock of the camera's own."""
 
     image: UInt8[ndarray, "h w 3"]
     """RGB."""
@@ -81,8 +81,8 @@ class Newest:
                 frame = self._frame
                 if frame is None or not is_fresh():
                     raise InputError(
-                        f"--camera {self._name}: gives no more pictures; check its cable and start again: the same "
-                        "command goes on where it was"
+                        f"--camera {self._name}: gives no more images; check its cable and start again: the same "
+                        "command resumes"
                     )
             yield frame
 

@@ -1,4 +1,4 @@
-"""Taking a capture: each request for a picture is judged, answered, and kept before the next is heard."""
+"""Taking a capture: each request for an image is judged, answered, and kept before the next is heard."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from jcr.live.page import ENOUGH, Window, write_page
 from jcr.live.rest import REST, farther
 
 SAME_PLACE = (0.005, np.radians(1.0))
-"""m, rad: a second picture from within this adds nothing."""
+"""m, rad: a second image from within this adds nothing."""
 
 
 @dataclass(frozen=True)
 class CollectOptions:
-    """How pictures are taken."""
+    """How images are taken."""
 
     images: int = 12
-    """Stop with so many pictures."""
+    """Stop with this many images."""
     patience: float = 5.0
-    """Seconds to wait for a picture at rest."""
+    """Seconds to wait for an image at rest."""
     reach: Annotated[
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
@@ -46,7 +46,7 @@ def collect(
     tell: Callable[[Answer, list[str]], None],
     words: ArmWords | None = None,
 ) -> None:
-    """Take pictures into the folder until there are enough, or nobody asks any more, or the video ends.
+    """Take images into the folder until there are enough, or nobody asks any more, or the video ends.
 
     `tell` hears each answer, with the lines a person reads, where the next pose is in the arm's own `words`.
     live.html in the folder shows how it goes.
@@ -54,7 +54,7 @@ def collect(
     reach = None if options.reach is None else np.array(options.reach).reshape(2, 3)
     kept = [_as_kept(live, name) for name in live.names]
     found = coverage(live, reach, words)
-    write_page(live, found, f"{len(live.names)} pictures of {options.images}", options.wanted)
+    write_page(live, found, f"{len(live.names)} images of {options.images}", options.wanted)
     frames = iter(camera.frames)
     with Window(live, camera.latest):
         for ask in asks if len(live.names) < options.images else ():
@@ -73,7 +73,7 @@ def collect(
                 found = coverage(live, reach, words)
                 answer = {"accepted": True, "image": name, "done": len(live.names) >= options.images}
                 answer |= as_answer(found)
-                headline = f"{len(live.names)} pictures of {options.images}"
+                headline = f"{len(live.names)} images of {options.images}"
                 lines = [f"kept {name}", *in_words(found)]
             write_page(live, found, headline, options.wanted)
             ask.answer(answer)
@@ -90,7 +90,7 @@ def _taken(
             return f"the gripper is where {name} was taken; move on"
     taken = picture(frames, kept, patience_s)
     if ask.current is not None and farther(ask.base_from_gripper, ask.current(), REST):
-        return "the arm moved while the picture was taken; let it rest"
+        return "the arm moved while the image was taken; let it rest"
     return taken
 
 

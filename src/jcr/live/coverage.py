@@ -1,4 +1,4 @@
-"""What the pictures taken so far will tell, and the pose that adds most; as text and as an answer."""
+"""What the images taken so far will tell, and the pose that adds most; as text and as an answer."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from jcr.live.folder import LiveFolder
 from jcr.records import NextPose
 
 ALTERNATIVES = 6
-"""Proposals of which the first is taken that the arm reaches."""
+"""Proposals; the first that the arm reaches is taken."""
 
 
 @dataclass(frozen=True)
@@ -26,24 +26,24 @@ class Coverage:
     unseen: tuple[str, ...]
     """What the motions do not show yet, in words."""
     expected_std: Float[ndarray, "k 7"]
-    """records.COVARIANCE_ORDER, one sigma expected with the first 3, 4, … pictures."""
+    """records.COVARIANCE_ORDER, one sigma expected with the first 3, 4, … images."""
     next_pose: NextPose | None
     next_joints: Float[ndarray, " dof"] | None
     """rad; None where the arm is not known."""
     like: str | None
-    """The picture nearest to the next pose."""
+    """The image nearest to the next pose."""
     words: ArmWords
 
     @property
     def now(self) -> Float[ndarray, "7"] | None:
-        """One sigma expected with all pictures; None below three."""
+        """One sigma expected with all images; None below three."""
         return self.expected_std[-1] if len(self.expected_std) else None
 
 
 def coverage(
     live: LiveFolder, reach: Float[ndarray, "2 3"] | None = None, words: ArmWords | None = None
 ) -> Coverage:
-    """What the gripper poses in the folder will show, whatever is in the pictures."""
+    """What the gripper poses in the folder will show, whatever is in the images."""
     words = words or ArmWords()
     if len(live.poses) < 2:
         return Coverage(len(live.poses), (), np.zeros((0, 7)), None, None, None, words)
@@ -77,10 +77,10 @@ def _reachable(
 def in_words(found: Coverage) -> list[str]:
     """A line on what is covered, and lines with the next pose."""
     if found.next_pose is None:
-        first = "one picture; " if found.pictures else "no picture yet; "
-        return [first + "turn the wrist by 20° or more, and move, between pictures"]
+        first = "one image; " if found.pictures else "no image yet; "
+        return [first + "rotate the wrist by 20° or more, and move, between images"]
     pose = found.next_pose
-    lines = [f"{found.pictures} pictures" + "".join(f"; not shown yet: {name}" for name in found.unseen)]
+    lines = [f"{found.pictures} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
     if (now := found.now) is not None and not found.unseen:
         offset = ", ".join(f"{1e3 * value:.2g}" for value in now[:3])
         lines[0] += f"; expected ± {offset} mm, scale {100 * now[6]:.2g} %"

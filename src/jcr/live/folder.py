@@ -1,4 +1,4 @@
-"""The capture folder while it grows: whole after every picture, so that stopping loses nothing."""
+"""The capture folder while it grows: whole after every image, so that stopping loses nothing."""
 
 import json
 import re
@@ -22,10 +22,10 @@ THUMBNAIL_PX = 240
 
 
 class LiveFolder:
-    """A capture folder that pictures are added to; what it holds already is kept."""
+    """A capture folder that images are added to; what it holds already is kept."""
 
     def __init__(self, folder: Path, lens: dict[str, Any] | None = None, robot: str | None = None):
-        """Raises InputError when `folder` holds a capture.json that cannot be gone on with."""
+        """Raises InputError when `folder` holds a capture.json that cannot be resumed."""
         self.folder = folder
         self.names: list[str] = []
         self.poses: list[Float[ndarray, "4 4"]] = []
@@ -66,14 +66,14 @@ class LiveFolder:
         joints: Float[ndarray, " dof"] | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
     ) -> str:
-        """Keep a picture (RGB) and its pose, and return the picture's name; capture.json is whole again after.
+        """Keep an image (RGB) and its pose, and return the image's name; capture.json is whole again after.
 
-        `joints` (rad) are kept when all pictures have them.
+        `joints` (rad) are kept when all images have them.
         """
         size = (image.shape[1], image.shape[0])
         if self.size not in (None, size):
             raise InputError(
-                f"{self.folder}: holds pictures of {self.size[0]}x{self.size[1]} pixels, the camera gives "
+                f"{self.folder}: holds images of {self.size[0]}x{self.size[1]} pixels, the camera gives "
                 f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
             )
         if self.lens is not None:
@@ -97,7 +97,7 @@ class LiveFolder:
         return name
 
     def all_joints(self) -> Float[ndarray, "n dof"] | None:
-        """Joint angles (rad) of all pictures, or None where one lacks them."""
+        """Joint angles (rad) of all images, or None where one lacks them."""
         known = [angles for angles in self.joints if angles is not None]
         return np.stack(known) if known and len(known) == len(self.joints) else None
 
@@ -115,7 +115,7 @@ class LiveFolder:
 
     @staticmethod
     def thumbnail(name: str) -> str:
-        """Where the small copy of a picture lies, in the folder."""
+        """Where the small copy of an image lies, in the folder."""
         return f"thumbnails/{Path(name).stem}.jpg"
 
     def _next_number(self) -> int:

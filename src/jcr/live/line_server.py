@@ -1,4 +1,4 @@
-"""Gripper poses over TCP, one JSON object a line, from any program that can open a socket (docs/capture.md).
+"""Gripper poses over TCP, one JSON object a line, from any program that can open a socket (jcr docs capture).
 
 A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) says that the arm rests there now;
 the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.
@@ -173,7 +173,7 @@ def pose_of(message: dict[str, Any]) -> Float[ndarray, "4 4"]:
 
 
 def _answer(client: socket.socket, answer: Answer) -> None:
-    """Send a line; a client that has gone misses it, and the picture is kept all the same."""
+    """Send a line; a client that has gone misses it, and the image is kept all the same."""
     before = client.gettimeout()
     client.settimeout(ANSWER_S)
     try:
@@ -201,8 +201,8 @@ def _refusal(reason: str) -> Answer:
 
 def _silence(listen: Listen) -> InputError:
     return InputError(
-        f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the pictures "
-        "taken are kept and the same command goes on"
+        f"--listen {listen.host}:{listen.port}: nobody sent a pose for {listen.timeout_s:.0f} s; the images "
+        "taken are kept and the same command resumes"
     )
 
 

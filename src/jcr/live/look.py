@@ -12,16 +12,16 @@ from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault
 from jcr.live.camera import Frame
 
 REST_S = 0.2
-"""Two pictures so far apart show whether anything moves."""
+"""Two images so far apart show whether anything moves."""
 STILL = 2.5
-"""Mean grey levels by which pictures at rest differ on a 160 px wide grid: pixel noise of sigma 10 gives 1.9,
+"""Mean grey levels by which images at rest differ on a 160 px wide grid: pixel noise of sigma 10 gives 1.9,
 a shift of one pixel in 640 of a textured tabletop 3."""
 GRID_PX = 160
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that was kept, and what later ones are held against."""
+    """An image that was kept, and what later ones are held against."""
 
     image: UInt8[ndarray, "h w 3"]
     grid: Float32[ndarray, "gh gw"]
@@ -30,14 +30,14 @@ class Picture:
 
 
 def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> Picture | str:
-    """The first picture at rest that can be kept, or after `patience_s` the reason why none could.
+    """The first image at rest that can be kept, or after `patience_s` the reason why none could.
 
     Those `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
     file.
     """
     earlier = next(frames)
     end = earlier.time_s + patience_s
-    reason = "no second picture came"
+    reason = "no second image came"
     while True:
         frame = next(frames)
         if frame.time_s - earlier.time_s < REST_S:
@@ -47,15 +47,13 @@ def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> 
         grey, sharpness = brightness_and_sharpness(frame.image)
         usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
         if np.abs(now - before).mean() > STILL:
-            reason = "the picture moves; let the arm come to rest and nothing move in view"
+            reason = "the image moves; let the arm come to rest and nothing move in view"
         elif (fault := exposure_fault(grey)) is not None:
-            reason = f"the picture is {fault}; change light or exposure"
+            reason = f"the image is {fault}; change light or exposure"
         elif sharpness < BLURRED * usual:
-            reason = f"the picture is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
+            reason = f"the image is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
         elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
-            reason = (
-                "the gripper moved but the picture is as before; is the stream frozen, the camera another?"
-            )
+            reason = "the gripper moved but the image is as before; is the stream frozen, the camera another?"
         else:
             return Picture(frame.image, now, sharpness, frame.depth_mm)
         if frame.time_s > end:

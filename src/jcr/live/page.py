@@ -1,4 +1,4 @@
-"""live.html: the camera's picture now, what the pictures show so far, and the next pose; it renews itself."""
+"""live.html: the camera's image now, what the images show so far, and the next pose; it renews itself."""
 
 import json
 import threading
@@ -24,7 +24,7 @@ STYLE = resources.files("jcr.report") / "page" / "page.css"
 """That of the report, so that both look alike."""
 NOW_PX = 640
 FEW_FEATURES = 150
-"""SIFT features in a picture of NOW_PX below which registration is at risk."""
+"""SIFT features in an image of NOW_PX below which registration is at risk."""
 LOOK_S = 1.0
 WIDTH, HEIGHT = 460.0, 340.0
 SIGHT_M = 0.12
@@ -65,7 +65,7 @@ class Window:
         self.look()
 
     def look(self) -> None:
-        """Write the newest picture, if it is new."""
+        """Write the newest image, if it is new."""
         frame = self._latest()
         if frame is None or frame.time_s == self._shown:
             return
@@ -88,7 +88,7 @@ class Window:
 
 
 def with_features(image: UInt8[ndarray, "h w 3"]) -> tuple[UInt8[ndarray, "h2 w2 3"], int]:
-    """The picture NOW_PX wide with a ring at each SIFT feature, and how many there are."""
+    """The image NOW_PX wide with a ring at each SIFT feature, and how many there are."""
     height = max(1, round(NOW_PX * image.shape[0] / image.shape[1]))
     small = cv2.resize(np.ascontiguousarray(image), (NOW_PX, height), interpolation=cv2.INTER_AREA)
     found = cv2.SIFT.create(2000).detect(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
@@ -106,7 +106,7 @@ def _body(live: LiveFolder, found: Coverage, headline: str, wanted: tuple[float,
         for number, name in reversed(list(enumerate(live.names, 1)))
     )
     lines = "\n".join(escape(line) for line in next_lines(found))
-    next_pose = "<p>Two pictures from different places are needed before a pose is proposed.</p>"
+    next_pose = "<p>Two images from different places are needed before a pose is proposed.</p>"
     if found.next_pose is not None:
         pose = found.next_pose
         next_pose = (
@@ -118,7 +118,7 @@ def _body(live: LiveFolder, found: Coverage, headline: str, wanted: tuple[float,
         f"<p>{escape(first)}</p></section>{_tiles(found, wanted)}"
         f'<div class="pair"><section><h2>Next pose</h2>{next_pose}{_scene(live, found)}</section>'
         f"<section><h2>Expected uncertainty</h2>{_chart(found, wanted)}</section></div>"
-        f'<section><h2>Pictures</h2><div class="thumbnails">{thumbnails or "None yet."}</div></section>'
+        f'<section><h2>Images</h2><div class="thumbnails">{thumbnails or "None yet."}</div></section>'
     )
 
 
@@ -152,9 +152,9 @@ def _tiles(found: Coverage, wanted: tuple[float, float]) -> str:
 
 
 def _chart(found: Coverage, wanted: tuple[float, float]) -> str:
-    """Expected sigma against the number of pictures, both axes of the chart logarithmic in sigma."""
+    """Expected sigma against the number of images, both axes of the chart logarithmic in sigma."""
     if not len(found.expected_std):
-        return "<p>Known from the third picture on.</p>"
+        return "<p>Known from the third image on.</p>"
     left, right, top, bottom = 52.0, 14.0, 16.0, 42.0
     series = dict(zip(("translation", "rotation"), _worst(found.expected_std), strict=True))
     shares = {name: values / want for (name, values), want in zip(series.items(), wanted, strict=True)}
@@ -189,12 +189,12 @@ def _chart(found: Coverage, wanted: tuple[float, float]) -> str:
         parts.append(
             f'<text x="{at(k, 1.0)[0]:.1f}" y="{HEIGHT - bottom + 18:.0f}" class="middle">{k + 3}</text>'
         )
-    parts.append(f'<text x="{WIDTH / 2}" y="{HEIGHT - 6}" class="middle">pictures</text>')
+    parts.append(f'<text x="{WIDTH / 2}" y="{HEIGHT - 6}" class="middle">images</text>')
     legend = "".join(
         f'<span><span class="key {name}"></span>{name}, worst axis: {values[-1]:.2g} {unit}</span>'
         for (name, values), unit in zip(series.items(), ("mm", "°"), strict=True)
     )
-    label = "Expected one-sigma uncertainty as a multiple of what is wanted, against the number of pictures"
+    label = "Expected one-sigma uncertainty as a multiple of what is wanted, against the number of images"
     return f'{_svg(parts, label)}<div class="legend">{legend}</div><p class="soft">{label}; logarithmic.</p>'
 
 
@@ -254,9 +254,7 @@ def _scene(live: LiveFolder, found: Coverage) -> str:
         '<span><span class="key ghost"></span>next pose</span><span>axes of the base, grid 0.1 m</span>'
         "<span>a pyramid opens along the gripper's z axis</span>"
     )
-    return (
-        f'{_svg(parts, "Gripper poses of the pictures, and the next one")}<div class="legend">{legend}</div>'
-    )
+    return f'{_svg(parts, "Gripper poses of the images, and the next one")}<div class="legend">{legend}</div>'
 
 
 def _svg(parts: list[str], label: str) -> str:

@@ -1,4 +1,4 @@
-"""An Intel RealSense: pictures, depth aligned with them, and the intrinsics that its maker stored; with pyrealsense2."""
+"""An Intel RealSense: images, depth aligned with them, and the intrinsics that its maker stored; with pyrealsense2."""
 
 import time
 from collections.abc import Iterator

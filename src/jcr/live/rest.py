@@ -1,4 +1,4 @@
-"""An arm that is watched: a request for a picture whenever it has come to rest in a new place."""
+"""An arm that is watched: a request for an image whenever it has come to rest in a new place."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ REST_S = 0.5
 REST = (2e-4, np.radians(0.03))
 """m, rad: an arm that stays within this for REST_S is at rest."""
 MOVED_ON = (0.01, np.radians(3.0))
-"""m, rad: as far as this from the last picture, rest asks for the next one."""
+"""m, rad: as far as this from the last image, rest asks for the next one."""
 TRY_AGAIN = (1e-3, np.radians(0.2))
 """m, rad: as far as this from a pose that was refused, likewise."""
 

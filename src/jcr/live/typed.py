@@ -10,7 +10,7 @@ from jcr.errors import InputError
 from jcr.live.asks import Ask
 
 BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16: "matrix"}
-"""What so many numbers are, where no convention was given."""
+"""What this many numbers are, where no convention was given."""
 
 
 def typed_poses(

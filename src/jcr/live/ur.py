@@ -56,7 +56,7 @@ def _state(head: bytes, read: Callable[[int], bytes], where: str) -> State:
         )
     packet = head + read(length - 4)
     if len(packet) < length:
-        raise InputError(f"{where}: the connection broke; the same command goes on")
+        raise InputError(f"{where}: the connection broke; the same command resumes")
     offset = TOOL_VECTOR_BEFORE if length in BEFORE_3_0 else TOOL_VECTOR_SINCE_3_0
     tool = struct.unpack_from("!6d", packet, offset)
     joints = np.array(struct.unpack_from("!6d", packet, JOINTS))

@@ -39,7 +39,7 @@ def states(host: str) -> Iterator[State]:
             if code or wrong:
                 raise InputError(
                     f"{where}: the arm answers with code {code or wrong}; look at UFACTORY Studio what it reports; "
-                    "the same command goes on"
+                    "the same command resumes"
                 )
             (base_from_gripper,) = poses_from_numbers(np.array([pose]), "xarm-axis-angle", "mm-rad", where)
             yield State(time.monotonic(), base_from_gripper, np.array(angles[: arm.axis], dtype=np.float64))

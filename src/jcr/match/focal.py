@@ -29,7 +29,7 @@ def focal_by_robot(
     geometries: Iterable[tuple[Key, pycolmap.TwoViewGeometry]],
     motion: Float[ndarray, "n n 4 4"],
 ) -> Intrinsics | None:
-    """An undistorted lens with square pixels and its centre in the middle; None where too few pairs agree on one."""
+    """Undistorted intrinsics with square pixels and its centre in the middle; None where too few pairs agree on one."""
     width, height = size
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     known = [item for item in geometries if angle[item[0]] > math.radians(8)]

@@ -29,7 +29,7 @@ LARGEST_STD = math.radians(3)
 SURE_STD = math.radians(2.5)
 """X's rotation counts as known from here on."""
 UPRIGHT_ENOUGH = math.radians(15)
-"""An image is turned by whole quarters where that leaves no more than this, for it costs no resampling."""
+"""An image is rotated by multiples of 90° where that leaves no more than this, for it costs no resampling."""
 LEAST_PAIRS = 4
 """That must agree about it: three wrong ones can agree by chance."""
 
@@ -157,7 +157,7 @@ def base_from_camera_rotations(
 
 
 def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
-    """Angles (rad) by which images are to be turned about the viewing axis so that none is turned against another.
+    """Angles (rad) by which images are to be rotated about the viewing axis so that none is rotated against another.
 
     The twist of each camera about the mean viewing direction (swing-twist decomposition, Dobrowolski 2015).
     """
@@ -175,7 +175,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
 
 
 def by_quarters(roll: float) -> float:
-    """The angle, or the whole quarters of a turn that are near it; in [0, 2π), to a degree."""
+    """The angle, or the whole multiples of 90° that are near it; in [0, 2π), to a degree."""
     quarters = round(roll / (math.pi / 2)) * math.pi / 2
     nearest = quarters if abs(roll - quarters) <= UPRIGHT_ENOUGH else math.radians(round(math.degrees(roll)))
     return nearest % (2 * math.pi)

@@ -1,6 +1,6 @@
-"""Features by networks, found in images that are turned about the viewing axis first.
+"""Features by networks, found in images that are rotated about the viewing axis first.
 
-The networks are not made for images that are turned against each other.
+The networks are not made for images that are rotated against each other.
 """
 
 import math
@@ -29,21 +29,22 @@ MULTIPLE = 32
 
 @dataclass(frozen=True)
 class _Set:
-    """Keypoints found in an image that was turned."""
+    """Keypoints found in an image that was rotated."""
 
     start: int
     """Row of the first among all keypoints of the image."""
     x_px: Float[Tensor, "k 2"]
-    """In the turned image."""
+    """In the rotated image."""
     descriptor: Float[Tensor, "k d"]
     size: tuple[int, int]
-    """Of the turned image: width, height."""
+    """Of the rotated image: width, height."""
 
 
 class LearnedFeatures:
-    """Keypoints of a capture's images, and a matcher that turns the images as it is told.
+    """Keypoints of a capture's images, and a matcher that rotates the images as asked.
 
-    What the networks find does not turn with the image (of a thousand keypoints chance finds as many again): every angle
+    What the networks find does not rotate with the image (of a thousand keypoints chance finds as many again):
+    every angle
     has keypoints of its own, and `x_px` grows as angles are asked for.
     """
 
@@ -61,7 +62,7 @@ class LearnedFeatures:
         return len(self._images) - 1
 
     def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
-        """Rows of the keypoints of images i and j that match, the images turned by these angles (rad) before."""
+        """Rows of the keypoints of images i and j that match, the images rotated by these angles (rad) before."""
         first, second = self._found(i, roll_i), self._found(j, roll_j)
         with _one_thread():
             early = self._kind == "aliked"  # XFeat's matcher was trained without
@@ -71,7 +72,7 @@ class LearnedFeatures:
         return rows.numpy() + [first.start, second.start]
 
     def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
+        """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
         found = self._found(row, roll)
         return found.start, found.descriptor.numpy()
 
@@ -121,7 +122,7 @@ def _networks(kind: str) -> tuple[xfeat.XFeat | aliked.Aliked, LightGlue]:
 def _prepared(
     image: UInt8[ndarray, "h w 3"], roll: float
 ) -> tuple[Float[Tensor, "3 h2 w2"], Float[ndarray, "3 3"]]:
-    """The image turned, reduced and padded for a network, values in 0..1, and given from prepared pixels."""
+    """The image rotated, reduced and padded for a network, values in 0..1, and given from prepared pixels."""
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     small_size = round(width * scale), round(height * scale)

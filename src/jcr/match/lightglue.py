@@ -129,7 +129,7 @@ class LightGlue(nn.Module):
         return torch.stack([row[mutual], match[mutual]], 1), score[mutual].exp()
 
     def _encoding(self, x_px: Float[Tensor, "k 2"], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Cosine and sine (k, width of a head) by which queries and keys are turned."""
+        """Cosine and sine (k, width of a head) by which queries and keys are rotated."""
         middle = torch.tensor(size) / 2
         phase = self.posenc.Wr((x_px - middle) / middle.max()).repeat_interleave(2, -1)
         return phase.cos(), phase.sin()
@@ -142,6 +142,6 @@ def _feed_forward(width: int) -> nn.Sequential:
 
 
 def _quarter_turn(x: Tensor) -> Tensor:
-    """Neighbouring channels as coordinates of a plane, turned by 90°."""
+    """Neighbouring channels as coordinates of a plane, rotated by 90°."""
     a, b = x.unflatten(-1, (-1, 2)).unbind(-1)
     return torch.stack([-b, a], -1).flatten(-2)

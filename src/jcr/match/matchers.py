@@ -26,7 +26,7 @@ FeatureName = Literal["sift", "xfeat", "aliked"]
 
 
 class SiftMatcher:
-    """SIFT that was extracted into a database; it does not mind how images are turned."""
+    """SIFT that was extracted into a database; it does not mind how images are rotated."""
 
     minds_roll = False
     every_pair = 24
@@ -99,7 +99,7 @@ class LearnedMatcher:
 
     @property
     def x_px(self) -> list[Float[ndarray, "_ 2"]]:
-        """Keypoints found so far, at the working size; more come with every angle by which an image is turned."""
+        """Keypoints found so far, at the working size; more come with every angle by which an image is rotated."""
         return [(x + 0.5) * self._scale - 0.5 for x in self._features.x_px]
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
@@ -120,5 +120,5 @@ class LearnedMatcher:
         return matched(self.x_px, self._camera, *key, rows, self._seed, self._known)
 
     def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint, and unit descriptors from there on, the image turned by an angle (rad)."""
+        """Row of the first keypoint, and unit descriptors from there on, the image rotated by an angle (rad)."""
         return self._features.descriptors(row, roll)

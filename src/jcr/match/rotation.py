@@ -1,6 +1,6 @@
-"""X's rotation from relative rotations of cameras, some of which are wrong: AX = XB over pairs of images.
+"""X's rotation from relative rotations of cameras, some wrong: AX = XB over pairs of images.
 
-Whatever X is, a pair of cameras turns by the angle of its grippers (the screw congruence of Chen 1991), and R_A R_X =
+Whatever X is, a pair of cameras rotates by the angle of its grippers (the screw congruence of Chen 1991), and R_A R_X =
 R_X R_B. Hypotheses come from two pairs each, as in RANSAC; the best is refined on all pairs that agree with it.
 """
 

@@ -1,7 +1,7 @@
 """Which images see the same: matches that the robot checks, for every kind of features.
 
-Pairs that the gripper turns little against each other are matched as they are; those that the robot confirms give X's
-rotation, and with it every image is turned upright before the others are matched. While too few agree, quarter turns
+Pairs that the gripper rotates little against each other are matched as they are; those that the robot confirms give X's
+rotation, and with it every image is rotated upright before the others are matched. While too few agree, rotations by 90°
 are guessed.
 """
 
@@ -34,11 +34,11 @@ Geometries = dict[Key, pycolmap.TwoViewGeometry]
 WORTH_SAYING = 0.1
 """Share of the matched pairs: a few wrong ones are left out of every set."""
 AS_TAKEN = math.radians(50)
-"""Networks match images that are turned against each other by up to this; no rotation is larger than its angle."""
+"""Networks match images that are rotated against each other by up to this; no rotation is larger than its angle."""
 STILL = (5e-3, math.radians(1))
 """m, rad: a gripper that moved by this moves the whole image."""
 GUESSED_AT_ONCE = 6
-"""Pairs whose quarter turns are guessed before the robot is asked again."""
+"""Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
 
 
@@ -53,7 +53,7 @@ class Matcher(Protocol):
 
     @property
     def minds_roll(self) -> bool:
-        """Whether images must be turned upright for it."""
+        """Whether images must be rotated upright for it."""
         ...
 
     @property
@@ -67,15 +67,15 @@ class Matcher(Protocol):
 
     @property
     def every_pair(self) -> int:
-        """Captures of up to so many images have all pairs matched; of more, pairs grow in proportion to the images."""
+        """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
         ...
 
     def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint of an image turned by an angle (rad), and the unit descriptors from there on."""
+        """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
         ...
 
     def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        """Verified two-view geometries of pairs, their images turned (rad) before."""
+        """Verified two-view geometries of pairs, their images rotated (rad) before."""
         ...
 
 
@@ -86,12 +86,12 @@ class Matched:
     geometries: Geometries
     """Those that a mapper may believe."""
     gate: Gate | None
-    """None where the robot had no say."""
+    """None where the robot poses were not used."""
     lens: Intrinsics
     """At the working size: given, or as the robot and the images have it."""
     pairs_tried: int
     upright: Float[ndarray, " n"] | None = None
-    """Angles (rad) by which the images were turned, once X's rotation was known."""
+    """Angles (rad) by which the images were rotated, once X's rotation was known."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     """As those of records.Reconstruction."""
@@ -105,13 +105,13 @@ class _Search:
     motion: Float[ndarray, "n n 4 4"]
     view: View
     known: bool
-    """Whether the lens is given."""
+    """Whether the intrinsics are given."""
     geometries: Geometries = field(default_factory=dict)
     pairs: dict[Key, Pair] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
     tried: set[tuple[int, int, int, int]] = field(default_factory=set)
-    """Pairs, and the angles (degrees) by which their images were turned."""
+    """Pairs, and the angles (degrees) by which their images were rotated."""
 
     @property
     def systematic(self) -> float:
@@ -120,7 +120,7 @@ class _Search:
     def match(
         self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None, guess: float = 0.0
     ) -> None:
-        """Match pairs with images turned by `rolls`, or the second of each by a guess; the better of two is kept."""
+        """Match pairs with images rotated by `rolls`, or the second of each by a guess; the better of two is kept."""
         todo, turns = [], []
         for i, j in pairs:
             turn = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
@@ -234,7 +234,8 @@ def match_with_robot(
     """The pairs of images that match and that the robot does not contradict.
 
     `original` is the size of the images as they were taken, for notes. `lens` is at the working size, and a first guess
-    unless `known`. Where X's rotation cannot be found from the pairs, the robot has no say: its poses may be of another
+    unless `known`. Where X's rotation cannot be found from the pairs, the robot poses are not used: they may be of
+    another
     convention, or too few pairs match.
     """
     n = len(base_from_gripper)
@@ -279,7 +280,7 @@ def match_with_robot(
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
-    """The gate through the lens that is known, or else through the one by which most pairs agree with the robot."""
+    """The gate through the intrinsics that are known, or else through those by which most pairs agree with the robot."""
     if search.known:
         return search.gate()
     size = guess.width, guess.height
@@ -291,7 +292,7 @@ def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
 
 
 def _guessed(search: _Search, pairs: Sequence[Key], angle: Float[ndarray, "n n"], found: Gate) -> Gate:
-    """The gate after quarter turns of further pairs, the least turned first, until X's rotation is known."""
+    """The gate after rotations by 90° of further pairs, the least rotated first, until X's rotation is known."""
     confirmed = {pair.key for pair in found.confirmed}
     left = sorted((key for key in pairs if key not in confirmed), key=lambda key: float(angle[key]))
     for start in range(0, min(len(left), GUESSED_AT_MOST), GUESSED_AT_ONCE):

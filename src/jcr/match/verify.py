@@ -22,7 +22,7 @@ STATIONARY_PX = 4.0
 
 
 def verification(seed: int, known: bool = False) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's options for every pair; `known`: the lens is no guess."""
+    """COLMAP's options for every pair; `known`: the intrinsics are no guess."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     options.min_num_inliers = MIN_INLIERS
@@ -43,7 +43,7 @@ class View:
     lens: Intrinsics
     """Given, or a guess."""
     rays: Sequence[Float[ndarray, "_ 2"]]
-    """x/z, y/z of the keypoints through that lens."""
+    """x/z, y/z of the keypoints through those intrinsics."""
 
     @staticmethod
     def of(x_px: Sequence[Float[ndarray, "_ 2"]], lens: Intrinsics) -> "View":
@@ -89,7 +89,7 @@ def matched(
 
 
 def pair_of(view: View, i: int, j: int, found: pycolmap.TwoViewGeometry) -> Pair:
-    """COLMAP's two-view geometry with its readings through the view's lens."""
+    """COLMAP's two-view geometry with its readings through the view's intrinsics."""
     rows = np.asarray(found.inlier_matches, dtype=int).reshape(-1, 2)
     return view.pair(i, j, rows, *matrices(found, view.lens))
 

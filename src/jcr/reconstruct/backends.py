@@ -20,7 +20,7 @@ CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons
 
 CC_BY_NC = "CC BY-NC 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
-"""Without what the package asks for beside these, numpy below 2 among it, of which its network uses nothing."""
+"""Without what the package asks for beside these, numpy below 2 among it; its network uses none of it."""
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -103,7 +103,7 @@ def _predictions(
 
     if options.predictions is None:
         raise InputError(
-            "--backend predictions: name the file with --predictions FILE.npz (docs/predictions.md)"
+            "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
         )
     return reconstruct(capture, PredictionsOptions(options.predictions, options.memory_gb), progress)
 
@@ -214,7 +214,7 @@ BACKENDS: dict[str, Backend] = {
             auto=True,
             options=("features",),
             selected_by="features",
-            accuracy="0.05 mm and 0.005° on the bundled capture (docs/results/run.md)",
+            accuracy="0.05 mm and 0.005° on the bundled capture (jcr docs results/run)",
         ),
         Backend(
             "da3",
@@ -289,7 +289,7 @@ BACKENDS: dict[str, Backend] = {
             "Apache-2.0",
             auto=True,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
-            "(docs/plain-tables.md)",
+            "(jcr docs plain-tables)",
         ),
         Backend(
             "moge",
@@ -311,7 +311,7 @@ BACKENDS: dict[str, Backend] = {
             metric=True,
             options=("board",),
             selected_by="board",
-            accuracy="0.6 mm and 0.20° from the reference of a real capture (docs/results/real.md)",
+            accuracy="0.6 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
         ),
         Backend(
             "predictions",
@@ -321,7 +321,7 @@ BACKENDS: dict[str, Backend] = {
             options=("predictions",),
             selected_by="predictions",
             keeps_order=True,
-            accuracy="0.95 mm and 0.051° from simulated predictions (docs/results/predictions.md)",
+            accuracy="0.95 mm and 0.051° from simulated predictions (jcr docs results/predictions)",
         ),
         Backend("given", _given, "your reconstruction's", options=("cameras",), selected_by="cameras"),
     )
@@ -330,7 +330,7 @@ BACKENDS: dict[str, Backend] = {
 
 Networks that see pairs, whose uncertainty is known, come first, metric ones before others. COLMAP needs no weights, and
 sees what networks do not. Networks that see all views come after it: refined by colours they are as good where it works,
-and better than direct alignment on plain tables (docs/results/models.md, with simulated predictions), for more time.
+and better than direct alignment on plain tables (jcr docs results/models, with simulated predictions), for more time.
 Direct alignment needs no weights: COLMAP matches what is printed on things, it the colours of plain ones.
 """
 
@@ -381,7 +381,7 @@ class ReconstructOptions:
     """A network's weights, a path or a hub id; unset: the published ones. Under auto they are taken for DUSt3R's or
     MASt3R's."""
     predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A network's output as an npz file (docs/predictions.md); selects the back end predictions."""
+    """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
@@ -465,7 +465,7 @@ def _by_name(capture: Capture) -> Int[ndarray, " n"]:
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
-    """The reconstruction with its images in the capture's own order, of which row k was taken as order[k]."""
+    """The reconstruction with its images in the capture's own order; row k was taken as order[k]."""
     image_index = order[reconstruction.image_index]
     rows = np.argsort(image_index)
     row_of = np.argsort(rows)

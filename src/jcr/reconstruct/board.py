@@ -128,7 +128,7 @@ def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarra
     across, down = count
     if (across + down) % 2 == 0:
         raise ValueError(
-            f"a chessboard of {across}x{down} inner corners looks the same after half a turn; use one with an "
+            f"a chessboard of {across}x{down} inner corners looks the same after a rotation by 180°; use one with an "
             "odd and an even side"
         )
     x_in_board = _grid(across, down) * square

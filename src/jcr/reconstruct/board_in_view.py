@@ -96,5 +96,5 @@ def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
         return None
     lengths = "SIDE of a square and MARKER" if "MARKER" in spec else "SIDE"
     return (
-        f"a calibration board is in view: try --board {spec} with its {lengths} in metres (docs/markers.md)"
+        f"a calibration board is in view: try --board {spec} with its {lengths} in metres (jcr docs markers)"
     )

@@ -91,7 +91,7 @@ def _triangulated(
     options: ColmapOptions,
     report: Progress,
 ) -> Tracks:
-    """Points of matched features, with lens and cameras held."""
+    """Points of matched features, with intrinsics and cameras held."""
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = extract(database, images, [lens], True, options.working_size_px, report, options.memory_gb)

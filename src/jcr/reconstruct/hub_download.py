@@ -2,7 +2,7 @@
 
 Where files lie, HF_ENDPOINT (a mirror), HF_TOKEN and HF_HOME are as the hub's own client has them, HTTPS_PROXY as
 everywhere. What comes first lies in a folder beside the cache, from where an interrupted download is resumed to the
-byte (the client's own starts anew: it writes in pieces of 10 MB and keeps none of a broken one); it is moved into the
+byte (the client's own starts again: it writes in pieces of 10 MB and keeps none of a broken one); it is moved into the
 cache when size and checksum are those that the hub publishes for the revision. The revision and the sums are kept
 beside the cache and hold from then on: a file that changes under its name is refused.
 """

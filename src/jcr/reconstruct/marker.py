@@ -30,7 +30,7 @@ WORST_PX = 3.0
 AMBIGUOUS = 1.5
 """A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
 LENS_IMAGES = 4
-"""Fewest images of a board that determine a lens."""
+"""Fewest images of a board that determine intrinsics."""
 RISE = 0.4
 """Share of a camera's distance to the board that things beside it may rise towards the camera."""
 
@@ -70,9 +70,7 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     notes += lens_notes
     if (fold_px := fold_distance_px(lens)) is not None:
         seen = [_within(sightings, lens, fold_px) for sightings in seen]
-        notes.append(
-            f"the lens distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used"
-        )
+        notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
     poses = [{s.body: pose for s in sightings if (pose := _pose(s, lens))} for sightings in seen]
     recon_from_camera, recon_from_body = _placed(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
@@ -108,7 +106,7 @@ def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) ->
     if images < LENS_IMAGES:
         raise NotTrustedError(
             f"{images} of {len(capture)} images show {board.name}, {LENS_IMAGES} are needed to find the unknown "
-            "lens from it; check the board's kind and size, or give the intrinsics"
+            "intrinsics from it; check the board's kind and size, or give the intrinsics"
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(
@@ -124,7 +122,9 @@ def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) ->
     lens = Intrinsics(
         float(fx), float(fy), float(cx), float(cy), *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)
     )
-    return lens, [f"the lens comes from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"]
+    return lens, [
+        f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
+    ]
 
 
 def _within(sightings: Sequence[Sighting], lens: Intrinsics, fold_px: float) -> list[Sighting]:

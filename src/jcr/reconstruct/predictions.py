@@ -1,4 +1,4 @@
-"""The `predictions` back end: bring the output of any network as one npz file (docs/predictions.md).
+"""The `predictions` back end: bring the output of any network as one npz file (jcr docs predictions).
 
 Either pairwise pointmaps, which are aligned here, or pointmaps that share one frame, with camera poses.
 """
@@ -66,7 +66,7 @@ def reconstruct(
         return _from_pointmaps(capture, arrays, source)
     raise InputError(
         f"{source}: holds neither 'edges' with pairwise pointmaps nor 'recon_from_camera' with pointmaps; "
-        "see docs/predictions.md"
+        "see jcr docs predictions"
     )
 
 
@@ -144,7 +144,7 @@ def _images(
         lens = pinhole = None
         warnings += (
             f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
-            "lens is estimated as a pinhole",
+            "intrinsics are estimated as a pinhole",
         )
     else:
         pinhole = lens

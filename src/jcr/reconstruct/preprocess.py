@@ -110,7 +110,7 @@ class PreparedImages:
         return None if self.pinhole is None else self.grid.grid_intrinsics(self.pinhole)
 
     def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
-        """Pixels (...,2) of the network's grid in the capture's images, distorted as the lens made them."""
+        """Pixels (...,2) of the network's grid in the capture's images, distorted as the camera made them."""
         undistorted_px = self.grid.original_from_grid(x_px)
         if self.pinhole is None or self.lens is None or not is_distorted(self.lens):
             return undistorted_px
@@ -120,7 +120,7 @@ class PreparedImages:
 def prepare_images(
     capture: Capture, grid_of: Callable[[tuple[int, int]], ImageGrid] = image_grid
 ) -> PreparedImages:
-    """Read, undistort where the lens is known, resize and crop the images of a capture.
+    """Read, undistort where the intrinsics are known, resize and crop the images of a capture.
 
     `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
     """
@@ -135,7 +135,7 @@ def prepare_images(
 def read_colors(
     capture: Capture, grid: ImageGrid, lens: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
-    """The images of a capture on a grid, made images of `pinhole` first where the lens is distorted.
+    """The images of a capture on a grid, made images of `pinhole` first where the camera has distortion.
 
     Raises InputError for an image that cannot be read.
     """

@@ -73,7 +73,7 @@ def relocate(
 
 
 def features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> Features:
-    """SIFT of an image of this lens, reduced to WORKING_SIZE_PX."""
+    """SIFT of an image of these intrinsics, reduced to WORKING_SIZE_PX."""
     scale = min(1.0, WORKING_SIZE_PX / max(lens.width, lens.height))
     size = round(lens.width * scale), round(lens.height * scale)
     grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)

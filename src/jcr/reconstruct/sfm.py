@@ -75,7 +75,7 @@ def structure_from_motion(
 
     With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes.
 
-    A `known` lens is the only one of `lenses`, does not fold over, and is held; unknown ones are starting
+    A `known` intrinsics are the only ones of `lenses`, do not fold over, and are held; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
     than three images register.
     """
@@ -98,7 +98,7 @@ def structure_from_motion(
         _adjust_robustly(model, hold_lens=known)
         lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
-            notes.append("the views do not determine the lens distortion: it is taken as zero")
+            notes.append("the views do not determine the distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
             _adjust_robustly(model, hold_lens=True)
             lens = _lens_of(model.camera(1), lens)
@@ -121,7 +121,7 @@ def extract(
     report: Progress,
     memory_gb: float = 8.0,
 ) -> list[pycolmap.Camera]:
-    """Features of every image, at the working size, in a new database; and the lenses as COLMAP's cameras.
+    """Features of every image, at the working size, in a new database; and the intrinsics as COLMAP's cameras.
 
     As many threads are used as the budget, a peak resident set, has room for.
     """
@@ -155,7 +155,7 @@ def _enter(
     known: bool,
     working_size_px: int,
 ) -> tuple[list[pycolmap.Camera], list[str]]:
-    """A new database of grey images at the working size; the lenses as COLMAP's cameras, and the images' names."""
+    """A new database of grey images at the working size; the intrinsics as COLMAP's cameras, and the images' names."""
     width, height = lenses[0].width, lenses[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
@@ -193,7 +193,7 @@ def _matched(
     names: Sequence[str],
     report: Progress,
 ) -> Matched:
-    """The pairs that a mapper may believe, written into the database; a lens that the robot found comes first."""
+    """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
     working = _at_work(lens, cameras[0])
     if base_from_gripper is None:
@@ -218,7 +218,7 @@ def _matched(
 
 
 def _at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
-    """The lens of the images at the working size."""
+    """The intrinsics of the images at the working size."""
     return resized(lens, camera.width, camera.height)
 
 
@@ -336,7 +336,8 @@ def _match_guided(
 def _second_model(
     database: Path, left: Sequence[int], camera: pycolmap.Camera, known: bool, seed: int
 ) -> pycolmap.Reconstruction | None:
-    """What the mapper makes of the images that are left, its lens that of the map; None where it makes nothing."""
+    """What the mapper makes of the images that are left, its intrinsics those of the map; None where it makes
+    nothing."""
     if len(left) < 2:
         return None
     with closing(pycolmap.Database.open(database)) as db:
@@ -418,7 +419,7 @@ def _why_not_registered(database: Path, n_images: int, model: pycolmap.Reconstru
         reason = f"only {matched} of {math.comb(n_images, 2)} pairs of images share features"
     else:
         reason = (
-            "the matches agree on no common scene: a repeated pattern, things that moved, or a wrong lens"
+            "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
         )
     return (
         f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images "
@@ -453,7 +454,7 @@ def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tu
 
 
 def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
-    """COLMAP's one camera: the given lens, or a focal length and two radial coefficients to refine."""
+    """COLMAP's one camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
     centre = [lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL]
     if not known:
         name, params = "RADIAL", [lens.fx, *centre, 0.0, 0.0]
@@ -470,7 +471,7 @@ def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
 
 
 def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
-    """Of a camera that `camera_of` made for an unknown lens; in images of the size of `like`."""
+    """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
     centre = cx - HALF_PIXEL, cy - HALF_PIXEL

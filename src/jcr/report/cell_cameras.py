@@ -1,4 +1,4 @@
-"""The section of the cell's other cameras and arms: where each is, how surely, and by which pictures."""
+"""The section of the cell's other cameras and arms: where each is, how surely, and by which images."""
 
 from html import escape
 
@@ -26,7 +26,7 @@ def _camera(camera: CameraPlaced) -> str:
         for picture in camera.pictures
     )
     remarks = "".join(f"<li>{escape(text)}</li>" for text in camera.warnings)
-    doubt = "" if camera.doubt is None else '<p class="why">Not to be trusted.</p>'
+    doubt = "" if camera.doubt is None else '<p class="why">Rejected.</p>'
     body = _transform(name, camera.parent_from_camera, camera.uncertainty)
     return (
         f'<div class="notation wide"><header><h3>{escape(camera.name)}: {escape(name)}</h3>'

@@ -1,4 +1,4 @@
-"""The report's figures, as SVG that follows the page's colours and as embedded pictures."""
+"""The report's figures, as SVG that follows the page's colours and as embedded images."""
 
 import base64
 import colorsys
@@ -210,7 +210,7 @@ def pyramid(lens: Intrinsics, depth: float) -> Float[ndarray, "5 3"]:
 
 
 def _view_axes(azimuth_deg: float, elevation_deg: float) -> Float[ndarray, "2 3"]:
-    """Right and up of the picture, in the base frame."""
+    """Right and up of the image, in the base frame."""
     a, e = np.radians([azimuth_deg, elevation_deg])
     right = [-np.sin(a), np.cos(a), 0.0]
     up = [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]

@@ -139,7 +139,7 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
 
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
-    """The report of a run that found no camera poses: why, with the cure, and the images."""
+    """The report of a run that found no camera poses: why, with the remedy, and the images."""
     cards = "".join(
         f'<figure><div class="shot"><img src="{url}" alt="{escape(name)}"></div>'
         f'<figcaption><span class="file">{escape(name)}</span></figcaption></figure>'
@@ -211,14 +211,16 @@ def _verdict(calibration: CalibrationFile) -> str:
         believe = "There were too few images to leave one out and see how well the others predict it."
     elif not calibration.observability.observable:
         # An error along a direction that no motion shows changes no prediction.
-        believe = f"Its leave-one-out error of {miss} is no comfort: what no motion shows, no image can miss."
+        believe = (
+            f"Its leave-one-out error of {miss} is no comfort: what is unobservable, no image can contradict."
+        )
     elif not calibration.converged:
         no_comfort = "what is wrong with all images, none of them can miss"
         believe = f"Its leave-one-out error of {miss} is no comfort: {no_comfort}."
     else:
         believe = (
             f"Beside it the leave-one-out error: {miss} ({escape(held_out.how)}). It is of one pose, with the "
-            "robot's noise in it, and blind to what all images share, such as intrinsics that are a little wrong."
+            "robot pose noise in it, and blind to what all images share, such as intrinsics that are a little wrong."
         )
     if calibration.uncertainty is not None:
         believe += f" Least certain is the translation {escape(calibration.uncertainty.worst)} (one σ)."
@@ -253,7 +255,7 @@ def _tiles(calibration: CalibrationFile) -> str:
     if (noise := calibration.robot_noise) is not None:
         how = "estimated" if noise.estimated else "as given"
         degrees = f"{significant(noise.rotation_deg)}° per axis, {how}"
-        tiles.append(("Robot's noise, 1 σ", f"{significant(noise.translation_mm)} mm", degrees))
+        tiles.append(("Robot pose noise, 1 σ", f"{significant(noise.translation_mm)} mm", degrees))
     cells = [
         f'<div class="{"tile first" if name in MAIN else "tile"}"><div class="name">{name}</div>'
         f'<div class="number">{escape(number)}</div><div class="more">{escape(more)}</div></div>'

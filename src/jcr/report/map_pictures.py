@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 WIDE = 480
-"""Pixels across of a picture that stands alone."""
+"""Pixels across of an image that stands alone."""
 PAIRS = 4
 """Images that are shown beside the map."""
 THUMBNAIL = 320

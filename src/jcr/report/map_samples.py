@@ -1,4 +1,4 @@
-"""What the trained map says, asked where a picture of it needs an answer."""
+"""What the trained map says, asked where an image of it needs an answer."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

@@ -13,7 +13,7 @@ from jcr.report.transform import copy_button
 from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
-PARTS = ("offset x", "offset y", "offset z", "turn x", "turn y", "turn z", "scale")
+PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
 """Of a direction, in records.COVARIANCE_ORDER."""
 NAMED = 0.4
 """Share of a unit direction from which a part is named."""
@@ -28,12 +28,12 @@ def motion_section(result: RunResult | PosesResult) -> str:
     says = "<p>The motions show every direction of the calibration: offset, orientation and scale.</p>"
     if not observed.observable:
         pairs = zip(observed.unobservable, observed.advice, strict=False)
-        items = "".join(f"<li><b>{escape(name)}</b>; cure: {escape(cure)}</li>" for name, cure in pairs)
+        items = "".join(f"<li><b>{escape(name)}</b>; remedy: {escape(cure)}</li>" for name, cure in pairs)
         says = f"<p>The motions leave unseen:</p><ul>{items}</ul>"
     spreads = ""
     if uncertainty is not None:
         offset = _spreads("offset along", uncertainty.translation_std_mm, " mm")
-        turn = _spreads("turn about", uncertainty.rotation_std_deg, "°")
+        turn = _spreads("rotation about", uncertainty.rotation_std_deg, "°")
         spreads = (
             f'<h3>What that leaves uncertain</h3><div class="columns">{offset}{turn}</div>'
             '<p class="soft">One standard deviation, axes of the gripper frame; scale '

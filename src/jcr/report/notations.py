@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jcr.geometry import roll_pitch_yaw, skew
 
 GIMBAL_LOCK = np.radians(89.9)
-"""Pitch beyond which roll and yaw turn about nearly the same axis."""
+"""Pitch beyond which roll and yaw rotate about nearly the same axis."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def rotation_vector_jacobian(rotvec: Float[ndarray, "3"]) -> Float[ndarray, "3 3
 
 
 def roll_pitch_yaw_jacobian(rpy: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
-    """d(roll, pitch, yaw)/dr: the axes that each angle turns about, inverted; singular at gimbal lock."""
+    """d(roll, pitch, yaw)/dr: the axes that each angle rotates about, inverted; singular at gimbal lock."""
     _, pitch, yaw = rpy
     roll_axis = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]
     pitch_axis = [-np.sin(yaw), np.cos(yaw), 0.0]

@@ -19,7 +19,7 @@ from jcr.results import RunResult
 from jcr.rounding import significant
 
 LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
-"""Pixels across of the pictures, and of all together at most, which is about a megabyte; they open large."""
+"""Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""
 MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
 
@@ -70,7 +70,7 @@ def images_section(result: RunResult) -> str:
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:
-    """Per image of the capture a drawing over its picture: some features, and where their 3D points fall."""
+    """Per image of the capture a drawing over its image: some features, and where their 3D points fall."""
     reconstruction, lens = result.reconstruction, result.lens
     tracks, straight = reconstruction.tracks, without_distortion(lens)
     drawings, draw = {}, np.random.default_rng(0)
@@ -95,7 +95,7 @@ def _reprojections(result: RunResult) -> dict[int, str]:
 
 
 def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
-    """Every image as a JPEG of the size that there is room for; a lens straightens it, to what the 3D view shows."""
+    """Every image as a JPEG of the size that there is room for; intrinsics undistort it, to what the 3D view shows."""
     shape = capture.image_size[1] / capture.image_size[0]
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)

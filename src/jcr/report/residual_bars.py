@@ -63,12 +63,12 @@ def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
 
 
 def _why_noise_is_larger(fit: HandEye) -> str:
-    """Why the robot's noise per axis is not the size of the residuals."""
+    """Why the robot pose noise per axis is not the size of the residuals."""
     count = 6 * int(fit.inliers.sum())
     taken = np.sqrt(count / max(count - 13, 1))
     noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
     return (
-        f"The robot's noise ({significant(1e3 * noise)} mm per axis"
+        f"The robot pose noise ({significant(1e3 * noise)} mm per axis"
         + (f", {significant(1e3 * together)} mm with systematic errors" if together > 1.05 * noise else "")
         + f") may be more than what these bars suggest: 13 unknowns were fitted to {count} numbers and took part of it "
         f"away (a factor of {taken:.2f}), features pull the poses towards them, and of few images its size is itself "

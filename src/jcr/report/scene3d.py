@@ -35,7 +35,7 @@ class PointLayer:
 def scene_section(
     result: RunResult, base_from_camera: Float[ndarray, "m 4 4"], surface: SurfacePoints | None
 ) -> str:
-    """Cameras, grippers and points in the base frame, to be turned by hand."""
+    """Cameras, grippers and points in the base frame, to be rotated by hand."""
     layers, legend = _layers(result, surface)
     tracked = apply_similarity(
         result.hand_eye.base_from_recon,

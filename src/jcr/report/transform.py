@@ -43,7 +43,7 @@ def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> str:
         name=f"{mount}_from_camera",
         whose="the frame of the gripper poses" if mount == "gripper" else "the robot's base",
         child=CHILD,
-        doubt="" if hand_eye.converged else '<p class="why">Not to be trusted: see above.</p>',
+        doubt="" if hand_eye.converged else '<p class="why">Rejected: see above.</p>',
     )
 
 

@@ -29,7 +29,7 @@ class FieldShape:
 
 
 class Lattice(nn.Module):
-    """The nodes of a regular grid over the workspace, of which a chosen few carry features.
+    """The nodes of a regular grid over the workspace, whose chosen few carry features.
 
     Fine features are needed near surfaces only; all other nodes share row 0.
     """

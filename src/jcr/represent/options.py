@@ -15,7 +15,7 @@ class CloudOptions:
     confidence_threshold: float | None = None
     """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
     max_points: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 200_000
-    """Keep at most so many points, drawn evenly over the pixels of all images."""
+    """Keep at most this many points, drawn evenly over the pixels of all images."""
     cloud_seed: int = 0
     """Seed of that draw."""
 
@@ -38,7 +38,7 @@ class MapOptions:
     cell: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
     """Side (m) of the finest feature cells; what was seen is kept at half of it."""
     max_cells: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 4_000_000
-    """Enlarge the cells until the workspace holds no more than so many."""
+    """Enlarge the cells until the workspace holds no more than this many."""
     max_seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0
     """Stop the training after this time at the latest; it stops by itself on a plateau."""
     map_seed: int = 0

@@ -18,7 +18,7 @@ from jcr.errors import InputError
 from jcr.geometry import apply, rotation_exp, transform
 
 VOXELS, CANDIDATES = 100_000, 1000
-"""At most so many in a shape's bounding box; and of these, drawn as centres of spheres at a time."""
+"""At most this many in a shape's bounding box; and of these, drawn as centres of spheres at a time."""
 
 JointValues = Float[ndarray, "*batch dof"] | Mapping[str, Float[ndarray, "*batch"] | float]
 
@@ -156,7 +156,7 @@ def _load(path: Path, changed_ns: int, excess: float) -> RobotSpheres:
         radii.append(radius)
     for each in robot.robot.links:
         if found[each.name] < len(each.collisions):
-            raise InputError(f"{path}: a collision mesh of link {each.name} cannot be found; mend its path")
+            raise InputError(f"{path}: a collision mesh of link {each.name} cannot be found; fix its path")
     if not radii:
         raise InputError(f"{path}: no link has a <collision> shape, so nothing can collide")
     return RobotSpheres(

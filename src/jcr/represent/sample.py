@@ -25,7 +25,7 @@ class Sample:
 
     @property
     def occupancy(self) -> Any:
-        """Probability (n,) that the place is solid; one half where nobody has looked, unless told otherwise.
+        """Probability (n,) that the place is solid; one half where nobody has looked, unless given otherwise.
 
         Where it is below 0.0009 in a whole cell, arrays are answered with 0.
         """

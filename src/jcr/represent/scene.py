@@ -119,7 +119,7 @@ class SceneMap:
     ) -> Bool[ndarray, "*batch"] | UInt8[ndarray, "*batch"]:
         """Whether spheres swept from starts to ends (…,3) touch something; answers and raises as `check_spheres`.
 
-        The sweep is checked at steps of half a cell, so an obstacle's corner may be missed by
+        The sweep is checked at steps of half a cell, so an obstacle's corner may be overlooked by
         r - sqrt(r² - (cell/4)²): 0.2 mm for a radius of 2 cm at the default cell.
         """
         starts, ends = np.asarray(starts_in_base, float), np.asarray(ends_in_base, float)

@@ -165,7 +165,7 @@ def _before_nearest(
 
 
 def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx"]:
-    """The mask grown by so many cells along every axis."""
+    """The mask grown by this many cells along every axis."""
     grown = mask[None].float()
     for axis in range(3):
         size, padding = [1, 1, 1], [0, 0, 0]

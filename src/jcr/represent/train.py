@@ -1,4 +1,4 @@
-"""Training: one loop fits a field of either preset to the rays, until held-out rays are explained no better."""
+"""Training: one loop fits a field of either preset to the rays, until validation rays are explained no better."""
 
 import time
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class Recipe:
     grid_rate: float
     """Learning rates of Adam."""
     look: int
-    """Steps between looks at the held-out rays."""
+    """Steps between looks at the validation rays."""
 
 
 RECIPES = {
@@ -56,7 +56,7 @@ def train(
     max_seconds: float,
     report: Callable[[float], None],
 ) -> int:
-    """Fit a field to the rays until the loss on held-out rays stops falling; gives the number of steps."""
+    """Fit a field to the rays until the loss on validation rays stops falling; gives the number of steps."""
     device, start = rays.x.device, time.perf_counter()
     generator = torch.Generator(device).manual_seed(seed)
     field.standardise(rays.targets)

@@ -13,7 +13,7 @@ from jcr.records import PointCloud
 from jcr.segment.tabletop import FEWEST, Support, support_plane
 
 SHARPEST = 0.0005
-"""Metres; heights are told apart no finer than this, nor than twice the roughness of the plane."""
+"""Metres; heights are separated no finer than this, nor than twice the roughness of the plane."""
 TOP_SHARE = 0.25
 """Of an object's mean density along its height that its top has at least: stray points above it have less."""
 CELL = 0.003

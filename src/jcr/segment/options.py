@@ -15,7 +15,7 @@ class TabletopOptions:
     object_highest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.6
     """Height (m) above the plane beyond which nothing belongs to an object."""
     object_gap: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
-    """Objects with this much room (m) between them, seen from above, are told apart."""
+    """Objects with this much space (m) between them, seen from above, are separated."""
     object_smallest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.015
     """Objects whose points span less (m) than this are taken for noise."""
 

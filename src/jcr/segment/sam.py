@@ -42,7 +42,7 @@ OVERLAP = 0.5
 
 
 def load_sam(weights: str) -> "Sam2Model":
-    """Segment Anything 2 by hub id or path; raises InputError, with the cure, where it cannot be had."""
+    """Segment Anything 2 by hub id or path; raises InputError, with the remedy, where it cannot be had."""
     extra("transformers", "sam", "--segments sam")
     from transformers import Sam2Model, logging
 

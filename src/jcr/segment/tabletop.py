@@ -109,7 +109,7 @@ def label_tabletop(
 ) -> PointCloud:
     """The cloud with label 1 on the support plane and 2, 3, … on the objects that stand on it, largest first.
 
-    Objects are told apart seen from straight above: what lies over one another is one object, and so are objects
+    Objects are separated seen from straight above: what lies over one another is one object, and so are objects
     that touch. Raises InputError when no plane carries the scene.
     """
     options = options or TabletopOptions()

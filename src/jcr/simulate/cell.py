@@ -1,4 +1,4 @@
-"""Cells with several cameras as numbers, without pictures: what robots report and pictures show, and the truth.
+"""Cells with several cameras as numbers, without images: what robots report and images show, and the truth.
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are

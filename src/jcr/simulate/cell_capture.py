@@ -63,7 +63,7 @@ def add_cameras(
     effective: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]],
     suffix: str,
 ) -> Further:
-    """Pictures of the further cameras that the options ask for; `effective` is X, and the base from the true one."""
+    """Images of the further cameras that the options ask for; `effective` is X, and the base from the true one."""
     rng = np.random.default_rng([options.seed, 14])
     x, base_from_true = effective
     cameras: dict[str, Any] = {"wrist": {"mount": "gripper"}}

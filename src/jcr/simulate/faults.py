@@ -1,4 +1,4 @@
-"""Captures that something is wrong with, without pictures: gripper poses, image observations, and the truth.
+"""Captures that something is wrong with, without images: gripper poses, image observations, and the truth.
 
 What is reported is what a user would have; what was is what the fault made of it.
 """

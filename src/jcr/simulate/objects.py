@@ -161,7 +161,7 @@ def bottle(rng: np.random.Generator) -> TableObject:
 
 
 def mug(rng: np.random.Generator) -> TableObject:
-    """A mug with a handle and a picture around it."""
+    """A mug with a handle and an image around it."""
     radius, height = rng.uniform((0.038, 0.085), (0.043, 0.105))
     color = _WHITE if rng.random() < 0.5 else _paint(rng)
     inner = radius - 0.004

@@ -21,7 +21,7 @@ class SimulateOptions:
     """How many images; of the pattern `varied` fewer are the first ones of more (`two` has 2)."""
     pattern: Pattern = "varied"
     """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
-    pure translation, a turntable, xyz + yaw (SCARA), turning about a tool point or about the camera's centre,
+    pure translation, a turntable, xyz + yaw (SCARA), rotating about a tool point or about the camera's centre,
     two images."""
     robot: RobotName | None = None
     """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
@@ -36,7 +36,7 @@ class SimulateOptions:
     sag: float = 0.0
     """Sigma of the deflection of each joint under gravity, in degrees with the arm stretched out."""
     seed: int = 0
-    """Objects, layout, textures, lamp, lens, hand-eye and poses all follow from it."""
+    """Objects, layout, textures, lamp, intrinsics, hand-eye and poses all follow from it."""
     texture: bool = True
     """Print and grain on the surfaces; without, each has one uniform colour, with nothing for features."""
     table: TableName | None = None
@@ -45,7 +45,7 @@ class SimulateOptions:
     """Sigma per axis, in mm and degrees, of Gaussian errors of the gripper poses in capture.json; the images
     show the true ones."""
     unknown_intrinsics: bool = False
-    """Leave the intrinsics out of capture.json. (Known or not, the lens is a pinhole without distortion.)"""
+    """Leave the intrinsics out of capture.json. (Known or not, the camera is a pinhole without distortion.)"""
     lens_error: float = 0.0
     """Sigma of the errors of the intrinsics in capture.json, in percent: of the focal length (fx and fy alike), and of
     the image's width for each coordinate of the principal point. The images show the true ones."""
@@ -61,13 +61,13 @@ class SimulateOptions:
     jpeg_quality: int | Literal["lossless"] = 90
     """1 to 100, or lossless: PNG."""
     fixed_cameras: int = 0
-    """How many cameras stand beside the table and see the scene, a picture each."""
+    """How many cameras stand beside the table and see the scene, an image each."""
     wrist_cameras: int = 1
-    """1 or 2: a second camera on the gripper, beside the first and with a lens of its own."""
+    """1 or 2: a second camera on the gripper, beside the first and with intrinsics of its own."""
     arms: int = 1
     """1 or 2: a second arm on the other side of the table, with a wrist camera of its own. (With --robot, of the same
     make and as exact.)"""
     eye_to_hand: bool = False
-    """The camera stands fixed and watches a package that the gripper carries and turns, before the scene."""
+    """The camera stands fixed and watches a package that the gripper carries and rotates, before the scene."""
     truth: Literal["full", "scene"] = "full"
     """Write truth/ with depth and labels of every image, or with scene.json alone."""

@@ -1,4 +1,4 @@
-"""Hand-eye problems without pictures: poses with a known answer, for tests and tables of the calibration."""
+"""Hand-eye problems without images: poses with a known answer, for tests and tables of the calibration."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class HandEyeProblem:
     """What a robot and a reconstruction would report, and the truth."""
 
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """As reported, with the robot's noise."""
+    """As reported, with the robot pose noise."""
     recon_from_camera: Float[ndarray, "n 4 4"]
     gripper_from_camera: Float[ndarray, "4 4"]
     scale: float
@@ -40,7 +40,7 @@ def hand_eye_problem(
     """A random hand-eye transform, scale and reconstruction frame, and wrist views in the given pattern.
 
     Noises are one sigma per axis (m, rad) of the reported gripper poses and of the reconstructed cameras;
-    `deviation` (rad) turns every view by so much about a random axis, off a degenerate pattern.
+    `deviation` (rad) rotates every view by so much about a random axis, off a degenerate pattern.
     """
     gripper_from_camera = random_hand_eye(rng)
     true = gripper_poses(pattern, count, TARGET_IN_BASE, gripper_from_camera, rng)
@@ -62,7 +62,7 @@ def hand_eye_problem(
 def disturbed(
     a_from_b: Float[ndarray, "n 4 4"], noise: tuple[float, float], rng: np.random.Generator
 ) -> Float[ndarray, "n 4 4"]:
-    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), turn in b's (rad)."""
+    """Transforms with Gaussian errors, one sigma per axis: position in a's axes (m), rotation in b's (rad)."""
     rotation = a_from_b[:, :3, :3] @ rotation_exp(noise[1] * rng.normal(size=(len(a_from_b), 3)))
     return transform(rotation, a_from_b[:, :3, 3] + noise[0] * rng.normal(size=(len(a_from_b), 3)))
 

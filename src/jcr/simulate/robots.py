@@ -41,7 +41,7 @@ TARGET_X = 0.5
 """m: distance of the middle of the table from the base of such an arm."""
 LOWER_TABLE, LEAST_SIZE = 0.2, 0.55
 """m by which the table is lower than the base of an arm of no size, and least factor on the distances of the views: a
-small arm stands above what it looks at, or objects would fill its pictures."""
+small arm stands above what it looks at, or objects would fill its images."""
 IN_VIEW, LOWEST_VIEW = np.radians(12.0), np.radians(25.0)
 """Largest angle from the optical axis to the aim; least elevation of the camera above the table."""
 ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
@@ -231,7 +231,7 @@ def patterned(
 ) -> Joints:
     """Joint angles (n,dof) of a pattern of views about a target; InputError where the arm does not reach them all.
 
-    The pattern `varied` is fitted to the arm (`views`); the others, of which each hides something, must be exact.
+    The pattern `varied` is fitted to the arm (`views`); the others, each hiding something, must be exact.
     """
     if pattern == "varied":
         return views(arm, count, gripper_from_camera, rng, target_in_base)

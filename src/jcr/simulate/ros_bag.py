@@ -165,7 +165,7 @@ def _messages(
 def _blurred(
     picture: UInt8[ndarray, "h w 3"], speed: float, rng: np.random.Generator
 ) -> UInt8[ndarray, "h w 3"]:
-    """The picture as a moving camera sees it, with one grey level of noise in places: no two frames are alike."""
+    """The image as a moving camera sees it, with one grey level of noise in places: no two frames are alike."""
     length = 1 + round(BLUR_PX_PER_M * speed)
     noisy = picture ^ (rng.random(picture.shape[:2]) < 0.02)[..., None].astype(np.uint8)
     return np.asarray(cv2.blur(noisy, (length, 1)), dtype=np.uint8) if length > 1 else noisy

@@ -136,7 +136,7 @@ def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:
 def _placed(
     rng: np.random.Generator, things: Sequence[TableObject], center_in_base: Float[ndarray, "3"]
 ) -> tuple[TableObject, ...]:
-    """The objects, each turned at random, where the bounding circles of none overlap."""
+    """The objects, each rotated at random, where the bounding circles of none overlap."""
     radii = np.array([thing.radius for thing in things])
     spots = np.zeros((len(things), 2))
     order = rng.permutation(len(things))

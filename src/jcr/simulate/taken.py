@@ -1,4 +1,4 @@
-"""What a camera and a robot make of the truth: lenses, the errors of cheaper cameras, poses as they are reported."""
+"""What a camera and a robot make of the truth: intrinsics, the errors of cheaper cameras, poses as they are reported."""
 
 from dataclasses import replace
 from typing import Literal
@@ -17,7 +17,7 @@ _WIDTH, _HEIGHT = 640, 480
 
 
 def pinhole(rng: np.random.Generator) -> Intrinsics:
-    """A lens of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
+    """Intrinsics of 40° to 48° vertical field of view, as webcams and the colour side of depth cameras have.
 
     MuJoCo's image spans [-½, W-½] when pixel (0, 0) is the centre of a pixel, so its middle is (W-1)/2.
     """

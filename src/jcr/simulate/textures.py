@@ -45,7 +45,7 @@ def laminate(rng: np.random.Generator, height: int, width: int, color: Color, co
 
 
 def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> Image:
-    """A printed package: a ground colour, a name, a picture of overlapping shapes, small print (h,w,3)."""
+    """A printed package: a ground colour, a name, an image of overlapping shapes, small print (h,w,3)."""
     image = np.full((height, width, 3), _ink(color), np.uint8)
     inks = [_ink(colorsys.hsv_to_rgb(*rng.uniform((0, 0.25, 0.35), (1, 0.85, 0.95)))) for _ in range(4)]
     bright = np.mean(color) > 0.45

@@ -103,7 +103,7 @@ def solve_joints(
 
 
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
-    """Of its value, rad or m; a turn either way where it has none."""
+    """Of its value, rad or m; a rotation either way where it has none."""
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return -np.pi, np.pi

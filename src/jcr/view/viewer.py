@@ -327,7 +327,7 @@ class Viewer:
             self._slice.position = np.array([*self.scene.box[:, :2].mean(0), height])
 
     def move_sphere(self) -> None:
-        """Ask the map whether the sphere touches something; it turns red where it does."""
+        """Query the map whether the sphere touches something; it becomes red where it does."""
         assert self.scene is not None  # or there would be no sphere
         with self._lock:
             center, radius = np.asarray(self.gizmo.position, float)[None], self.radius.value / 1e3
@@ -401,7 +401,7 @@ class Viewer:
         return float(np.clip(edges[counts.argmax()], low, high - 0.02))
 
     def _place_eye(self) -> None:
-        """Where a reader starts: obliquely above, with points and cameras in the picture."""
+        """Where a reader starts: obliquely above, with points and cameras in the image."""
         target = np.median(self._solid(), axis=0)
         cameras = self.run.base_from_camera[:, :3, 3]
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))

@@ -1,6 +1,6 @@
 """Each adapter against a network that answers with the truth in its package's own convention.
 
-The pictures' colours say where in the original image a pixel lies, so that the networks know what was done to them,
+The images' colours say where in the original image a pixel lies, so that the networks know what was done to them,
 and nothing is taken from the adapter: a resize, a crop, a half pixel or a camera the wrong way round shows.
 """
 
@@ -22,7 +22,7 @@ UNIT = 0.37
 
 
 class Scene:
-    """Views of the plane z = 0 in the recon frame, in pictures that say where their pixels lie."""
+    """Views of the plane z = 0 in the recon frame, in images that say where their pixels lie."""
 
     def __init__(self, width: int, height: int) -> None:
         middle = (width - 1) / 2, (height - 1) / 2
@@ -37,7 +37,7 @@ class Scene:
         self.colors = np.clip(np.floor(255 * ramp + noise), 0, 255).astype(np.uint8)
 
     def seen(self, images: ndarray) -> tuple[ndarray, ndarray]:
-        """K of pictures (n,h,w,3) in [0, 1] from their colours, pixel (0, 0) a centre, and depth along z (n,h,w)."""
+        """K of images (n,h,w,3) in [0, 1] from their colours, pixel (0, 0) a centre, and depth along z (n,h,w)."""
         count, height, width = images.shape[:3]
         lens = self.pinhole
         matrices = np.tile(np.eye(3), (count, 1, 1))

@@ -48,7 +48,7 @@ def base_from_camera() -> ndarray:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Pictures of a printed plane."""
+    """Images of a printed plane."""
     place = tmp_path_factory.mktemp("plane")
     rng = np.random.default_rng(0)
     layers = [

@@ -178,7 +178,7 @@ def dense_pointmaps(
 
 
 def plan_memory(images: int, size: tuple[int, int], options: DenseOptions, features: int = 0) -> None:
-    """Say what memory the reconstruction of so many images of a size, and their map, will take before they start.
+    """Say what memory the reconstruction of this many images of a size, and their map, will take before they start.
 
     `features` are the bytes that finding features takes at least. Raises InputError where the budget cannot be
     kept with one image at a time.

@@ -25,7 +25,7 @@ from jcr.records import Intrinsics
 ON_PLANE = 0.006
 """Relative distance of inverse depth within which a matched pixel lies on a plane."""
 SAME_COLOUR = 0.1
-"""Distance (RGB, each 0 to 1, exposure and vignetting evened) below which two pixels may show one point."""
+"""Distance (RGB, each 0 to 1, exposure and vignetting compensated) below which two pixels may show one point."""
 FARTHEST = 3.5
 """Standard deviations of the pixels that carry a plane, up to which it is continued; the support plane has no end."""
 CARRIED = 0.5
@@ -89,7 +89,7 @@ def evened(
     views: Sequence[Relative],
     pinhole: Intrinsics,
 ) -> Float[ndarray, "m h w 3"]:
-    """Colours (0 to 1) without the images' exposures and the lens's vignetting, as matched points tell them.
+    """Colours (0 to 1) without the images' exposures and the vignetting, as matched points show them.
 
     Log brightness of one point in two images differs by their exposures and by a·(r²₁ - r²₂), with r the tangent of the
     angle off axis: least absolute deviations over matched points.
@@ -145,7 +145,8 @@ def planar_prior(
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
 ) -> Prior:
-    """The planes of image i's regions; `colors` are evened and a little smooth, `support` is in the recon frame."""
+    """The planes of image i's regions; `colors` are gain-compensated and a little smooth, `support` is in the
+    recon frame."""
     label, count = colour_regions(colors[i])
     in_camera = recon_from_camera[:3, :3].T @ support[:3]
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])

@@ -205,7 +205,7 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
 @compiled
 @no_type_check
 def _narrow(moments, n):
-    """The smaller eigenvalue of the covariance of pixels, of which the sums of u, v, uu, uv, vv are given."""
+    """The smaller eigenvalue of the covariance of pixels, from the sums of u, v, uu, uv, vv."""
     x, y = moments[0] / n, moments[1] / n
     xx, xy, yy = moments[2] / n - x * x, moments[3] / n - x * y, moments[4] / n - y * y
     return 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)

@@ -70,7 +70,7 @@ def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
 
 
 def tied_directions(lens_held: bool) -> Float[ndarray, "7 q"]:
-    """Directions in which cameras on a robot's gripper, all alike, and their lens may move."""
+    """Directions in which cameras on a robot's gripper, all alike, and their intrinsics may move."""
     return np.eye(7)[:, : 6 if lens_held else 7]
 
 

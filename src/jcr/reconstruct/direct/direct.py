@@ -1,13 +1,15 @@
-"""Direct alignment: wrist cameras found by colour alone, on plain tables too, where features find nothing to match.
+"""Direct alignment: wrist cameras by photometric alignment, on plain tables too, where features find nothing to match.
 
-The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the lens is
-not known). That is little enough to find it from nothing: the cameras look at a common place, which tells their
-viewing direction in the gripper's frame, and turns about it and tilts are tried all around, on images 15 pixels high.
+The robot's poses leave one unknown for all cameras, the hand-eye transform (and the focal length, if the
+intrinsics are not
+known). That is little enough to find it from nothing: the cameras look at a common place, which tells their
+viewing direction in the gripper's frame, and rotations about it and tilts are tried all around, on images 15
+pixels high.
 From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
 that what disagrees with the robot's motion shows.
 
 Pointmaps are matched near edges; plain surfaces between them are filled with planes (depth/priors.py).
-docs/plain-tables.md says when, and what it gives.
+The page `plain-tables` says when, and what it gives.
 """
 
 from collections.abc import Sequence
@@ -39,16 +41,16 @@ from jcr.reconstruct.direct.search import SIZES, search
 from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tracks
 
 FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
-"""The robot has no say in these any more."""
+"""Found without the robot poses."""
 FINEST = Stage(240, 300, 3, 0.1)
 UNEVEN = Stage(60, 300, 1, 0.2)
 """Where brightness is compared, before it is even."""
 EVENINGS = 3
-"""How often brightness is evened: each time more points agree."""
+"""How often gains are estimated: each time more points agree."""
 EVEN_ENOUGH = 0.05
 """Difference of log brightness below which it is left alone: shading and gloss look like as much."""
 GUESSED_FOCAL = 0.8
-"""In long sides, where nothing is known of the lens."""
+"""In long sides, where nothing is known of the intrinsics."""
 LEAST_AGREED = 0.25
 """Share of the points that the views must agree on in the end."""
 LEAST_POINTS = 100
@@ -102,7 +104,7 @@ def reconstruct(
     if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
         raise NotTrustedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
-            "take pictures that overlap more, of a scene that does not move or shine"
+            "take images that overlap more, of a scene that does not move or shine"
         )
     covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
     points = points.where(points.agreed)
@@ -115,7 +117,7 @@ def reconstruct(
 
 
 def evening(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
-    """By what to multiply the images so that they are equally bright, though the camera chose its exposure anew."""
+    """By what to multiply the images so that they are equally bright, though the camera chose its exposure again."""
     factor = np.ones(level.count)
     for _ in range(EVENINGS):
         even = level.times(factor)
@@ -142,7 +144,7 @@ def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int
         if fits.all():
             return rows, cameras
         if fits.sum() < 3:
-            raise NotTrustedError("direct alignment: fewer than three pictures fit together; take more")
+            raise NotTrustedError("direct alignment: fewer than three images fit together; take more")
         rows, level = rows[fits], level.rows(np.flatnonzero(fits))
         cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
 

@@ -29,7 +29,7 @@ _BORDER_PX = 2
 _SHARED = 5
 """Points that two images must share before their brightness is compared."""
 _KEEP_DEPTH = 1e-3
-"""Information that keeps a depth of which the images say nothing where it is."""
+"""Information that keeps a depth that the images do not determine where it is."""
 _CHUNK = 500
 """Points whose equations are held at a time: less than 100 MB for 15 images."""
 
@@ -42,7 +42,7 @@ class Level:
     by_u: Float32[ndarray, "nh w 3"]
     by_v: Float32[ndarray, "nh w 3"]
     grid: Intrinsics
-    """Its focal length is a guess where the lens is not known; the cameras have it right."""
+    """Its focal length is a guess where the intrinsics are not known; the cameras have it right."""
 
     @property
     def count(self) -> int:

@@ -23,7 +23,7 @@ SAME_M, SAME_DEG = 0.03, 5.0
 """Starts that ended closer than this found the same."""
 CLEARLY_BETTER = 0.9
 """Largest cost of a found hand-eye transform, relative to the next different one. Right ones, where there was another
-at all, had 0.60 to 0.81; wrong ones 0.96 to 1.00 (nine captures, eight of them with gripper poses of other pictures)."""
+at all, had 0.60 to 0.81; wrong ones 0.96 to 1.00 (nine captures, eight of them with gripper poses of other images)."""
 COARSEST = Stage(15, 150, 3, 0.2)
 COARSE = Stage(30, 100, 8, 0.15)
 JUDGE = Stage(60, 100, 1, 0.12)
@@ -39,7 +39,7 @@ def search(
     """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise NotTrustedError(
-            "direct alignment: the pictures show one colour and no edges; put different objects in view"
+            "direct alignment: the images show one colour and no edges; put different objects in view"
         )
     directions = tied_directions(lens_held)
     screen = replace(COARSEST, per_image=SCREENED_POINTS)
@@ -61,14 +61,14 @@ def search(
     best, *rivals = different(fine)
     if rivals and best.cost > CLEARLY_BETTER * rivals[0].cost:
         raise NotTrustedError(
-            f"direct alignment: cameras at different places explain the pictures alike (cost {best.cost:.3f} and "
-            f"{rivals[0].cost:.3f}); take more pictures, from more sides, of more and different objects"
+            f"direct alignment: cameras at different places explain the images alike (cost {best.cost:.3f} and "
+            f"{rivals[0].cost:.3f}); take more images, from more sides, of more and different objects"
         )
     return best
 
 
 def starts_from_nothing(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
-    """Hand-eye transforms by which the cameras look at a common place, turned and tilted all around."""
+    """Hand-eye transforms by which the cameras look at a common place, rotated and tilted all around."""
     # Directions evenly over the sphere (Fibonacci's spiral).
     k = np.arange(600) + 0.5
     height, around = 1 - 2 * k / len(k), np.pi * (1 + 5**0.5) * k

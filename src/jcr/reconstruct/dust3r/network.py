@@ -1,7 +1,7 @@
 """DUSt3R's network (Wang et al., CVPR 2024): two images in, two pointmaps in the first camera's frame out.
 
 A ViT encodes each image on its own; two decoders read each other's tokens through cross-attention (CroCo v2,
-Weinzaepfel et al., ICCV 2023); a head per view turns tokens into a 3D point and a confidence per pixel,
+Weinzaepfel et al., ICCV 2023); a head per view maps tokens into a 3D point and a confidence per pixel,
 either linear or a dense prediction transformer (DPT, Ranftl et al., ICCV 2021). Attribute names are those of
 the published checkpoints, because they are the keys of the state dict.
 
@@ -214,7 +214,7 @@ def rotary_embedding(position: Int[Tensor, "n 2"], head_dim: int, base: float) -
 
 
 def rotate(x: Float[Tensor, "b heads n d"], rotary: Rotary) -> Float[Tensor, "b heads n d"]:
-    """Turn queries or keys by their position: the first half of a head's channels by y, the second by x."""
+    """Rotate queries or keys by their position: the first half of a head's channels by y, the second by x."""
     # Each half of the channels holds pairs (a, b), all a before all b: a cos - b sin and b cos + a sin. Whole rows
     # and a small matrix are several times as quick as slices of a few channels.
     cos, sin = rotary.to(x.dtype).repeat_interleave(2, -2).flatten(-2)
@@ -333,7 +333,7 @@ class DptHead(nn.Module):
         self.dpt = Dpt((enc_dim, dec_dim, dec_dim, dec_dim))
 
     def finest(self, tokens: FeatureMap) -> Float[Tensor, "b 256 4*h 4*w"]:
-        """The finest level, from the encoder's tokens: the one part in which the other image has no say."""
+        """The finest level, from the encoder's tokens: the one part that does not use the other image."""
         return self.dpt.finest(tokens)
 
     def forward(self, layers: list[Tensor], grid: tuple[int, int], finest: Tensor | None = None) -> Pointmap:

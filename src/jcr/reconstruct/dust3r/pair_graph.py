@@ -34,7 +34,7 @@ class PairOptions:
     cache: Path | None = None
     """Folder of predictions already made; unset: jcr/pairs in the user's cache folder."""
     cache_gb: float = 4.0
-    """Size at which the oldest predictions in the cache are deleted; 0 turns it off."""
+    """Size at which the oldest predictions in the cache are deleted; 0 switches it off."""
 
 
 def complete_pairs(count: int) -> Int[ndarray, "e 2"]:
@@ -95,7 +95,7 @@ def _first_calibration(
     scatter = rotation_a.sum(0) - cosine.sum() * np.eye(3)
     _, second, largest = np.linalg.eigvalsh((scatter + scatter.T) / 2)
     if largest < 5e-4 or second < 0.02 * largest:
-        return "neighbours turn about less than two axes, so where the camera looks is unknown"
+        return "neighbours rotate about less than two axes, so where the camera looks is unknown"
     # Chained along the neighbours, for any frame of the cameras will do.
     camera = np.stack(list(accumulate(rotation_b, np.matmul, initial=np.eye(3))))
     rotation, _ = rotations(base_from_gripper[:, :3, :3], camera, np.ones(len(camera)))

@@ -302,8 +302,8 @@ def _new_array(shape: tuple[int, ...], in_memory: bool) -> ndarray:
             _reserve(stream.fileno(), 4 * math.prod(shape))
         except OSError as error:
             raise InputError(
-                f"{tempfile.gettempdir()}: no room for pointmaps that do not fit --memory-gb ({error.strerror}); make "
-                "room, name another folder in TMPDIR, or raise --memory-gb"
+                f"{tempfile.gettempdir()}: no space for pointmaps that do not fit --memory-gb ({error.strerror}); make "
+                "space, name another folder in TMPDIR, or raise --memory-gb"
             ) from None
         return np.memmap(stream, np.float32, "w+", shape=shape)
 

@@ -181,7 +181,7 @@ def gauss_newton(
 ) -> Solution:
     """Iterate until no unknown moves by more than `tolerance` (rad, or relative).
 
-    The weights, and the spread of the pairs' errors, are measured anew in each iteration, and depths and pairs' errors
+    The weights, and the spread of the pairs' errors, are measured again in each iteration, and depths and pairs' errors
     eliminated: neither is a problem for least_squares.py. Raises NotTrustedError where the pointmaps do not determine
     the unknowns.
     """

@@ -1,7 +1,7 @@
 """Kinematic alignment: the cameras are not free, they are base_from_gripper[i] · gripper_from_camera.
 
 The unknowns of global alignment's cameras, 6 per image and only up to a similarity, become one
-`gripper_from_camera` and small corrections of the gripper poses under the robot's own noise. The robot's
+`gripper_from_camera` and small corrections of the gripper poses under the robot pose noise. The robot's
 motion then sets the metric scale inside the alignment, pair scales included, instead of after it.
 """
 
@@ -49,7 +49,7 @@ VAGUE = 10.0
 """One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
 
 STRAIN = 5.0
-"""Standard deviations by which a gripper pose may move before the user is told."""
+"""Standard deviations by which a gripper pose may move before the user is warned."""
 START_NOISE = 0.001
 """Of the robot (rad) until it is measured."""
 LEAST_NOISE = 1e-5
@@ -73,7 +73,7 @@ class KinematicAlignment:
     scale: float
     """Metres per unit of the free alignment, which is the geometric mean of the pairs' units."""
     base_from_gripper: Float[ndarray, "n 4 4"]
-    """Corrected within the robot's noise."""
+    """Corrected within the robot pose noise."""
     covariance: Float[ndarray, "7 7"]
     """Of gripper_from_camera and log scale, in the order of `records.COVARIANCE_ORDER`."""
     alignment: Alignment
@@ -113,7 +113,8 @@ class HandEyeCameras:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns.
 
         Unknowns in turn: a step of gripper_from_camera and one of each gripper pose, both in gripper axes, then what
-        `layout` has beside cameras. A turn of the gripper carries the camera along, one of the camera on it does not.
+        `layout` has beside cameras. A rotation of the gripper carries the camera along, one of the camera on it
+        does not.
         """
         images = layout.images
         rest = layout.size - 6 * images
@@ -161,7 +162,7 @@ class HandEyeCameras:
         return functional @ np.linalg.solve(self.normal, functional.T)
 
     def strain(self) -> Float[ndarray, " n"]:
-        """By how many standard deviations of the robot's noise each gripper pose had to move, at most."""
+        """By how many standard deviations of the robot pose noise each gripper pose had to move, at most."""
         return np.abs(self.deviation() * np.sqrt(self.information)).max(axis=1)
 
     def deviation(self) -> Float[ndarray, "n 6"]:
@@ -176,7 +177,7 @@ def align_kinematic(
     gripper_from_camera: Float[ndarray, "4 4"] | None = None,
     progress: Progress | None = None,
 ) -> KinematicAlignment:
-    """Solve for gripper_from_camera and the reconstruction together, gripper poses under the robot's noise.
+    """Solve for gripper_from_camera and the reconstruction together, gripper poses under the robot pose noise.
 
     The start is a free alignment and a hand-eye transform in closed form, or the one given. Motions that
     leave a direction unobservable show in the covariance. Raises InputError as `align` does, and where there
@@ -235,7 +236,7 @@ def rescaled(state: State, factor: float) -> State:
 
 
 def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
-    """A warning that names the images whose gripper pose had to move further than the robot's noise explains.
+    """A warning that names the images whose gripper pose had to move further than the robot pose noise explains.
 
     Where that noise is estimated, four images or fewer cannot tell a wrong pose from a bad robot.
     """
@@ -246,6 +247,6 @@ def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tup
         predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(strain > STRAIN)
     ]
     return (
-        f"the pictures contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
-        "robot's noise; these poses are wrong, or --robot-noise is too small",
+        f"the images contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
+        "robot pose noise; these poses are wrong, or --robot-noise is too small",
     )

@@ -1,13 +1,13 @@
 """How far pairwise pointmaps are from a reconstruction, and how far to believe each of them.
 
-A predicted point errs differently *across* its line of sight (where in the observer's picture it appears) and
+A predicted point errs differently *across* its line of sight (where in the observer's image it appears) and
 *along* it (how far it is): networks know directions several times better than distances, and their errors in
 distance are smooth, so that a thousand pixels do not average them out. Each residual is therefore split,
 
     across = n − (n·x̂) x̂        along = log|x| − log|q| − log σ_e
 
 (x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction, both
-turned into the recon axes), and the two parts are weighted by variances measured on the residuals themselves:
+rotated into the recon axes), and the two parts are weighted by variances measured on the residuals themselves:
 per pointmap by their median, and per kind of view by how far neighbouring residuals go together. Pairs that
 contradict the others get large variances and so lose their say.
 """
@@ -65,7 +65,7 @@ class Residuals:
     distance: Float[ndarray, "k m"]
     across: Float[ndarray, "k 3 m"]
     across_squared: Float[ndarray, "k m"]
-    """Squared chord between the directions: grows up to a half turn, as |across| does not."""
+    """Squared chord between the directions: grows up to a rotation by 180°, as |across| does not."""
     along: Float[ndarray, "k m"]
 
 

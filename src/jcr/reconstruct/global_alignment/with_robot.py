@@ -32,7 +32,7 @@ from jcr.records import CameraEvidence
 
 @dataclass(frozen=True)
 class RobotAlignment:
-    """The better alignment in the first camera's frame, and what the pictures alone say, for the calibration."""
+    """The better alignment in the first camera's frame, and what the images alone say, for the calibration."""
 
     alignment: Alignment
     evidence: CameraEvidence | None
@@ -49,7 +49,7 @@ def align_with_robot(
 
     Neither knows the truth. Each predicts, from its own normal equations with weights measured on its own
     residuals, how far its cameras are off after the best similarity. Kinematic alignment is kept where it
-    promises less, did settle, and no gripper pose had to move beyond the robot's noise, which it estimates: a
+    promises less, did settle, and no gripper pose had to move beyond the robot pose noise, which it estimates: a
     wrong gripper pose would bend the scene. (The cost at the minimum does not decide: free cameras have 6n - 13
     parameters more and always fit better.) What the calibration is given as `evidence` is the free cameras in
     either case, as the robot's poses must not count twice. Raises InputError as `align` does.
@@ -90,7 +90,7 @@ def _kinematic_if_better(
         return None, "cameras aligned freely: tied to the robot's poses they came to nothing", ()
     contradicted = contradictions(cameras, problem.predictions)
     if contradicted:
-        return None, "cameras aligned freely: the pictures contradict the robot's poses", contradicted
+        return None, "cameras aligned freely: the images contradict the robot's poses", contradicted
     if not kinematic.settled:
         return None, "cameras aligned freely: tied to the robot's poses they did not settle", ()
     metres = float(np.exp(kinematic.state.log_pair_scale.mean()))

@@ -100,7 +100,7 @@ def _held_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     """Where a window's content holds it in all directions: along a straight edge a match stays where it was predicted.
 
     The variance of the flow is the noise's over the smaller eigenvalue of the gradients' summed products (the
-    structure tensor), of which noise alone has a share that is taken off.
+    structure tensor), whose share of noise is taken off.
     """
     image = gray.astype(np.float32)
     by_x, by_y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))

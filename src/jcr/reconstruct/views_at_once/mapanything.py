@@ -46,7 +46,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
-    """One pass over all views, told the intrinsics where known, and the poses where the views have them."""
+    """One pass over all views, given the intrinsics where known, and the poses where the views have them."""
     grid = image_grid(views.size, LONG_EDGE, PATCH, keep_square=True)
     colors = np.stack([resize_and_crop(image, grid) for image in views.colors])
     shown: list[dict[str, Any]] = [

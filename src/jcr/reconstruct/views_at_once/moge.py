@@ -37,7 +37,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def predict(network: nn.Module, views: Views) -> Predicted:
-    """Every view by itself, told the field of view where the intrinsics are known."""
+    """Every view by itself, given the field of view where the intrinsics are known."""
     grid = grid_of(views.size)
     device = next(network.parameters()).device.type
     fov_deg = None

@@ -46,7 +46,7 @@ def load(weights: Path, device: str) -> Predict:
 
 
 def predict(network: nn.Module, views: Views) -> Predicted:
-    """One pass over all views, told the intrinsics where known, and the poses where the views have them."""
+    """One pass over all views, given the intrinsics where known, and the poses where the views have them."""
     grid = grid_of(views.size)
     # Lanczos, whether it shrinks or enlarges.
     colors = np.stack(

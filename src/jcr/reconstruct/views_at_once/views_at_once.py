@@ -286,7 +286,7 @@ def _second_pass(
         for points in (first.points, aligned)
     )
     words = (
-        f"second pass, shown the robot's cameras: matches in views left out are predicted to {after:.2f} px, before "
+        f"second pass, shown the robot's cameras: leave-one-out error of matches {after:.2f} px, before "
         f"{before:.2f} px"
     )
     if not after < CLEARLY * before:
@@ -321,7 +321,7 @@ def transfer_px(
     """How far pointmaps put keypoints from where views left out show them: the median, in pixels.
 
     A view left out has the camera that the robot's motion from the keypoint's view gives, with the hand-eye transform;
-    neither its depth nor its predicted camera has a say.
+    neither its depth nor its predicted camera is used.
     """
     grid, lens = predicted.grid, capture.intrinsics or pinhole
     first = np.full(len(tracks.points_in_recon), -1)
@@ -409,7 +409,7 @@ def _record(
 def predicted_evidence(predicted: Predicted) -> CameraEvidence:
     """Predicted cameras with the error that such models are known for, each its own, the first one's in all others.
 
-    Steps are relative to the first camera: its own error turns all others about it.
+    Steps are relative to the first camera: its own error rotates all others about it.
     """
     poses = predicted.recon_from_camera
     assert poses is not None

@@ -1,0 +1,315 @@
+"""Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas.
+
+`docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. None of them is committed.
+"""
+
+import ast
+import inspect
+import json
+import re
+import sys
+import textwrap
+import warnings
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+import jcr
+from jcr.calibration.calibration_json import CalibrationFile
+from jcr.cell.cameras_json import CamerasFile
+from jcr.cli import COMMANDS, NO_DEFAULT, configuration
+from jcr.reconstruct.reconstruction_npz import About
+from jcr.run_folder import State
+
+REFERENCE = Path(__file__).parent / "reference"
+SCHEMAS = REFERENCE / "schemas"
+RESULTS_OF_CALLS = (
+    "jcr.results:RunResult",
+    "jcr.records:Capture",
+    "jcr.records:HandEye",
+    "jcr.records:Reconstruction",
+    "jcr.represent.scene:SceneMap",
+    "jcr.represent.sample:Sample",
+)
+"""What the functions of the package return, and a user reads."""
+FORMATS = {
+    "calibration.json": (
+        CalibrationFile,
+        "The hand-eye transform, its covariance, and what was made of each image.",
+    ),
+    "cameras.json": (CamerasFile, "Further cameras and arms of the cell, where there are some."),
+    "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
+    "reconstruction.npz": (
+        About,
+        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#reconstruction).",
+    ),
+}
+"""Files of a run folder that a pydantic model in the source describes."""
+
+
+def write_pages() -> None:
+    """Write all of them."""
+    REFERENCE.mkdir(exist_ok=True)
+    (REFERENCE / "cli.md").write_text(cli_page(), encoding="utf-8")
+    (REFERENCE / "api.md").write_text(api_page(), encoding="utf-8")
+    SCHEMAS.mkdir(exist_ok=True)
+    (REFERENCE / "formats.md").write_text(formats_page(), encoding="utf-8")
+
+
+def cli_page() -> str:
+    """Every command with its arguments, as the parser itself has them."""
+    parts = [
+        "# Command line\n",
+        "Written from the parser of each command. Exit status: 0 done, 2 the input is wrong, 3 done, but the result "
+        "is rejected, 1 a bug, 130 interrupted. [In the shell](../how-to/shell.md) tells what goes to stdout.\n",
+        "| command | |\n|---|---|",
+        *(f"| [`jcr {name}`](#jcr-{name}) | {about} |" for name, about in COMMANDS.items()),
+    ]
+    for name in COMMANDS:
+        command = import_module(f"jcr.cli.{name.replace('-', '_')}")
+        with warnings.catch_warnings():
+            # The only way to ask tyro for what it has parsed; it is to go with nothing in its place yet.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            parser = tyro.extras.get_parser(command.Arguments, prog=f"jcr {name}", config=configuration())
+        parts += ["", f"## jcr {name}", "", _text(parser.description or "")]
+        for group in parser._action_groups:
+            rows = [_argument(action) for action in group._group_actions if action.dest != "help"]
+            if rows:
+                title = {"positional arguments": "Arguments", "options": "Options"}.get(
+                    group.title or "", group.title
+                )
+                parts += [
+                    "",
+                    f"**{(title or '').capitalize()}**"
+                    + (f": {group.description}" if group.description else ""),
+                ]
+                parts += ["", "| | |", "|---|---|", *rows]
+    return "\n".join(parts) + "\n"
+
+
+def _argument(action: Any) -> str:
+    flag = action.option_strings[-1] if action.option_strings else ""
+    value = "" if action.nargs == 0 else action.metavar
+    value = " ".join(value) if isinstance(value, tuple) else value or ""
+    if action.choices:
+        value = "" if len(value) > 24 else value
+        value += f" `{' | '.join(map(str, action.choices))}`" if not value else ""
+    said = NO_DEFAULT.sub("", str(action.help).replace("\n", " "))
+    named = f"`{flag} {value}`".replace(" `", "`") if not value.startswith(" `") else f"`{flag}`{value}"
+    return f"| {_cell(named if flag else f'`{value}`')} | {_cell(_escaped(said))} |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").strip()
+
+
+def _escaped(text: str) -> str:
+    """Angle brackets and stars of help texts are not markup."""
+    return re.sub(r"([<>*])", r"\\\1", text)
+
+
+def _text(docstring: str) -> str:
+    """A docstring as Markdown: indented blocks after `examples:` are code."""
+    lines, code = [], False
+    for line in inspect.cleandoc(docstring).splitlines():
+        if line.startswith("  ") and not code:
+            lines += ["", "```"]
+            code = True
+        if code and line and not line.startswith("  "):
+            lines += ["```", ""]
+            code = False
+        lines.append(line[2:] if code else line)
+    return "\n".join([*lines, "```"] if code else lines)
+
+
+def api_page() -> str:
+    """The public names of the package, and what its functions return."""
+    parts = [
+        "# Python\n",
+        "Every public name of `jcr`. Transforms are `a_from_b` (4×4), points `x_in_a`; metres and radians, or the unit "
+        "in the name. Cameras are OpenCV's: x right, y down, z forward.\n",
+    ]
+    for name in jcr.__all__:
+        parts += _entry(f"jcr.{name}", getattr(jcr, name))
+    parts += ["## What functions return", ""]
+    for place in RESULTS_OF_CALLS:
+        module, _, name = place.partition(":")
+        parts += _entry(name, getattr(import_module(module), name), "###")
+    return "\n".join(parts) + "\n"
+
+
+def _entry(name: str, value: Any, level: str = "##") -> list[str]:
+    if inspect.isfunction(value):
+        return [
+            "",
+            f"{level} {name}",
+            "",
+            f"```python\n{_signature(name, value)}\n```",
+            "",
+            _text(value.__doc__ or ""),
+        ]
+    lines = ["", f"{level} {name}", "", _text(value.__doc__ or "")]
+    if is_dataclass(value):
+        said, kinds = described(value), annotations(value)
+        rows = [
+            f"| `{field.name}` | `{_cell(kinds.get(field.name, ''))}` | {_cell(_escaped(said.get(field.name, '')))} |"
+            for field in fields(value)
+        ]
+        lines += ["", "| field | type | |", "|---|---|---|", *rows]
+    for method, function in inspect.getmembers(value, inspect.isfunction):
+        if not method.startswith("_") and function.__doc__ and method in vars(value):
+            lines += ["", f"```python\n{_signature(method, function)}\n```", "", _text(function.__doc__)]
+    return lines
+
+
+def _signature(name: str, function: Any) -> str:
+    """As it is in the source, where annotations are short."""
+    node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    assert isinstance(node, ast.FunctionDef)
+    arguments = ast.unparse(node.args)
+    line = f"{name}({arguments})" + (f" -> {ast.unparse(node.returns)}" if node.returns else "")
+    if len(line) <= 100:
+        return line
+    parts = inspect.signature(function).parameters
+    star = [parameter for parameter in parts.values() if parameter.kind is parameter.KEYWORD_ONLY]
+    written = {part.arg: part for part in [*node.args.args, *node.args.kwonlyargs]}
+    lines = []
+    for parameter in parts.values():
+        if star and parameter is star[0]:
+            lines.append("    *,")
+        kind = written[parameter.name].annotation if parameter.name in written else None
+        text = parameter.name + (f": {ast.unparse(kind)}" if kind else "")
+        text += "" if parameter.default is parameter.empty else f" = {parameter.default!r}"
+        lines.append(f"    {text},")
+    returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    return "\n".join([f"{name}(", *lines, f"){returns}"])
+
+
+def described(record: type) -> dict[str, str]:
+    """What the string below each field of a class says, of the class itself and those it is made of."""
+    return {
+        field.target.id: " ".join(below.value.value.split())
+        for field, below in _fields(record)
+        if isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+        and isinstance(below.value.value, str)
+    }
+
+
+def annotations(record: type) -> dict[str, str]:
+    """The type of each field as the source has it, without what tyro is told beside it."""
+    found = {}
+    for field, _ in _fields(record):
+        kind = field.annotation
+        if isinstance(kind, ast.Subscript) and ast.unparse(kind.value) == "Annotated":
+            kind = kind.slice.elts[0] if isinstance(kind.slice, ast.Tuple) else kind
+        found[field.target.id] = ast.unparse(kind).replace(" | ", " or ")
+    return found
+
+
+def _fields(record: type) -> Iterator[tuple[Any, ast.stmt | None]]:
+    for kind in reversed(record.__mro__):
+        if not kind.__module__.startswith("jcr"):
+            continue
+        node = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+        assert isinstance(node, ast.ClassDef)
+        for field, below in zip(node.body, [*node.body[1:], None], strict=True):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                yield field, below
+
+
+def schema(model: Any) -> dict[str, Any]:
+    """The JSON Schema of a pydantic model, with what the source says of each field."""
+    found = model.model_json_schema()
+    module_names = {model.__name__: model} | {
+        name: value
+        for module in list(sys.modules.values())
+        if (getattr(module, "__name__", "") or "").startswith("jcr")
+        for name, value in vars(module).items()
+        if inspect.isclass(value)
+    }
+    for name, part in [(model.__name__, found), *found.get("$defs", {}).items()]:
+        said = described(module_names[name]) if name in module_names else {}
+        for field, text in said.items():
+            if field in part.get("properties", {}):
+                part["properties"][field].setdefault("description", text)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | found
+
+
+def formats_page() -> str:
+    """Every file that is read or written, with its JSON Schema beside it."""
+    parts = [
+        "# Files and their schemas\n",
+        "| file | schema | what |\n|---|---|---|",
+        "| `capture.json` | {download}`capture.schema.json <schemas/capture.schema.json>` | "
+        "Images and gripper poses: what is read. [Other formats](captures.md). |",
+    ]
+    for file, (model, what) in FORMATS.items():
+        name = f"{file.split('.')[0]}.schema.json"
+        (SCHEMAS / name).write_text(
+            json.dumps(schema(model), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
+        parts.append(f"| `{file}` | {{download}}`{name} <schemas/{name}>` | {what} |")
+    parts += [
+        "| `predictions.npz` | | [Predictions](predictions.md): what a network of your own gives. |",
+        "| `cloud.ply`, `map.safetensors`, `report.html`, `log.txt` | | The point cloud in the base frame, "
+        "[the map](../how-to/map.md), [the report](../how-to/viewer.md), all messages. |",
+        "",
+        "The schemas state what is checked on reading, but for what needs more than one field: that a matrix is rigid, "
+        "a covariance positive, an image in its folder.",
+    ]
+    capture = json.loads((SCHEMAS / "capture.schema.json").read_text(encoding="utf-8"))
+    parts += ["", "## capture.json", "", capture["description"], "", *_table(capture)]
+    for name, part in capture["$defs"].items():
+        parts += ["", f"**{name}**: {part.get('description', '')}", "", *_table(part)]
+    for file, (model, what) in FORMATS.items():
+        found = schema(model)
+        parts += ["", f"## {file}", "", what, "", *_table(found)]
+        for name, part in found.get("$defs", {}).items():
+            if "properties" in part:
+                parts += [
+                    "",
+                    f"**{name}**: {_escaped(' '.join(part.get('description', '').split()))}",
+                    "",
+                    *_table(part),
+                ]
+    return "\n".join(parts) + "\n"
+
+
+def _table(part: dict[str, Any]) -> list[str]:
+    required = part.get("required", [])
+    rows = [
+        f"| `{name}`{'' if name in required else ' (optional)'} | {_cell(_type(value))} "
+        f"| {_cell(_escaped(_said(value)))} |"
+        for name, value in part.get("properties", {}).items()
+    ]
+    return ["| key | type | |", "|---|---|---|", *rows] if rows else []
+
+
+def _said(value: dict[str, Any]) -> str:
+    """Of a value that may be null, what is said of the other."""
+    parts = [value, *value.get("anyOf", [])]
+    return next((part["description"] for part in parts if "description" in part), "")
+
+
+def _type(value: dict[str, Any]) -> str:
+    if "$ref" in value:
+        return value["$ref"].rpartition("/")[2]
+    if "anyOf" in value:
+        return " or ".join(dict.fromkeys(_type(part) for part in value["anyOf"]))
+    if "enum" in value or "const" in value:
+        return ", ".join(f"`{choice}`" for choice in value.get("enum", [value.get("const")]))
+    if value.get("type") == "array":
+        count = value.get("minItems") if value.get("minItems") == value.get("maxItems") else None
+        if "items" in value:
+            return f"list of {f'{count} × ' if count else ''}{_type(value['items'])}"
+        return "list"
+    return str(value.get("type", "any"))
+
+
+if __name__ == "__main__":
+    write_pages()

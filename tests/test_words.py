@@ -1,0 +1,93 @@
+"""The field's words in what a person reads: documents, help, messages, docstrings."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from places import ROOT
+
+GENERATED = ("cli.md", "api.md", "formats.md")
+"""From the source, when the site is built."""
+
+SAY = {
+    r"\boffset (?:of the camera|in the gripper)\b|\bof the offset\b|\bthe offset is\b": "translation",
+    r"\blens(?:es)?\b": "intrinsics, or distortion; the glass alone is a lens",
+    r"\bpictures?\b": "image",
+    r"\bturn(?:s|ed|ing)?\b(?! (?:out|into|to|off|on|red|blue|green)\b)": "rotate, rotation",
+    r"\bheld[ -]out\b|\bmissed by\b|\bleft out are predicted\b": "leave-one-out error",
+    r"\bshows? too little\b|\bno motion shows?\b|\bnot shown yet\b": "unobservable, degenerate motion",
+    r"\bcures?\b": "remedy",
+    r"\b(?:goes|go|compares?|found) by colou?rs?\b|\bcompares colou?rs\b": "direct (photometric) alignment",
+    r"\bevened\b|\bevening\b": "exposure compensation, gain",
+    r"\btold\b": "weight, residual, predicted pose, …: whichever it is",
+    r"\brobot's word\b|\bno say\b|\ba say\b": "reported pose; the robot pose is not used",
+    r"\brobot's noise\b": "robot pose noise",
+    r"\bcovariance (?:that )?(?:covers|holds)\b": "the covariance is calibrated",
+    r"\b(?:not )?to be trusted\b|\bnot trusted\b|\bis trusted\b|\bare trusted\b": "accepted, rejected",
+    r"\bg[ai]ves? nothing\b": "failed: registered 2 of 12 images",
+    r"\bdetective\b": "pose-convention diagnosis",
+    r"\bfood of\b": "observations",
+    r"\bgo(?:es)? on (?:with|from)\b|\bgone on with\b|\bcommand goes on\b": "resumed",
+    r"\bmend(?:s|ed)?\b": "fix",
+    r"\bask(?:s|ing)? the map\b": "query the map",
+    r"\bwhat leaves\b": "export formats",
+    r"\bone fears\b": "has the camera moved?",
+    r"\brooms?\b|\bhouse\b": "package, module",
+    r"\brough start\b|\bwild\b": "initial estimate",
+    r"\banew\b|\bof which\b|\bso many\b|\bnone else\b": "again, whose, n, no others",
+}
+"""What is not said (a pattern), and what is said in its place."""
+MEANT = re.compile(
+    r"\b(?:has|leaves?|make|of|little|much) room\b|room (?:on|in|for|to)\b|room is\b|--[\w-]+|"
+    r"turns? images into|in turn\b|in the original image"
+)
+"""Words in another meaning: disk room, one after the other; and options."""
+VALUES = {"not trusted"}
+"""Of summary.csv."""
+
+
+def without_code(text: str) -> str:
+    """What is not between backticks: names keep their spelling."""
+    return re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", " ", text, flags=re.DOTALL)
+
+
+def faults(text: str) -> list[str]:
+    """Every word that is not said, with what is."""
+    text = MEANT.sub(" ", without_code(text))
+    return [
+        f"{found[0]!r}: {right}" for wrong, right in SAY.items() for found in re.finditer(wrong, text, re.I)
+    ]
+
+
+def strings(file: Path) -> list[str]:
+    """The texts of a Python file that have more than one word: messages, help and docstrings."""
+    found = (node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant))
+    return [text for text in found if isinstance(text, str) and " " in text.strip() and text not in VALUES]
+
+
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "SECURITY.md",
+    *sorted(
+        page
+        for page in (ROOT / "docs").rglob("*.md")
+        if page.parent.name != "results" and page.name not in GENERATED
+    ),
+]
+MODULES = sorted((ROOT / "src" / "jcr").rglob("*.py"))
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_documents_say_it_in_the_words_of_the_field(page: Path):
+    assert faults(page.read_text()) == []
+
+
+def test_source_says_it_in_the_words_of_the_field():
+    found = {
+        str(file.relative_to(ROOT)): [f for text in strings(file) for f in faults(text)] for file in MODULES
+    }
+    assert {name: wrong for name, wrong in found.items() if wrong} == {}
