@@ -50,11 +50,11 @@ def choose(
 ) -> Choice:
     """The capture reconstructed and calibrated; where `auto` had a choice, the notes say what it chose and why.
 
-    `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long as
-    the ones before failed or gave a calibration that is rejected for another reason than the motion. Of two results an
-    accepted one is kept, else the one with the smaller leave-one-out error; dense depth is made for the one that is kept,
-    unless a known length is read from it. `chosen` gets the reconstruction as soon as it is sure that the run keeps it.
-    Raises InputError as the back end does, NothingFoundError where none gave anything.
+    `auto` runs the best back end whose weights are on this machine, and the next attempt of `backends.tries` as long
+    as the ones before failed or gave a calibration that is rejected for another reason than the motion. Of two results
+    an accepted one is kept, else the one with the smaller leave-one-out error; dense depth is made for the one that is
+    kept, unless a known length is read from it. `chosen` gets the reconstruction as soon as it is sure that the run
+    keeps it. Raises InputError as the back end does, NothingFoundError where none gave anything.
     """
     made = tries(options)
     if len(made) == 1:

@@ -403,7 +403,7 @@ class HandEye:
     scale_check: ScaleCheck | None = None
     """None where the reconstruction's unit is not meant to be the metre."""
     scale_from_robot_alone: bool = False
-    """No length that is known otherwise, and no depth camera, had a say."""
+    """Neither a known length nor a depth camera took part."""
     lens_shift: Float[ndarray, "7"] | None = None
     """How far the intrinsics that the images show, in place of the one given, would move the answer; in
     COVARIANCE_ORDER,

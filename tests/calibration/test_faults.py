@@ -106,5 +106,5 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     assert SCALE_FROM_ROBOT in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
-    assert "4.8 ± 0.2 % larger than told" in metric.warnings[0]
+    assert "4.8 ± 0.2 % larger than given" in metric.warnings[0]
     assert SCALE_FROM_ROBOT not in calibration_file(capture, reconstruction, metric, {}, "").notes

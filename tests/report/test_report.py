@@ -233,7 +233,7 @@ def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(
     run: RunResult, page: str, capsys: pytest.CaptureFixture[str]
 ):
     content = run.calibration
-    assert content.notes == ["a <note> & more"] and content.warnings[-1] == "a <pose> is off"
+    assert content.notes[0] == "a <note> & more" and content.warnings[-1] == "a <pose> is off"
     page = page.partition('<section class="warnings" id="warnings">')[2]
     warned, _, noted = page.partition('<section class="notes" id="notes">')
     assert "a &lt;pose&gt; is off" in warned and "a &lt;note&gt;" not in warned
@@ -350,7 +350,7 @@ def test_unseen_direction_has_a_red_bar(run: RunResult):
     turned[:, :3, :3] = rotation_exp(yaw) @ turned[0, :3, :3]
     bars = excitation_bars(excitation(turned, result.hand_eye.gripper_from_camera))
     red = re.findall(r'class="rejected"><th>([^<]*)</th>', bars)
-    assert len(red) == 1 and "offset" in red[0] and bars.index("rejected") < bars.index('"used"')
+    assert len(red) == 1 and "translation" in red[0] and bars.index("rejected") < bars.index('"used"')
 
 
 def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):

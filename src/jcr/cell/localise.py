@@ -4,7 +4,7 @@ Features that it shares with two or more images of known pose become points; the
 agree (P3P in RANSAC, with a focal length where none is given). Points and all their observations are kept, for the
 bundle adjustment of all images. A place that rests on few points by SIFT is refined with learned features, where these
 are installed. They alone place nothing: to a network another board of the same kind is the same board, and so is a board
-rotated by a rotation by 180° (docs/cameras.md).
+rotated by 180° (`jcr docs cameras`).
 """
 
 import math

@@ -37,7 +37,6 @@ def posed_cameras(
         beside = None
         if camera.frame is not None:
             beside = tuple(int(np.flatnonzero(rows == camera.frame[k])[0]) for k in poses)
-        poses = np.stack([_pose(camera, found, k, grippers, bases) for k in used])
         out.append(
             PosedImages(
                 camera.folder or capture.folder,

@@ -170,7 +170,7 @@ def _others(
         else:
             continue
         arm = "" if found.arm is None else f" of arm {found.arm}"
-        doubt = "" if found.doubt is None else "\nnot to be trusted"
+        doubt = "" if found.doubt is None else "\nrejected"
         lens = found.intrinsics
         out.append(
             {
