@@ -53,7 +53,7 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     assert dispatch([*command, "--json"]) == 3
     told = capsys.readouterr()
     rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(told.out)["captures"]}
-    assert "of 4 captures failed or are not" in told.err and told.err.count("\n") == 1
+    assert "of 4 captures failed or are rejected" in told.err and told.err.count("\n") == 1
     assert rows["broken"].status == "failed" and "01.jpg: not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "not trusted" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None

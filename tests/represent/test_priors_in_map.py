@@ -44,17 +44,6 @@ def test_priors_make_surfaces_and_nothing_free() -> None:
     ).any()
 
 
-def test_doubtful_matches_free_nothing_either() -> None:
-    from jcr.represent.rays import frees
-
-    cloud = replace(analytic_scene.cloud(400), confidence=np.arange(400.0))
-    reason = np.repeat(np.array([MATCHED, BOTH, PRIOR, MATCHED], np.uint8), 100)
-    free = frees(replace(cloud, reason=reason))
-    assert free[100:200].all() and not free[200:300].any() and free[300:].all()
-    np.testing.assert_array_equal(free[:100], np.arange(100) >= 60)  # 30 % of 200 matches
-    assert frees(cloud).all() and frees(replace(cloud, reason=np.full(400, BOTH, np.uint8))).all()
-
-
 def test_a_cloud_keeps_reasons_and_sigmas_on_disk(tmp_path: Path) -> None:
     from jcr.represent.cloud_ply import read_cloud, write_cloud
 

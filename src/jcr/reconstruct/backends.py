@@ -214,7 +214,7 @@ BACKENDS: dict[str, Backend] = {
             auto=True,
             options=("features",),
             selected_by="features",
-            accuracy="0.05 mm and 0.005° on the bundled capture (jcr docs results/run)",
+            accuracy="0.20 mm and 0.036° on the bundled capture (jcr docs results/run)",
         ),
         Backend(
             "da3",

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.records import MATCHED, PRIOR, PointCloud
+from jcr.records import PRIOR, PointCloud
 from jcr.represent.seen import CROSSED, HIT, SeenGrid
 
 BEHIND = 2.0
@@ -20,10 +20,6 @@ CLEARANCE = 0.1
 
 NEAR = 2.0
 """Cells before a surface from which half of the negatives along the rays are drawn."""
-
-LEAST_SURE = 30.0
-"""Percent of the points that rest on matching alone, the least confident, whose rays show no free space: a depth that is
-wrong is one that few images agree on."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,7 @@ class Rays:
     """Metres from the point to its camera, or to where the ray enters the workspace."""
     weight: Float[Tensor, " n"]
     measured: Float[Tensor, " n"]
-    """1 where `frees` holds; 0 for points whose rays show no free space."""
+    """1; 0 for a prior, whose ray shows no free space."""
     targets: dict[str, Tensor]
     """What each point says of itself: color (n,3), label (n,), further values (n,d)."""
 
@@ -131,15 +127,6 @@ def workspace_box(
     return np.stack([np.minimum(lower, cameras.min(0)) - 0.05, np.maximum(upper, cameras.max(0)) + 0.05])
 
 
-def frees(cloud: PointCloud) -> Bool[ndarray, " n"]:
-    """Whether the way from the camera to each point counts as seen: not to priors, nor to doubtful matches."""
-    if cloud.reason is None:
-        return np.ones(len(cloud.points_in_base), bool)
-    alone = cloud.reason == MATCHED
-    least = np.percentile(cloud.confidence[alone], LEAST_SURE) if alone.any() else 0.0
-    return (cloud.reason != PRIOR) & ~(alone & (cloud.confidence < least))
-
-
 def workspace_rays(
     cloud: PointCloud,
     values: dict[str, Float[ndarray, "n d"]],
@@ -171,7 +158,7 @@ def workspace_rays(
     weight = np.clip(confidence / max(np.median(confidence), 1e-12), 0.25, 4.0)
     depth_std = 0.0 if cloud.depth_std is None else cloud.depth_std[inside]
     weight /= 1.0 + (cloud.margin[inside] ** 2 + depth_std**2) / cell**2
-    measured = frees(cloud)[inside]
+    measured = np.ones(len(inside)) if cloud.reason is None else cloud.reason[inside] != PRIOR
 
     targets: dict[str, ndarray] = {"color": cloud.color[inside] / np.float32(255)}
     for name, value in values.items():
