@@ -6,7 +6,9 @@ from typing import Any, no_type_check
 import numpy as np
 from numba import njit
 
-_OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy"}
+# Sums keep their order. Where the compiler may change it, a loop gives other bits fresh than from the cache, for it is
+# inlined otherwise; on 12 images of 400x300 that freedom saved no time.
+_OPTIONS = {"nogil": True, "fastmath": {"nnan", "ninf", "nsz"}, "error_model": "numpy"}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
