@@ -1,5 +1,8 @@
 """Dense depth on a scene whose depth is known: a box on a table, drawn by casting rays."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -176,6 +179,33 @@ def test_windows_lie_on_slopes() -> None:
     middle = np.s_[1, 20:-20, 40:-40]
     assert (score[middle] > 0.8).mean() > 0.9
     assert (np.abs(inverse_depth * np.stack(depths) - 1)[middle] < 0.005).mean() > 0.95
+
+
+MATCH_NOISE = """
+import hashlib
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from jcr.reconstruct.depth.matched import match_depth
+from jcr.records import Intrinsics
+texture = gaussian_filter(np.random.default_rng(0).uniform(0, 255, (60, 120, 3)), (1.5, 1.5, 0))
+images = np.stack([texture[:, 10 * k : 10 * k + 80] for k in range(3)]).astype(np.uint8)
+poses = np.tile(np.eye(4), (3, 1, 1))
+poses[:, 0, 3] = 0.1 * np.arange(3)
+planes = np.tile([[[0, 0, 0.3], [0, 0, 1.2]]], (3, 1, 1))
+neighbours = [np.array([1, 2]), np.array([0, 2]), np.array([1, 0])]
+depth = match_depth(images, poses, Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60), neighbours, planes, 1, lambda _: None)
+print(hashlib.sha256(np.stack(depth).tobytes()).hexdigest())
+"""
+
+
+def test_loops_give_the_same_bits_freshly_compiled_and_from_the_cache(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MATCH_NOISE]
+    at = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    compiled, cached = (
+        subprocess.run(command, env=at, capture_output=True, text=True, check=True) for _ in "12"
+    )
+    assert any(tmp_path.rglob("*.nbc"))
+    assert compiled.stdout == cached.stdout
 
 
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
