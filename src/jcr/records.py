@@ -471,6 +471,15 @@ class PointCloud:
     camera_centers_in_base: Float[ndarray, "m 3"]
     label_names: tuple[str, ...] = field(default=("none",))
     reason: UInt8[ndarray, " n"] | None = None
-    """MATCHED, PRIOR or BOTH; the ray of a PRIOR shows no free space. None: no point is a prior."""
+    """MATCHED, PRIOR or BOTH; None: no point is a prior."""
     depth_std: Float[ndarray, " n"] | None = None
     """One sigma (m) of the depth in its image; None: not known."""
+    clears: Bool[ndarray, " n"] | None = None
+    """Whether the way from the camera to the point counts as seen free; None: every one but to a PRIOR."""
+
+    @property
+    def cleared(self) -> Bool[ndarray, " n"]:
+        """`clears`, with what None stands for."""
+        if self.clears is not None:
+            return self.clears
+        return np.ones(len(self.image), bool) if self.reason is None else self.reason != PRIOR

@@ -15,7 +15,17 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.geometry import inverse, scale_translation, transform
 from jcr.reconstruct.added import extend
-from jcr.records import Capture, HandEye, Observability, Reconstruction, RobotNoise, Tracks
+from jcr.records import (
+    BOTH,
+    MATCHED,
+    PRIOR,
+    Capture,
+    HandEye,
+    Observability,
+    Reconstruction,
+    RobotNoise,
+    Tracks,
+)
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.simulate.capture import SimulateOptions, simulate
@@ -145,6 +155,25 @@ def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
     low, high = np.array([-0.25, -0.25, -0.1]), np.array([0.25, 0.25, 0.4])
     x = np.random.default_rng(0).uniform(low, high, (count, 3)) * thing.box_size
     return x @ thing.base_from_box[:3, :3].T + thing.base_from_box[:3, 3]
+
+
+def test_the_least_sure_matches_clear_nothing_but_in_added_images(truth: Truth, capture: Capture):
+    made, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 3)
+    draw = np.random.default_rng(0)
+    made = replace(
+        made,
+        reason=draw.choice(np.array([MATCHED, BOTH, PRIOR], np.uint8), made.confidence.shape),
+        confidence=made.confidence * draw.uniform(1, 2, made.confidence.shape),
+        image_index=np.array([0, 1, len(capture)]),
+    )
+    cloud = point_cloud(capture, made, hand_eye, options=CloudOptions(confidence_percentile=0.0))
+    added, alone = cloud.image == 2, cloud.reason == MATCHED
+    np.testing.assert_array_equal(cloud.cleared[added], cloud.reason[added] != PRIOR)
+    np.testing.assert_array_equal(cloud.cleared[~alone], cloud.reason[~alone] != PRIOR)
+    sure = cloud.cleared[alone & ~added]
+    assert sure.mean() == pytest.approx(0.7, abs=0.001)
+    confidence = cloud.confidence[alone & ~added]
+    assert confidence[sure].min() >= confidence[~sure].max()
 
 
 def test_a_thing_that_was_taken_away_leaves_the_map(truth: Truth, capture: Capture, tmp_path: Path):

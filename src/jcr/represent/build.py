@@ -13,7 +13,7 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
 from jcr.reconstruct.threads import threads_of_one_core
-from jcr.records import PRIOR, PointCloud
+from jcr.records import PointCloud
 from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
 from jcr.represent.options import MapOptions
@@ -57,7 +57,7 @@ def build_scene(
     # Rays that end beyond the workspace cross it all the same.
     image = torch.as_tensor(cloud.image, device=device)
     centers = tensor(cloud.camera_centers_in_base)
-    measured = None if cloud.reason is None else torch.as_tensor(cloud.reason != PRIOR, device=device)
+    measured = torch.as_tensor(cloud.cleared, device=device)
     seen = carve(tensor(cloud.points_in_base), image, centers, tensor(box), cell / 2, measured)
     carved = time.perf_counter()
     lattices = feature_lattices(seen) if recipe.grids else []

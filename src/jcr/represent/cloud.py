@@ -1,13 +1,17 @@
 """From pointmaps and a calibration to one metric point cloud in the base frame (paper, section IV-C)."""
 
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Bool, Float, Integer, UInt8
 from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
-from jcr.records import MATCHED, Capture, HandEye, PointCloud, Reconstruction
+from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions
+
+LEAST_SURE = 30.0
+"""Percent of the points that rest on matching alone, the least confident, to which the way counts as seen by no one:
+few images agree on them, and a depth that ends too deep is one of theirs. It takes a third of what is free and wrong."""
 
 
 def point_cloud(
@@ -44,22 +48,40 @@ def point_cloud(
         pixel = np.sort(draw.choice(pixel, options.max_points, replace=False))
 
     image = pixel // confidence[0].size
+    confident = confidence.reshape(-1)[pixel].astype(np.float64)
+    reason = None if reconstruction.reason is None else reconstruction.reason.reshape(-1)[pixel]
     x_in_recon = reconstruction.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
     recon_from_camera = scale_translation(reconstruction.recon_from_camera, hand_eye.scale)
     return PointCloud(
         points_in_base=apply_similarity(hand_eye.base_from_recon, hand_eye.scale, x_in_recon),
         color=reconstruction.colors.reshape(-1, 3)[pixel],
-        confidence=confidence.reshape(-1)[pixel].astype(np.float64),
+        confidence=confident,
         margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),
         label=np.zeros(len(pixel), int) if labels is None else labels.reshape(-1)[pixel].astype(int),
         image=image,
         camera_centers_in_base=apply(hand_eye.base_from_recon, recon_from_camera[:, :3, 3]),
         label_names=label_names,
-        reason=None if reconstruction.reason is None else reconstruction.reason.reshape(-1)[pixel],
+        reason=reason,
         depth_std=None
         if reconstruction.depth_std is None
         else hand_eye.scale * reconstruction.depth_std.reshape(-1)[pixel].astype(np.float64),
+        clears=None
+        if reason is None
+        else _clears(reason, confident, reconstruction.image_index[image] >= len(capture)),
     )
+
+
+def _clears(
+    reason: UInt8[ndarray, " n"], confidence: Float[ndarray, " n"], added: Bool[ndarray, " n"]
+) -> Bool[ndarray, " n"]:
+    """The points to which the way is free: no priors, no doubtful matches.
+
+    Images that were `added` to a run show what has changed, where the others contradict them: there no match is too
+    doubtful to say that a thing was taken away.
+    """
+    alone = (reason == MATCHED) & ~added
+    least = np.percentile(confidence[alone], LEAST_SURE) if alone.any() else 0.0
+    return (reason != PRIOR) & ~(alone & (confidence < least))
 
 
 def position_std(

@@ -9,7 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.errors import InputError
-from jcr.records import PRIOR, PointCloud
+from jcr.records import PointCloud
 from jcr.represent.seen import CROSSED, HIT, SeenGrid
 
 BEHIND = 2.0
@@ -158,7 +158,7 @@ def workspace_rays(
     weight = np.clip(confidence / max(np.median(confidence), 1e-12), 0.25, 4.0)
     depth_std = 0.0 if cloud.depth_std is None else cloud.depth_std[inside]
     weight /= 1.0 + (cloud.margin[inside] ** 2 + depth_std**2) / cell**2
-    measured = np.ones(len(inside)) if cloud.reason is None else cloud.reason[inside] != PRIOR
+    measured = cloud.cleared[inside]
 
     targets: dict[str, ndarray] = {"color": cloud.color[inside] / np.float32(255)}
     for name, value in values.items():

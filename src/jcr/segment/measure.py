@@ -22,6 +22,10 @@ EDGE_SHARE = 0.4
 """Of the median density seen from above below which a cell holds the fringe of wrong depths beside an outline."""
 SIDE_SHARE = 0.005
 """Of the area seen from above that lies beyond each side, where noise has put it."""
+RIM = 0.006
+"""Width (m) of the band along a top's outline in which a rim is looked for that stands above the rest."""
+SECTORS, FEWEST_IN_SECTOR = 24, 8
+"""Directions from a top's middle in which a rim shows, and the points that a direction needs to count."""
 SAME_TOP = 0.05
 """Of the height by which images left out may move the top (jackknife) when it is the same top they show."""
 
@@ -178,7 +182,8 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
 
     Over the heights a flat top is a peak of the density and a round one a step. The highest peak that is no
     scatter is taken, and the median of the heights around it. (A high quantile instead is lifted by the points
-    that stray above narrow tops, by 2 % and more.)
+    that stray above narrow tops, by 2 % and more.) Where the outline stands above that peak all around, as of a can
+    whose lid is sunk, the top is the rim's.
     """
     height = x_in_support[:, 2]
     width = max(2 * roughness, SHARPEST)
@@ -196,8 +201,36 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
     # Where matching windows straddle a rim, depth is drawn down. The median of a wide top does not suffer; that of
     # a top that is all rim does, by a cell at most. The cube was fitted to scenes 3 to 5 of `jcr bench table2`.
     top = binary_closing(_counted(x_in_support[around, :2]) > 0, np.ones((3, 3)))
-    rim = 1 - binary_erosion(top, np.ones((3, 3))).sum() / max(top.sum(), 1)
-    return middle, float(CELL * rim**3), spread
+    narrow = 1 - binary_erosion(top, np.ones((3, 3))).sum() / max(top.sum(), 1)
+    rim, above_lid = _rim(x_in_support[height > middle - 2.5 * width])
+    if len(rim) > SECTORS / 2 and np.mean(above_lid > width) > 0.75:
+        # It is as narrow as a pixel, and drawn down towards the lid by an unknown part of the step.
+        edge = float(np.median(rim))
+        return edge, (edge - middle) / 2, float(rim.std())
+    return middle, float(CELL * narrow**3), spread
+
+
+def _rim(x_in_support: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " s"], Float[ndarray, " s"]]:
+    """Height of a top's outline in every direction that shows enough of it, and how far its middle one is above the rest.
+
+    The first is what a tenth of the points exceeds; medians are compared, for what single images have too high by their
+    errors is as much within as at the outline.
+    """
+    xy, height = x_in_support[:, :2], x_in_support[:, 2]
+    from_middle = xy - (xy.min(0) + xy.max(0)) / 2
+    sector = ((np.arctan2(*from_middle.T) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    distance = np.linalg.norm(from_middle, axis=1)
+    within, rim, middle = np.zeros(len(xy), bool), [], []
+    for k in range(SECTORS):
+        here = sector == k
+        if here.sum() >= FEWEST_IN_SECTOR:
+            outline = np.quantile(distance[here], 0.98)
+            band = here & (distance > outline - RIM)
+            rim.append(np.quantile(height[band], 0.9))
+            middle.append(np.median(height[band]))
+            within |= here & (distance < outline - 2 * RIM)
+    lid = np.median(height[within]) if within.any() else np.inf
+    return np.array(rim), np.array(middle) - lid
 
 
 def _counted(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "c r"]:

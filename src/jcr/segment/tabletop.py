@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, transform
-from jcr.records import PointCloud
+from jcr.records import PRIOR, PointCloud
 from jcr.segment.options import TabletopOptions
 
 
@@ -45,6 +45,8 @@ PATCH = 0.02
 """Metres over which a table is taken for flat, however it is bent."""
 LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
 """Cosine to the base frame's z axis from which a plane is level, and how many times its points then count."""
+FEWEST_MEASURED = 1000
+"""Points that were measured from which a support plane is told without those that were filled in."""
 PLANES, SAMPLE = 400, 20_000
 """Planes through three random points that are tried, and points each is tried on."""
 
@@ -52,10 +54,14 @@ PLANES, SAMPLE = 400, 20_000
 def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     """The plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
+    What was filled in by planes is left out of the fit and its noise: it lies where a plane was believed to be.
     Raises InputError when no plane holds a tenth of the points.
     """
     draw = np.random.default_rng(seed)
-    x = cloud.points_in_base
+    filled = np.zeros(len(cloud.image), bool) if cloud.reason is None else cloud.reason == PRIOR
+    if (~filled).sum() < FEWEST_MEASURED:
+        filled[:] = False
+    x, image = cloud.points_in_base[~filled], cloud.image[~filled]
     if len(x) < 100:
         raise InputError(f"the cloud has {len(x)} points; a support plane needs some hundreds")
     some = x[draw.choice(len(x), min(SAMPLE, len(x)), replace=False)]
@@ -67,7 +73,7 @@ def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     side = np.sign(cloud.camera_centers_in_base @ normal.T - offset)
     one_sided = (np.abs(side.sum(0)) == len(side)) & (length[:, 0] > 1e-9)
     # A table's points are spread about it by the noise of depth, which is larger the farther the cameras are.
-    far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[cloud.image], axis=1))
+    far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[image], axis=1))
     count = (np.abs(some @ normal.T - offset) < 0.005 * far).sum(0) * one_sided
     # A wall behind the table may be seen more; arms that stand upright are the rule.
     level = np.abs(normal[:, 2]) > LEAST_LEVEL
@@ -96,7 +102,10 @@ def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     on = np.abs(distance) < 3 * noise
     _, place = np.unique(np.floor((x[on] - middle) @ rotation[:, :2] / PATCH), axis=0, return_inverse=True)
     bend = ndimage.median(distance[on], place, np.arange(place.max() + 1))
-    return Support(transform(rotation, middle), noise, min(_noise(distance[on] - bend[place]), noise), on)
+    on_plane = np.abs((cloud.points_in_base - middle) @ up) < 3 * noise
+    return Support(
+        transform(rotation, middle), noise, min(_noise(distance[on] - bend[place]), noise), on_plane
+    )
 
 
 def _noise(distance: Float[ndarray, " n"]) -> float:
