@@ -45,6 +45,8 @@ FAR_SCALE = float(np.log(1.2))
 """Metric networks are a few percent off, at times ten; beyond this a unit is wrong or the calibration."""
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses say."""
+MOST_OBSERVATIONS = 60_000
+"""Adjusted with the robot, which limits what more of them could add: 25 images of 640x480 have as many."""
 METRIC_STD = 0.005
 """Relative; a printed marker has the size that its maker says to half a percent."""
 
@@ -124,7 +126,7 @@ def _calibrated(
     if contradiction is not None:
         return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
     used = hand_eye.inliers
-    tracks = of_images(reconstruction.tracks, used)
+    tracks = _some_of_many(of_images(reconstruction.tracks, used))
     adjustable = (
         options.bundle_adjustment
         # What pointmaps say of the cameras is in their covariance, with the errors that neighbours share; their
@@ -392,6 +394,18 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     kept = used[tracks.image]
     row = np.cumsum(used) - 1
     return replace(tracks, image=row[tracks.image[kept]], x_px=tracks.x_px[kept], point=tracks.point[kept])
+
+
+def _some_of_many(tracks: Tracks) -> Tracks:
+    """All observations, or where there are more than are adjusted those of a random choice of the points."""
+    if len(tracks.image) <= MOST_OBSERVATIONS:
+        return tracks
+    count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
+    order = np.random.default_rng(0).permutation(len(count))
+    chosen = np.zeros(len(count), bool)
+    chosen[order[np.cumsum(count[order]) <= MOST_OBSERVATIONS]] = True
+    rows = chosen[tracks.point]
+    return replace(tracks, image=tracks.image[rows], x_px=tracks.x_px[rows], point=tracks.point[rows])
 
 
 def _refined(

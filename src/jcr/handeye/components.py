@@ -239,19 +239,30 @@ def _cholesky(matrix: Float[ndarray, "*k n n"]) -> Float[ndarray, "*k n n"]:
 def most_likely(
     equations: Equations, start: LogSizes | None = None, settled: float = SETTLED
 ) -> tuple[LogSizes, Float[ndarray, "c c"]]:
-    """Log sizes at the mode of their posterior, and the information there (Fisher scoring to a last step `settled`)."""
+    """Log sizes at the mode of their posterior, and the expected information there, to a last step `settled`.
+
+    By Fisher scoring, with the curvature that the last step showed (BFGS, Nocedal and Wright, "Numerical optimization",
+    2006, eq. 6.19): where the expected information is half of it, steps swing about the mode.
+    """
     at = np.log(equations.typical) if start is None else start
     value, gradient, information = _score(equations, at)
+    curvature = information
     for _ in range(40):
-        step = np.linalg.solve(information, gradient)
+        step = np.linalg.solve(curvature, gradient)
         step /= max(1.0, float(np.abs(step).max()))
         while (scored := _score(equations, at + step))[0] < value and np.abs(step).max() > settled:
             step = step / 2
         if scored[0] < value:
             break
-        gained = scored[0] - value
+        gained, fell = scored[0] - value, gradient - scored[1]
         at = at + step
         value, gradient, information = scored
+        curvature = information
+        if step @ fell > 0:
+            along = information @ step
+            curvature = (
+                information - np.outer(along, along) / (step @ along) + np.outer(fell, fell) / (step @ fell)
+            )
         if np.abs(step).max() < settled or gained < 1e-9:
             break
     return at, information

@@ -51,6 +51,8 @@ _GUIDED_PARTNERS = 6
 """Images with which one that was left out is matched along epipolar lines."""
 _PREDICTED_STD = 0.008
 """rad, of directions predicted by X and the robot."""
+_MANY, _GROWN = 40, 1.3
+"""From so many images on COLMAP adjusts the whole map only when it has grown by this factor (its default is 1.1)."""
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""
@@ -235,6 +237,8 @@ def _map_incrementally(
     The share of images in the model is reported; it falls back where another start is tried.
     """
     pipeline = _pipeline(known, seed)
+    if n_images > _MANY:
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
     mapper = pipeline.mapper
     best, registered = None, 0
     for init_inliers, init_angle_deg, inliers in ((100, 16.0, 30), (50, 8.0, 15)):

@@ -9,7 +9,7 @@ from jcr.geometry import apply, apply_similarity, inverse, scale_translation, sk
 from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions
 
-LEAST_SURE = 30.0
+LEAST_SURE = 40.0
 """Percent of the points that rest on matching alone, the least confident, to which the way counts as seen by no one:
 few images agree on them, and a depth that ends too deep is one of theirs. It takes a third of what is free and wrong."""
 

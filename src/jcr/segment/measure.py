@@ -211,9 +211,9 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
 
 
 def _rim(x_in_support: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " s"], Float[ndarray, " s"]]:
-    """Height of a top's outline in every direction that shows enough of it, and how far its middle one is above the rest.
+    """Height of a top's outline in every direction that shows enough of it, and how far its median is above the rest's.
 
-    The first is what a tenth of the points exceeds; medians are compared, for what single images have too high by their
+    The first is what a tenth of the points exceeds. Medians are compared, for what single images have too high by their
     errors is as much within as at the outline.
     """
     xy, height = x_in_support[:, :2], x_in_support[:, 2]
