@@ -103,6 +103,21 @@ def again(
     return replace(choice, attempts=earlier or choice.attempts)
 
 
+def deepened(
+    capture: Capture, choice: Choice, options: ReconstructOptions, progress: Progress | None = None
+) -> Choice:
+    """A choice that was made without dense depth, with it; raises as `choose` does where the memory is too small."""
+    if not BACKENDS[choice.reconstruction.backend].hub_id:
+        plan_depth(capture, options)
+    start = time.perf_counter()
+    made = with_depth_of(capture, choice.reconstruction, options, progress)
+    give_back()
+    seconds = choice.timings_s["reconstruct"] + time.perf_counter() - start
+    return replace(
+        choice, reconstruction=made, timings_s=choice.timings_s | {"reconstruct": round(seconds, 3)}
+    )
+
+
 @dataclass(frozen=True)
 class _Tried:
     """One attempt with all that it made."""

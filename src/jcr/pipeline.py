@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr import __version__
-from jcr.attempts import Choice, NothingFoundError, again, choose, timings_of
+from jcr.attempts import Choice, NothingFoundError, again, choose, deepened, timings_of
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
@@ -120,7 +120,7 @@ def build_map(
 
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
     not the calibration, and every later map of the folder has them. Where the folder was made without dense depth,
-    the reconstruction is made again with it.
+    the reconstruction gets it.
     """
     made_with = RunFolder(Path(out)).options()
     reconstruct = replace(made_with.reconstruct, dense=True)
@@ -209,12 +209,16 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
             options = dense  # it is there already
     state = state_of(capture, options.reconstruct, options.calibrate)
     try:
-        choice = _kept(capture, folder, state, progress) or choose(
-            capture,
-            options.reconstruct,
-            options.calibrate,
-            progress,
-            lambda made: folder.keep_reconstruction(made, state),
+        choice = (
+            _kept(capture, folder, state, progress)
+            or _deepened(capture, folder, options, state, progress)
+            or choose(
+                capture,
+                options.reconstruct,
+                options.calibrate,
+                progress,
+                lambda made: folder.keep_reconstruction(made, state),
+            )
         )
     except NothingFoundError as nothing:
         error = nothing if options.reconstruct.board else _with_board(nothing, capture)
@@ -334,6 +338,21 @@ def _kept(capture: Capture, folder: RunFolder, state: State, progress: Progress)
     reconstruction = folder.reconstruction()
     seconds = _seconds_since(start)
     return again(capture, reconstruction, seconds, earlier.attempts, state.options.calibrate, progress)
+
+
+def _deepened(
+    capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
+) -> Choice | None:
+    """What an earlier run chose from the same input without dense depth, with it; None where it is to be made."""
+    if not options.reconstruct.dense or options.calibrate.known_length is not None:
+        return None
+    without = _with_dense(options, False)
+    choice = _kept(capture, folder, state_of(capture, without.reconstruct, without.calibrate), progress)
+    if choice is None:
+        return None
+    choice = deepened(capture, choice, options.reconstruct, progress)
+    folder.keep_reconstruction(choice.reconstruction, state)
+    return choice
 
 
 def _with_board(error: NothingFoundError, capture: Capture) -> NothingFoundError:

@@ -15,6 +15,7 @@ import pytest
 import jcr
 from jcr.cli import COMMANDS, dispatch
 from jcr.represent.cloud_ply import read_cloud
+from jcr.represent.options import MapOptions
 
 pytestmark = pytest.mark.slow
 
@@ -83,6 +84,20 @@ def test_the_same_command_again_resumes_and_gives_the_same_bits(done: Path, tabl
     assert (done / "reconstruction.npz").stat().st_mtime_ns == stamp
     assert after["gripper_from_camera"] == before["gripper_from_camera"]
     assert after["scale"] == before["scale"]
+
+
+def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(small_capture: Path, tmp_path: Path):
+    capture, stages = jcr.read_capture(small_capture), list[str]()
+    jcr.calibrate(capture, tmp_path / "out")
+    options = MapOptions(max_seconds=1.0)
+    mapped = jcr.build_map(tmp_path / "out", map=options, progress=lambda stage, share: stages.append(stage))
+    assert "dense depth" in stages and "matching" not in stages
+    assert jcr.measure(tmp_path / "out").objects
+    whole = jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options))
+    one, other = mapped.reconstruction, whole.reconstruction
+    np.testing.assert_array_equal(one.points_in_recon, other.points_in_recon)
+    np.testing.assert_array_equal(one.confidence, other.confidence)
+    np.testing.assert_array_equal(mapped.gripper_from_camera, whole.gripper_from_camera)
 
 
 def result_points(done: Path) -> np.ndarray:
