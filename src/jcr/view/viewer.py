@@ -133,10 +133,10 @@ class Viewer:
             self.image = server.gui.add_slider("image", 0, len(run.calibration.images) - 1, 1, 0)
             self._about_image = server.gui.add_markdown("")
             look = server.gui.add_button("look from this camera")
-            self.photo = server.gui.add_slider("photograph over the map (%)", 0, 100, 5, 0)
+            self.photo = server.gui.add_slider("photograph", 0, 100, 5, 0, hint="laid over the map, %")
             self.show_cameras = server.gui.add_checkbox("cameras", True)
             self.show_grippers = server.gui.add_checkbox("grippers", True)
-            self.show_grid = server.gui.add_checkbox("ground grid (0.1 m, base z = 0)", True)
+            self.show_grid = server.gui.add_checkbox("grid", True, hint="0.1 m, base z = 0")
             self.show_robot = server.gui.add_checkbox("robot", True, visible=self.joint_values is not None)
         self.image.on_update(lambda _: self.choose_image())
         for switch in (self.show_cameras, self.show_grippers, self.show_robot, self.show_grid, self.photo):
@@ -147,7 +147,9 @@ class Viewer:
         names = (MAP, CLOUD, "none") if self.scene is not None else (CLOUD, "none")
         with self.server.gui.add_folder("Points"):
             self.shown = self.server.gui.add_dropdown("show", names, initial_value=names[0])
-            self.show_tracks = self.server.gui.add_checkbox("tracked features (red)", self.scene is None)
+            self.show_tracks = self.server.gui.add_checkbox(
+                "features", self.scene is None, hint="tracked, red"
+            )
             self.size = self.server.gui.add_slider("size (mm)", 1.0, 15.0, 0.5, 5.0)
         for control in (self.shown, self.show_tracks, self.size):
             control.on_update(lambda _: self.show_points())
@@ -162,7 +164,7 @@ class Viewer:
             self.threshold = gui.add_slider("occupancy over", LEAST, 0.98, 0.02, 0.5)
             self.colored = gui.add_dropdown("coloured by", colors, initial_value="color")
             self._legend = gui.add_html("")
-            self.show_unknown = gui.add_checkbox("edge of the unknown", False)
+            self.show_unknown = gui.add_checkbox("unknown", False, hint="where sight ended")
             self.unknown = gui.add_dropdown("unknown is", ("occupied", "free"), initial_value="occupied")
             self.slice_of = gui.add_dropdown("slice", ("none", *get_args(SliceOf)), initial_value="none")
             self._slice_legend = gui.add_html("")
@@ -405,7 +407,7 @@ class Viewer:
         target = np.median(self._solid(), axis=0)
         cameras = self.run.base_from_camera[:, :3, 3]
         reach = max(0.3, float(np.linalg.norm(cameras - target, axis=1).max(initial=0.0)))
-        eye = target + 1.9 * reach * np.array([0.62, -0.62, 0.6])
+        eye = target + 1.6 * reach * np.array([0.62, -0.62, 0.6])
         self.server.initial_camera.position, self.server.initial_camera.look_at = eye, target
 
 
