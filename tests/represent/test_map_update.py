@@ -26,7 +26,7 @@ from jcr.records import (
     RobotNoise,
     Tracks,
 )
-from jcr.represent.cloud import point_cloud
+from jcr.represent.cloud import LEAST_SURE, point_cloud
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render
@@ -171,7 +171,7 @@ def test_the_least_sure_matches_clear_nothing_but_in_added_images(truth: Truth, 
     np.testing.assert_array_equal(cloud.cleared[added], cloud.reason[added] != PRIOR)
     np.testing.assert_array_equal(cloud.cleared[~alone], cloud.reason[~alone] != PRIOR)
     sure = cloud.cleared[alone & ~added]
-    assert sure.mean() == pytest.approx(0.7, abs=0.001)
+    assert sure.mean() == pytest.approx(1 - LEAST_SURE / 100, abs=0.001)
     confidence = cloud.confidence[alone & ~added]
     assert confidence[sure].min() >= confidence[~sure].max()
 

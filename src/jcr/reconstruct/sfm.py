@@ -52,7 +52,7 @@ _GUIDED_PARTNERS = 6
 _PREDICTED_STD = 0.008
 """rad, of directions predicted by X and the robot."""
 _MANY, _GROWN = 40, 1.3
-"""From so many images on COLMAP adjusts the whole map only when it has grown by this factor (its default is 1.1)."""
+"""Of more images than the first, COLMAP adjusts all only when the map has grown by the second (its default: 1.1)."""
 _ENOUGH = 1e-6
 """Relative change of a cost that ends an adjustment: with COLMAP's 0 it takes three times as long, and cameras come out
 1e-5 of their distance elsewhere."""

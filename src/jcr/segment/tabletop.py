@@ -46,7 +46,7 @@ PATCH = 0.02
 LEAST_LEVEL, LEVEL_WEIGHT = 0.9, 5
 """Cosine to the base frame's z axis from which a plane is level, and how many times its points then count."""
 FEWEST_MEASURED = 1000
-"""Points that were measured from which a support plane is told without those that were filled in."""
+"""Measured points from which a support plane is fitted without those that were filled in."""
 PLANES, SAMPLE = 400, 20_000
 """Planes through three random points that are tried, and points each is tried on."""
 
