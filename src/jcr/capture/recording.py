@@ -68,6 +68,11 @@ def capture_of_recording(
         for k, (_, picture, _) in enumerate(pictures(rows)):
             values.append(sharpness(picture))
             report("frames", 0.1 + 0.7 * k / len(rows))
+        if len(values) < len(rows):
+            raise InputError(
+                f"{source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its index says; "
+                "it is damaged: repair it (`mcap recover`, `ros2 bag reindex`) or record again"
+            )
         return np.array(values)
 
     rows, remarks = best_frames(base_from_gripper, speed, fresh, sharpness_of, options.frames)
