@@ -114,6 +114,10 @@ def _correlation(v, u, p0, p1, p2, n, greys, others, weight, weighted, moments, 
     product = np.float32(0)
     tap = np.uint32(0)
     for i in range(-REACH, REACH + 1):
+        # A row's sums of their own: one long chain of additions would wait for itself.
+        row_mean = np.float32(0)
+        row_square = np.float32(0)
+        row_product = np.float32(0)
         for j in range(-REACH, REACH + 1):
             px = cu + np.float32(j) * uu + np.float32(i) * uv
             py = cv + np.float32(j) * vu + np.float32(i) * vv
@@ -125,10 +129,13 @@ def _correlation(v, u, p0, p1, p2, n, greys, others, weight, weighted, moments, 
             low = g10 + fx * (g11 - g10)
             g = top + fy * (low - top)
             k_g = weight[v, u, tap] * g
-            mean += k_g
-            square += k_g * g
-            product += weighted[v, u, tap] * g
+            row_mean += k_g
+            row_square += k_g * g
+            row_product += weighted[v, u, tap] * g
             tap += one
+        mean += row_mean
+        square += row_square
+        product += row_product
     variance = max(square - mean * mean, np.float32(0))
     noise = np.float32(NOISE * NOISE)
     spread = np.sqrt((moments[v, u, 1] + noise) * (variance + noise))
@@ -137,17 +144,23 @@ def _correlation(v, u, p0, p1, p2, n, greys, others, weight, weighted, moments, 
 
 @compiled
 @no_type_check
-def _score(v, u, p0, p1, p2, greys, others, asked, weight, weighted, moments, a, b, k):
+def _score(v, u, p0, p1, p2, greys, others, asked, weight, weighted, moments, a, b, k, least):
     """Mean of the best correlations of the window at (v, u) on plane p with the neighbours that it asks.
 
     `a` (n,3,3) is K R and `b` (n,3) K t to each neighbour, in rows `others` of `greys`; k is fx, fy, cx, cy; bit n of
-    `asked` (h,w) says whether a pixel asks the n-th.
+    `asked` (h,w) says whether a pixel asks the n-th. -1 where the last neighbour could not lift it above `least`.
     """
     first = np.float32(-1)
     second = np.float32(-1)
+    left = 0
+    for n in range(len(others)):
+        left += (asked[v, u] >> n) & 1
     for n in range(len(others)):
         if not (asked[v, u] >> n) & 1:
             continue
+        if left == 1 and len(others) >= BEST and first + 1 <= 2 * least and first + second <= 2 * least:
+            return np.float32(-1)
+        left -= 1
         score = _correlation(v, u, p0, p1, p2, n, greys, others, weight, weighted, moments, a, b, k)
         if score > first:
             first, second = score, first
@@ -225,7 +238,9 @@ def score_all(planes, score, greys, others, asked, weight, weighted, moments, a,
     for v in range(h):
         for u in range(w):
             p0, p1, p2 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
-            score[v, u] = _score(v, u, p0, p1, p2, greys, others, asked, weight, weighted, moments, a, b, k)
+            score[v, u] = _score(
+                v, u, p0, p1, p2, greys, others, asked, weight, weighted, moments, a, b, k, np.float32(-2)
+            )
 
 
 @compiled
@@ -268,9 +283,11 @@ def spread_planes(
                 if y < 0 or x < 0 or y >= h or x >= w:
                     continue
                 q0, q1, q2 = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2]
+                if q0 == planes[v, u, 0] and q1 == planes[v, u, 1] and q2 == planes[v, u, 2]:
+                    continue
                 if not _faces(q0, q1, q2, rx, ry):
                     continue
-                new = _score(v, u, q0, q1, q2, greys, others, asked, weight, weighted, moments, a, b, k)
+                new = _score(v, u, q0, q1, q2, greys, others, asked, weight, weighted, moments, a, b, k, best)
                 if new > best:
                     best = new
                     planes[v, u, 0], planes[v, u, 1], planes[v, u, 2] = q0, q1, q2
@@ -301,6 +318,7 @@ def spread_planes(
                     a,
                     b,
                     k,
+                    best,
                 )
                 if new > best:
                     best = new
@@ -318,8 +336,40 @@ def to_the_peak(planes, score, greys, others, asked, weight, weighted, moments, 
             p0, p1, p2 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
             rx, ry = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
             delta = np.float32(step * (p0 * rx + p1 * ry + p2))
-            left = _score(v, u, p0, p1, p2 - delta, greys, others, asked, weight, weighted, moments, a, b, k)
-            right = _score(v, u, p0, p1, p2 + delta, greys, others, asked, weight, weighted, moments, a, b, k)
+            left = _score(
+                v,
+                u,
+                p0,
+                p1,
+                p2 - delta,
+                greys,
+                others,
+                asked,
+                weight,
+                weighted,
+                moments,
+                a,
+                b,
+                k,
+                np.float32(-2),
+            )
+            right = _score(
+                v,
+                u,
+                p0,
+                p1,
+                p2 + delta,
+                greys,
+                others,
+                asked,
+                weight,
+                weighted,
+                moments,
+                a,
+                b,
+                k,
+                np.float32(-2),
+            )
             curvature = left - 2 * score[v, u] + right
             if curvature < -1e-6:
                 shift = (left - right) / (2 * curvature)
