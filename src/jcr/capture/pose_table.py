@@ -1,7 +1,7 @@
 """A table of gripper poses: columns by their names, TUM and ethz-asl trajectories, or a controller's rows."""
 
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,7 @@ def stamp_ns(text: str, where: str) -> int:
         if not -_LATEST_NS <= (stamp := int(value * unit_ns)) <= _LATEST_NS:
             raise ValueError
         return stamp
-    except (InvalidOperation, ValueError, OverflowError):
+    except (ArithmeticError, ValueError):  # of Decimal each has its own name
         raise InputError(f"{where}: {shown(text)} is no time stamp; give seconds or nanoseconds") from None
 
 
