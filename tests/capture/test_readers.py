@@ -422,7 +422,7 @@ def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProb
 
 @pytest.mark.parametrize("text", ["9700000000000000000", "1e30", "0.58E58800781040842", "nan", "now"])
 def test_a_stamp_that_64_bits_do_not_hold_is_refused(text: str):
-    """Two were found by fuzzing: the first made floats of all the stamps beside it, the third was too large to compare."""
+    """By fuzzing: the first made floats of all the stamps beside it, the third was too large to compare."""
     assert stamp_ns("9200000000000000000", "a table") == 9_200_000_000_000_000_000
     with pytest.raises(jcr.InputError, match="no time stamp"):
         stamp_ns(text, "a table")
