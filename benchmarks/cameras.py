@@ -237,7 +237,7 @@ def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Seq
         f"{_box()} mm in the gripper), 0.5 px of noise; intrinsics off by what is usual of given ones (0.5 % of focal "
         "length, 0.5 % of the width). No images: what bundle adjustment and the robots make of them. σ also counts "
         "what features of real images leave wrong in the intrinsics, and systematic errors of any arm: why squared "
-        "distance / 6 is below 1 here is in docs/cameras.md.",
+        "distance / 6 is below 1 here is in docs/how-to/cameras.md.",
         "",
         "| cell | errors | transform | median error | 95 % of errors below | σ per axis | inside 95 % | 99 % | > 3 σ | "
         "squared distance / 6 |",
