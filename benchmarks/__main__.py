@@ -30,8 +30,12 @@ class Bench:
     """Writes images beside its page."""
     of_captures: bool = False
     """Asks for the folder of captures."""
+    of_boards: bool = False
+    """And takes --boards."""
     measures: tuple[str, ...] = ()
     """Files and folders whose change makes its page old, beside the bench's own."""
+    long: str = ""
+    """What `--long` measures more of, for which `all` has no time."""
 
 
 SOLVER = (
@@ -58,11 +62,13 @@ BENCHES = {
     "table1": Bench(
         "hand-eye calibration from few images of three scenes, by the paper and by ours",
         measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/global_alignment", "src/jcr/simulate"),
+        long="two captures behind each line instead of one",
     ),
     "real": Bench(
         "real captures in DIR, against the references stored beside them",
         True,
         of_captures=True,
+        of_boards=True,
         measures=(
             *SOLVER,
             *FEATURES,
@@ -74,24 +80,27 @@ BENCHES = {
     ),
     "matching": Bench(
         "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
-        True,
         of_captures=True,
+        of_boards=True,
         measures=(*SOLVER, *FEATURES, *READING),
+        long="SIFT without the gate, and ALIKED, too",
     ),
     "cameras": Bench(
         "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld images of captures in DIR",
         of_captures=True,
         measures=(*SOLVER, *FEATURES, *READING, "src/jcr/cell", "src/jcr/simulate"),
+        long="40 draws of every kind of cell instead of 20",
     ),
     "gate": Bench(
         "scenes that mislead matching, with the robot's gate and without",
-        True,
         measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
+        long="two draws of every scene instead of one, and XFeat",
     ),
     "many": Bench(
-        "from 8 to 200 images: seconds and peak memory",
+        "seconds and peak memory by number of images",
         True,
         measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/simulate"),
+        long="128 and 200 images",
     ),
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time",
@@ -103,6 +112,7 @@ BENCHES = {
         "arms with systematic errors: is the answer within its sigma, and nearer than others'",
         draws=True,
         measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "src/jcr/simulate/problem.py"),
+        long="8 draws of every arm instead of 2",
     ),
     "limits": Bench(
         "where it breaks: one thing made worse at a time",
@@ -112,6 +122,7 @@ BENCHES = {
     "attack": Bench(
         "captures with one silent fault: named, refused, or wrong; and false alarms",
         measures=(*SOLVER, "src/jcr/simulate/observations.py", "src/jcr/simulate/faults.py"),
+        long="twice as many draws of everything",
     ),
     "table2": Bench(
         "heights of objects in simulated scenes, from 8 and 10 images",
@@ -136,6 +147,7 @@ BENCHES = {
         "the whole job from pointmaps with a network's errors: error, honesty, map, time",
         True,
         measures=(*SOLVER, "src/jcr/reconstruct/global_alignment", "src/jcr/reconstruct/from_pairs.py", *MAP),
+        long="three draws instead of one",
     ),
     "models": Bench(
         "any-view models from predictions with published errors, beside COLMAP and direct alignment",
@@ -150,6 +162,7 @@ BENCHES = {
         "global alignment: fast against adam, kinematic against free, in error, time and memory",
         True,
         measures=("src/jcr/reconstruct/global_alignment",),
+        long="3 draws of every number of images instead of 1, 10 of every calibration instead of 4",
     ),
     "pairs": Bench(
         "predicting pairs with every image encoded once, or with every pair",
@@ -176,9 +189,12 @@ BENCHES = {
         "many small captures by one process and by two: time, and memory while they run",
         True,
         measures=(*WHOLE, "src/jcr/batch.py"),
+        long="200 captures instead of 60",
     ),
 }
 """In the order of the README's claims."""
+LONG = "_long"
+"""Ends the name of a page that --long wrote."""
 
 if TYPE_CHECKING:
     BenchName = str
@@ -194,6 +210,7 @@ class Arguments:
       jcr bench calibrate
       jcr bench run --out docs/results
       jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
+      jcr bench robots --long --out docs/results
       jcr bench all captures --out docs/results
       jcr bench stale --write
     """
@@ -210,7 +227,9 @@ class Arguments:
     boards: tuple[str, ...] = ()
     """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Also write NAME.md in this folder, and the images of those benches that draw some."""
+    """Also write NAME.md in this folder (NAME_long.md with --long), and the images of those benches that draw some."""
+    long: bool = False
+    """Measure more than all has time for: more draws, images or methods."""
     resume: bool = False
     """For all: leave out the benches whose page is newer than the program's source files."""
     write: bool = False
@@ -231,24 +250,27 @@ def main(arguments: Arguments) -> int:
         raise InputError(
             f"bench {name}: name the folder that holds the captures, as in jcr bench {name} captures"
         )
-    if not BENCHES[name].of_captures and (arguments.captures is not None or arguments.boards):
-        raise InputError(f"bench {name}: takes no folder of captures and no --boards; leave them out")
+    if not BENCHES[name].of_captures and arguments.captures is not None:
+        raise InputError(f"bench {name}: takes no folder of captures; leave it out")
+    if not BENCHES[name].of_boards and arguments.boards:
+        raise InputError(f"bench {name}: takes no --boards; leave them out")
+    if arguments.long and not BENCHES[name].long:
+        raise InputError(f"bench {name}: has no --long; leave it out")
     bench = import_module(f"benchmarks.{name}")
-    if BENCHES[name].of_captures:
-        found = bench.run(arguments.captures, arguments.boards)
-    elif BENCHES[name].draws:
-        found = bench.run(arguments.out)
-    else:
-        found = bench.run()
+    asks = {"captures": BENCHES[name].of_captures, "boards": BENCHES[name].of_boards}
+    asks |= {"out": BENCHES[name].draws, "long": bool(BENCHES[name].long)}
+    found = bench.run(**{option: getattr(arguments, option) for option, is_asked in asks.items() if is_asked})
     table = heading(arguments) + found
     arguments.output.result(table, {"bench": name, "markdown": table})
     if arguments.out is not None:
-        write_text(arguments.out / f"{name}.md", table)
+        write_text(arguments.out / f"{name}{LONG if arguments.long else ''}.md", table)
     return 0
 
 
 def _all(arguments: Arguments) -> int:
     """Every bench; 1 when one of them failed."""
+    if arguments.long:
+        raise InputError("bench all: --long is of one bench at a time; leave it out")
     if arguments.out is None:
         raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
     from benchmarks.suite import Outcome, absent_networks, run, write_index
@@ -261,7 +283,7 @@ def _all(arguments: Arguments) -> int:
             del names[name]
             absent.append(f"{name}: no folder of captures was named")
         else:
-            boards = ["--boards", *arguments.boards] if arguments.boards else []
+            boards = ["--boards", *arguments.boards] if arguments.boards and BENCHES[name].of_boards else []
             given[name] = [str(arguments.captures), *boards]
 
     def report(outcome: Outcome) -> None:
@@ -307,13 +329,13 @@ def _stale(arguments: Arguments) -> int:
 
 def paths_of(page: str) -> tuple[str, ...] | None:
     """What the numbers of a page come from, the bench itself included; None for the index."""
-    name = {"real_all": "real"}.get(page, page)
+    name = page.removesuffix(LONG)
     return (*BENCHES[name].measures, f"benchmarks/{name}.py") if name in BENCHES else None
 
 
 def heading(arguments: Arguments) -> str:
     """What a reader needs to judge and repeat the numbers."""
-    command = ["jcr", "bench", arguments.name]
+    command = ["jcr", "bench", arguments.name, *(["--long"] if arguments.long else [])]
     if arguments.captures is not None:
         # Where they lie is the machine's own affair.
         command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]

@@ -29,8 +29,19 @@ from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.simulate.problem import HandEyeProblem, disturbed, error
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
-SEEDS = 3
-HAND_EYE_SEEDS = 10
+
+
+@dataclass(frozen=True)
+class Draws:
+    """How many of each."""
+
+    images: int
+    kinds: int
+    hand_eye: int
+
+
+FEW, MANY = Draws(1, 1, 4), Draws(3, 2, 10)
+"""MANY with --long."""
 FEW_STEPS = 3
 """Of adam at the large size, whose 300 take a quarter of an hour."""
 ERRORS = {
@@ -59,9 +70,12 @@ class Score:
     seconds: float
 
 
-def run() -> str:
+def run(long: bool = False) -> str:
     """Markdown tables: time and memory, accuracy over images, kinds of error, hand-eye from few images."""
-    return "\n\n".join([_cost(), _images(), _kinds(), _hand_eye()]) + "\n"
+    draws = MANY if long else FEW
+    return (
+        "\n\n".join([_cost(), _images(draws.images), _kinds(draws.kinds), _hand_eye(draws.hand_eye)]) + "\n"
+    )
 
 
 def camera_errors(
@@ -160,15 +174,15 @@ def _mean_row(name: str, scores: dict[str, list[Score]]) -> str:
     return f"| {name} | {cells[0]} | {cells[1]} |"
 
 
-def _images() -> str:
+def _images(draws: int) -> str:
     rows = [
-        f"Mean over seeds 0 to {SEEDS - 1} (worst in brackets), {_size(SMALL)}:\n",
+        f"Mean over {draws} draws (worst in brackets), {_size(SMALL)}:\n",
         "| images | fast | adam |",
         "|---|---|---|",
     ]
     for images in (6, 10, 15):
         scores: dict[str, list[Score]] = {"fast": [], "adam": []}
-        for seed in range(SEEDS):
+        for seed in range(draws):
             predictions, truth = synthetic_pairs(complete_pairs(images), SMALL, seed=seed)
             for method, list_of in scores.items():
                 list_of.append(_score(predictions, truth, method))
@@ -176,15 +190,15 @@ def _images() -> str:
     return "\n".join(rows)
 
 
-def _kinds() -> str:
+def _kinds(draws: int) -> str:
     rows = [
-        f"Mean over seeds 0 and 1 (worst in brackets), 8 images, {_size(SMALL)}:\n",
+        f"Mean over {draws} draws (worst in brackets), 8 images, {_size(SMALL)}:\n",
         "| errors of the predictions | fast | adam |",
         "|---|---|---|",
     ]
     for name, errors in ERRORS.items():
         scores: dict[str, list[Score]] = {"fast": [], "adam": []}
-        for seed in range(2):
+        for seed in range(draws):
             predictions, truth = synthetic_pairs(complete_pairs(8), SMALL, errors, seed)
             for method, list_of in scores.items():
                 list_of.append(_score(predictions, truth, method))
@@ -192,9 +206,9 @@ def _kinds() -> str:
     return "\n".join(rows)
 
 
-def _hand_eye() -> str:
+def _hand_eye(draws: int) -> str:
     rows = [
-        f"With the robot's poses, mean camera errors and median calibration errors over {HAND_EYE_SEEDS} seeds, "
+        f"With the robot's poses, mean camera errors and median calibration errors over {draws} draws, "
         f"{_size(SMALL)}. The robot pose noise is not told but estimated. `jcr` keeps the alignment that promises the "
         "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n",
         "| robot noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
@@ -202,7 +216,7 @@ def _hand_eye() -> str:
     ]
     for noise in ((0.0, 0.0), (5e-4, float(np.radians(0.1)))):
         for images in (3, 4, 5, 10):
-            trials = [_hand_eye_trial(images, seed, noise) for seed in range(HAND_EYE_SEEDS)]
+            trials = [_hand_eye_trial(images, seed, noise) for seed in range(draws)]
             free, kept, kinematic, *_ = np.mean(trials, axis=0)
             *_, mm, deg, percent, _ = np.median(trials, axis=0)
             sigmas = np.sqrt(np.mean([trial[-1] for trial in trials]) / 7)

@@ -18,28 +18,30 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Intrinsics
 from jcr.simulate.problem import hand_eye_problem
 
-CAPTURES, IMAGES = 200, 6
+CAPTURES, MANY, IMAGES = 60, 200, 6
+"""MANY with --long."""
 LENS = Intrinsics(30.0, 30.0, 15.5, 11.5, 32, 24)
 
 
-def run() -> str:
+def run(long: bool = False) -> str:
     """Markdown: seconds for all captures, and resident memory of all processes after each quarter of them."""
+    count = MANY if long else CAPTURES
     with tempfile.TemporaryDirectory(prefix="jcr-batch-") as name:
         folder = Path(name)
-        captures = [_capture(folder / f"capture{k:03d}", seed=k) for k in range(CAPTURES)]
+        captures = [_capture(folder / f"capture{k:03d}", seed=k) for k in range(count)]
         rows = {processes: _measured(captures, folder / f"out{processes}", processes) for processes in (1, 2)}
     seconds = {processes: row[0] for processes, row in rows.items()}
     lines = [
-        f"> {CAPTURES} small captures take {seconds[1]:.0f} s by one process and {seconds[2]:.0f} s by two.",
+        f"> {count} small captures take {seconds[1]:.0f} s by one process and {seconds[2]:.0f} s by two.",
         "",
-        f"{CAPTURES} captures of {IMAGES} images of {LENS.width}x{LENS.height} with pointmaps given (`--backend "
+        f"{count} captures of {IMAGES} images of {LENS.width}x{LENS.height} with pointmaps given (`--backend "
         "predictions --calibrate-only`); memory is the resident set of the command and of its workers together",
         "",
         "| processes | s | times one process | MiB after a quarter | half | three quarters | all |",
         "|---|---|---|---|---|---|---|",
     ]
     for processes, (took, memory) in rows.items():
-        quarters = " | ".join(f"{memory[CAPTURES * k // 4]:.0f}" for k in range(1, 5))
+        quarters = " | ".join(f"{memory[count * k // 4]:.0f}" for k in range(1, 5))
         lines.append(f"| {processes} | {took:.1f} | {seconds[1] / took:.2f} | {quarters} |")
     return "\n".join(lines) + "\n"
 

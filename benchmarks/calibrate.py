@@ -78,8 +78,8 @@ def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int]) -> list[str]:
         f"> Simulated poses, robot noise 0.5 mm and 0.1°, 10 images: {at[ours]} off (median), the paper's grid search "
         f"{at[papers]}.",
         f"> {most} wrong gripper poses among {MANY} images are all named, and no others, in {named[most]} of {TRIALS} "
-        f"captures, and the offset is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other method is off "
-        f"by {others:.0f} mm or more.",
+        f"captures, and the translation is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other method is "
+        f"off by {others:.0f} mm or more.",
     ]
 
 
@@ -209,7 +209,7 @@ def _outliers(spoilt: Spoilt, named: dict[int, int]) -> list[str]:
 
 
 def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
-    """PNG: median errors of the offset by robot noise, number of images and share of wrong gripper poses."""
+    """PNG: median errors of the translation by robot noise, number of images and share of wrong gripper poses."""
     figure = Figure(figsize=(14, 4.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for name in _solvers():
@@ -230,7 +230,7 @@ def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
     for axis, title in zip(axes, titles, strict=True):
         axis.set(xlabel=title, yscale="log")
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("median error of the offset, mm")
+    axes[0].set_ylabel("median error of the translation, mm")
     lines, names = axes[0].get_legend_handles_labels()
     figure.legend(
         lines, names, loc="outside right center", fontsize=7, title="* scale given", title_fontsize=7

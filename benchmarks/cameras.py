@@ -25,7 +25,8 @@ from jcr.records import Capture, CellCamera
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 from jcr.simulate.robots import PresetName
 
-DRAWS = 40
+DRAWS, MANY_DRAWS = 20, 40
+"""Of each kind of cell; with --long."""
 COUNT = 10
 """Poses of each arm."""
 PRESET_NAMES: tuple[PresetName, ...] = ("white", "typical")
@@ -78,21 +79,20 @@ class Draw:
         return float((np.abs(self.error) / np.sqrt(np.diag(self.covariance))).max())
 
 
-def run(captures: Path, boards: Sequence[str] = ()) -> str:
-    """Markdown: 40 simulated draws of each kind, and withheld images of every capture below `captures`.
+def run(captures: Path, long: bool = False) -> str:
+    """Markdown: simulated draws of each kind, and withheld images of every capture below `captures`.
 
-    Raises InputError where there is no capture, or boards are named.
+    Raises InputError where there is no capture.
     """
-    if boards:
-        raise InputError("bench cameras: takes no --boards; leave them out")
     folders = sorted(path.parent for path in captures.glob("*/capture.json"))
     if not folders:
         raise InputError(f"{captures}: no folder below it holds a capture.json")
+    draws = MANY_DRAWS if long else DRAWS
     drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]] = {
-        (kind, preset): _drawn(kind, preset) for kind in get_args(Kind) for preset in PRESET_NAMES
+        (kind, preset): _drawn(kind, preset, draws) for kind in get_args(Kind) for preset in PRESET_NAMES
     }
     real = [line for folder in folders for line in _withheld(folder)]
-    return _page(drawn, real)
+    return _page(drawn, real, draws)
 
 
 def answered(problem: CellProblem, seed: int) -> Answer:
@@ -113,9 +113,9 @@ def answered(problem: CellProblem, seed: int) -> Answer:
     return tied(imaged, ties, problem.scale)
 
 
-def _drawn(kind: Kind, preset: PresetName) -> dict[str, list[Draw]]:
+def _drawn(kind: Kind, preset: PresetName, draws: int) -> dict[str, list[Draw]]:
     out: dict[str, list[Draw]] = {}
-    for seed in range(DRAWS):
+    for seed in range(draws):
         problem = cell_problem(kind, preset, COUNT, seed)
         answer = answered(problem, seed)
         for name, of in wanted(problem).items():
@@ -211,12 +211,14 @@ def _against_robot(answer: Answer, rig: int, gripper: Float[ndarray, "4 4"]) -> 
     return Draw(error, j @ answer.covariance @ j.T + robot)
 
 
-def _page(drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Sequence[Row]) -> str:
+def _page(
+    drawn: dict[tuple[Kind, PresetName], dict[str, list[Draw]]], real: Sequence[Row], of_each: int
+) -> str:
     every = [draw for names in drawn.values() for draws in names.values() for draw in draws]
     beyond = 100 * np.mean([draw.sigmas > 3 for draw in every])
     placed = [row for row in real if row.draw is not None]
     lines = [
-        f"> Simulated cells of {COUNT} poses an arm, {DRAWS} draws of each kind: {100 * _inside(every, 0.95):.0f} % of "
+        f"> Simulated cells of {COUNT} poses an arm, {of_each} draws of each kind: {100 * _inside(every, 0.95):.0f} % of "
         f"{len(every)} answers lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that of "
         f"99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
     ]

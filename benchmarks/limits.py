@@ -99,7 +99,7 @@ class Verdict:
     mm: float = np.nan
     deg: float = np.nan
     sigmas: float = np.nan
-    """Largest error on an axis of offset and orientation in reported standard deviations."""
+    """Largest error on an axis of translation and rotation in reported standard deviations."""
     std_mm: float = np.nan
     status: int = 3
     """Of `jcr calibrate`: 3 where the answer is rejected."""

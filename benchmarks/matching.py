@@ -26,7 +26,8 @@ WAYS: tuple[tuple[FeatureName, bool], ...] = (
     ("xfeat", False),
     ("aliked", True),
 )
-"""Features, and whether the robot checks them."""
+"""Features, and whether the robot checks them; all with --long."""
+FEW: tuple[tuple[FeatureName, bool], ...] = (("sift", True), ("xfeat", True))
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ class Row:
     says: str = ""
 
 
-def run(captures: Path, boards: Sequence[str] = ()) -> str:
-    """Markdown: every capture below `captures` that has a reference.json, matched in every way.
+def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
+    """Markdown: every capture below `captures` that has a reference.json, matched in a few ways, or all.
 
     `boards` are CAPTURE=BOARD for those whose reference is the marker back end's with that board, where it accepts it,
     for one that is stored may be of a wrong size. Raises InputError where no capture has a reference, and for a board
@@ -66,7 +67,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         reference = stored = reference_of(folder)
         if (board := board_of.get(folder.name)) is not None and (made := by_board(folder, board)) is not None:
             reference, remade[folder.name] = made, f"`{board}`, {apart(made, stored)} from that stored"
-        rows += [row_of(folder, features, gate, reference) for features, gate in WAYS]
+        rows += [row_of(folder, features, gate, reference) for features, gate in (WAYS if long else FEW)]
     return table(rows, remade)
 
 

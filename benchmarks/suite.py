@@ -172,7 +172,8 @@ def _cell(text: str) -> str:
 
 def _command(page: Path) -> str:
     lines = (line.strip() for line in page.read_text().splitlines() if line.startswith("    jcr bench"))
-    return " ".join(next(lines, f"jcr bench {page.stem}").split()[:3])
+    words = next(lines, f"jcr bench {page.stem}").split()
+    return " ".join([*words[:3], *(word for word in words[3:] if word == "--long")])
 
 
 def _commit(page: Path) -> str:

@@ -5,12 +5,14 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import BENCHES, paths_of
+from benchmarks.__main__ import BENCHES, LONG, paths_of
 from benchmarks.freshness import (
     COMMIT,
     changed_since_measured,
@@ -81,10 +83,10 @@ def test_a_page_says_that_it_is_old_below_its_commit_and_once():
 
 def test_every_page_of_results_says_which_command_writes_it():
     named = set(re.findall(r"\((\w+)\.md\)", (RESULTS / "README.md").read_text()))
-    assert named and named <= {*BENCHES, "real_all"}
-    for name in named - {"real_all"}:
-        text = (RESULTS / f"{name}.md").read_text()
-        assert f"\n    jcr bench {name}" in text and claims(RESULTS / f"{name}.md"), name
+    assert named == {page.stem for page in RESULTS.glob("*.md")} - {"README"}
+    for page in named:
+        text, name = (RESULTS / f"{page}.md").read_text(), page.removesuffix(LONG)
+        assert name in BENCHES and f"\n    jcr bench {name}" in text and claims(RESULTS / f"{page}.md"), page
         pictures = re.findall(r"\]\((\w+\.png)\)", text)
         assert all((RESULTS / picture).is_file() for picture in pictures)
 
@@ -165,8 +167,21 @@ def test_benches_run_as_a_package_of_their_own_and_are_not_installed(tmp_path: P
 
 
 def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]):
-    assert dispatch(["bench", "pairs", "captures"]) == 2
-    assert "takes no folder of captures" in capsys.readouterr().err
+    for given, said in {
+        ("pairs", "captures"): "takes no folder of captures",
+        ("cameras", "captures", "--boards", "a=charuco"): "takes no --boards",
+        ("pairs", "--long"): "has no --long",
+        ("all", "--long", "--out", "pages"): "of one bench at a time",
+    }.items():
+        assert dispatch(["bench", *given]) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(BENCHES))
+def test_a_bench_takes_what_its_row_of_the_table_says(name: str):
+    row, run_one = BENCHES[name], import_module(f"benchmarks.{name}").run
+    asks = {"captures": row.of_captures, "boards": row.of_boards, "out": row.draws, "long": bool(row.long)}
+    assert set(signature(run_one).parameters) == {option for option, is_asked in asks.items() if is_asked}
 
 
 def test_the_bench_of_robots_tells_what_each_way_of_knowing_them_is_worth():
