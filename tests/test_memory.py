@@ -182,6 +182,16 @@ def test_objects_in_a_mapped_file_are_refused(tmp_path: Path) -> None:
             read_arrays(path, in_memory)
 
 
+def test_bytes_in_place_of_an_array_are_refused(tmp_path: Path) -> None:
+    """Found by the fuzzer: NumPy reads them without a word where their first letters are damaged."""
+    path = tmp_path / "pairs.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("edges.npy", b"\x93NUNPY and so on")
+    for in_memory in (0.0, 1e9):
+        with pytest.raises(InputError, match=r"pairs\.npz: no readable npz file"):
+            read_arrays(path, in_memory)
+
+
 def test_a_budget_that_is_no_number_is_refused() -> None:
     with pytest.raises(InputError, match="--memory-gb nan"):
         require(10**9, float("nan"), "a run")

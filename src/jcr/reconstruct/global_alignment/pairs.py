@@ -112,7 +112,11 @@ def read_arrays(path: Path, in_memory: float = math.inf) -> dict[str, ndarray]:
         if path.stat().st_size > in_memory:
             return _map_arrays(path)
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return dict(file)
+            arrays = dict(file)
+        # NumPy hands out the bytes of what does not begin as an array does.
+        if strangers := [name for name, array in arrays.items() if not isinstance(array, ndarray)]:
+            raise ValueError(f"{strangers[0]} in it is not an array")
+        return arrays
     except Exception as error:  # zipfile, zlib and NumPy's parser of headers have errors of their own
         raise InputError(f"{path}: no readable npz file ({error}); write it again with numpy.savez") from None
 
