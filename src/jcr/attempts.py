@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate, missed_m
 from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
@@ -54,8 +55,10 @@ def choose(
     as the ones before failed or gave a calibration that is rejected for another reason than the motion. Of two results
     an accepted one is kept, else the one with the smaller leave-one-out error; dense depth is made for the one that is
     kept, unless a known length is read from it. `chosen` gets the reconstruction as soon as it is sure that the run
-    keeps it. Raises InputError as the back end does, NothingFoundError where none gave anything.
+    keeps it. Raises InputError as the back end does, and where gripper poses and joint angles contradict each other;
+    NothingFoundError where no back end gave anything.
     """
+    robot_errors(capture, calibrate_options)  # refuses before the images cost time
     made = tries(options)
     if len(made) == 1:
         only = _tried(capture, made[0], calibrate_options, progress, chosen)

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.words import angles_in_words
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
@@ -65,7 +67,8 @@ def check(
     `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
     held against those.
 
-    `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis.
+    `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
+    poses and joint angles contradict each other.
     """
     gripper = capture.base_from_gripper
     motion = inverse(gripper)[:, None] @ gripper[None]
@@ -84,6 +87,9 @@ def check(
             f"the gripper moves by at most {1e3 * move:.2g} mm while it rotates by {np.degrees(turn):.0f}°: "
             "positions that were divided by 1000 look so"
         )
+    if isinstance(capture, Capture):
+        _, _, unused = robot_errors(capture, CalibrateOptions())
+        remarks += [] if unused is None else [unused]
     held, quick = None, False
     if isinstance(capture, PosePairs):
         held = _held_against(gripper, capture, robot_noise)

@@ -28,6 +28,8 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
+from jcr.handeye.arms import arm_named
+from jcr.handeye.robots import forward_kinematics
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.simulate.problem import hand_eye_problem
 
@@ -121,6 +123,17 @@ def written(change: Callable[[Case], Any]) -> Plant:
 
 def posed(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> Plant:
     return written(lambda case: case.poses(change, only))
+
+
+def too_long(case: Case) -> None:
+    """Gripper positions in another unit than the arm's joint angles say; no image would show it."""
+    arm, content = arm_named("ur5e"), case.content()
+    joints = arm.rest + 0.4 * np.random.default_rng(1).normal(size=(COUNT, arm.dof))
+    poses = forward_kinematics(arm, joints)
+    poses[:, :3, 3] *= 1.05
+    for frame, angles, pose in zip(content["frames"], joints, poses, strict=True):
+        frame |= {"joints": angles.tolist(), "base_from_gripper": pose.tolist()}
+    case.write(content | {"robot": "ur5e"})
 
 
 def by_colmap(plant: Plant) -> Plant:
@@ -273,6 +286,16 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     # The folder.
     "empty folder": (written(lambda c: (shutil.rmtree(c.capture), c.capture.mkdir())), 2, "no capture.json"),
     "no such folder": (written(lambda c: shutil.rmtree(c.capture)), 2, "no such"),
+    "positions too long for the joint angles": (
+        written(lambda c: too_long(c)),
+        2,
+        r"[45]\.\d ± \d\.\d % too long for a ur5e.*check the unit",
+    ),
+    "positions too long, looked at by jcr check": (
+        lambda c: (too_long(c), ["check", str(c.capture), "--poses-only"])[1],
+        2,
+        r"[45]\.\d ± \d\.\d % too long for a ur5e",
+    ),
     # The pictures.
     "zero-byte image": (picture(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
     "truncated image": (picture(cut), 2, "not a readable image"),

@@ -315,6 +315,27 @@ def test_base_and_tool_follow_from_joints_and_poses(name):
         mounted_arm(arm, joints[:, ::-1].copy(), poses)
 
 
+@pytest.mark.parametrize("name", ["ur5e", "panda", "so101"])
+def test_joint_angles_contradict_positions_that_are_all_too_long(name):
+    """No image shows it, for the scale comes from the robot."""
+    arm = arm_named(name)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        joints = postures(arm, 12, spread=0.3, seed=seed)
+        # As a controller whose kinematics was calibrated at the factory: a few mm from the nominal arm.
+        bent = forward_kinematics(arm, joints + rng.normal(0, 1e-3, joints.shape[1]))
+        bent[:, :3, 3] += rng.normal(0, 5e-4, (12, 3))
+        mounted_arm(arm, joints, bent)
+        for factor, said in (
+            (1.05, r"[45]\.\d ± [01]\.\d % too long"),
+            (1 / 1.05, r"[45]\.\d ± [01]\.\d % too short"),
+        ):
+            poses = bent.copy()
+            poses[:, :3, 3] *= factor
+            with pytest.raises(InputError, match=f"{said} for a {name}"):
+                mounted_arm(arm, joints, poses)
+
+
 def test_urdf_that_is_no_arm_is_refused(tmp_path):
     form = URDF_FORMS["ur5e"]
     file = tmp_path / "arm.urdf"

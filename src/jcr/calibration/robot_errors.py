@@ -11,6 +11,7 @@ from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.handeye.arms import arm_named
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
+from jcr.handeye.mounting import LengthError
 from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.systematic import arm_errors, posed, systematic_errors
@@ -50,8 +51,8 @@ def robot_errors(
     """Covariance of the systematic errors of the capture's gripper poses and of `later` ones of the same robot, the arm
     with its tool and joint angles, and why an arm is not used.
 
-    InputError where the poses are not those of the arm that the user named; what a capture says of itself is only
-    doubted.
+    InputError where the poses are not those of the arm that the user named, or all too long by one factor for that of
+    their joint angles; else what a capture says of itself is only doubted.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:
@@ -63,6 +64,8 @@ def robot_errors(
             return systematic_errors(gripper), None, None
         posed_arm = posed(arm, joints, gripper)
         return arm_errors(*posed_arm), posed_arm, None
+    except LengthError:
+        raise
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None

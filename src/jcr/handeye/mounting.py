@@ -13,6 +13,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import ARM, inverse, rotation_exp, transform
 from jcr.handeye.closed_form import closed_form
+from jcr.handeye.equation import Poses, expected_std, residuals
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, with_tool
 
@@ -21,12 +22,20 @@ NOISE = (1e-3, 1e-3 / ARM)
 AGREE = (0.015, np.radians(1.5))
 """Of the reach, rad; root mean square. Controllers use kinematics calibrated at the factory, which are millimetres
 from the nominal arm."""
+ALIKE, SURE = 0.01, 5.0
+"""Relative, and in standard deviations: further apart, reported positions are of another length than the arm's links. A
+factory's calibration changes them by less."""
+
+
+class LengthError(InputError):
+    """Gripper positions are by one factor longer or shorter than the arm's; no image would show it."""
 
 
 def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]) -> Arm:
     """The arm with the base and tool with which its forward kinematics gives the reported poses best.
 
-    Where the motions do not determine them, those nearest the arm's own. InputError where angles and poses disagree.
+    Where the motions do not determine them, those nearest the arm's own. InputError where angles and poses disagree,
+    LengthError where they do by a factor of all positions.
     """
     nominal = forward_kinematics(arm, joints)
     weights = np.ones(len(joints))
@@ -43,6 +52,25 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4
             f"joint angles and gripper poses disagree on a {arm.name}: {1e3 * metres:.0f} mm, "
             f"{np.degrees(radians):.1f}° apart; check the robot, the order of its joints and their unit (rad)"
         )
+    factor, std = _length(base_from_gripper, nominal)
+    if abs(factor - 1) > max(ALIKE, SURE * std):
+        raise LengthError(
+            f"the gripper positions are {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % too "
+            f"{'long' if factor > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "
+            "positions, and that this is the robot"
+        )
     frames = arm.parent_from_joint.copy()
     frames[0] = best.base_from_recon @ frames[0]
     return with_tool(replace(arm, parent_from_joint=frames), inverse(best.gripper_from_camera))
+
+
+def _length(base_from_gripper: Poses, nominal: Poses) -> tuple[float, float]:
+    """Reported positions over those of the nominal arm, and the relative standard deviation that the residuals leave."""
+    tool, scale, base = closed_form(base_from_gripper, nominal)
+    if scale <= 0:  # no motion shows it
+        return 1.0, np.inf
+    residual, j = residuals(tool, float(scale), base, base_from_gripper, nominal)
+    left = max(6 * len(nominal) - j.shape[2], 1)
+    noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
+    j /= np.repeat(noise, 3)[:, None]
+    return float(scale), float(expected_std(np.einsum("nij,nik->jk", j, j))[6])
