@@ -43,7 +43,10 @@ SOLVERS = [
     "least_squares",
     *(f"handeye.{name}" for name in ("closed_form", "fit", "known_scale", "residuals", "robust", "solve")),
     *(f"cell.{name}" for name in ("bundle", "carried", "localise", "stage", "ties")),
-    *(f"calibration.{name}" for name in ("bundle", "cues", "drift", "given_intrinsics", "stage")),
+    *(
+        f"calibration.{name}"
+        for name in ("bundle", "cues", "drift", "elimination", "given_intrinsics", "stage")
+    ),
     *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
 ]
 FORBIDDEN = {

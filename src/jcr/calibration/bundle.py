@@ -1,9 +1,9 @@
 """Hand-eye bundle adjustment: reprojection error over X, the intrinsics, the points and the gripper poses.
 
 The robot's poses are measurements with the robot's own errors, random and systematic, so metric scale comes from the
-robot and the camera's sub-millimetre geometry from the images. Points are eliminated by the Schur complement and the
-rest is a small dense system, solved by Levenberg-Marquardt: least_squares.py without that elimination would hold a
-matrix of thousands of points. What the images alone say of the cameras, as a normal distribution about the adjusted
+robot and the camera's sub-millimetre geometry from the images. Points are eliminated (elimination.py) and the rest
+is a small dense system, solved by Levenberg-Marquardt: least_squares.py without that elimination would hold a matrix of
+thousands of points. What the images alone say of the cameras, as a normal distribution about the adjusted
 ones, then goes into the same mixed model as poses do (handeye/components.py): it tells the sizes of the robot's errors,
 and the answer is averaged over them.
 """
@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
+from jcr.calibration.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
 from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by, prior_of
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
@@ -25,8 +26,6 @@ from jcr.handeye.systematic import Region, smooth_errors
 from jcr.least_squares import loss_weight
 from jcr.records import Budget, Intrinsics, Tracks
 
-POINTS_AT_ONCE = 1024
-"""Points whose coupling to the cameras is held in memory together."""
 MIN_SIGMA_PX = 0.05
 FAR_OFF = 6.0
 """Median residuals; seven sigma."""
@@ -108,35 +107,13 @@ class _Problem:
     intrinsics: Intrinsics
     """Where the camera's parameters start."""
     free: IntrinsicsPrior
-    rows_of_image: list[Int[ndarray, "..."]]
     systematic: Float[ndarray, "s s"]
     """Covariance of systematic errors of the gripper poses at 1 rad."""
     given_noise: tuple[float, float] | None
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3."""
-    groups: "list[_Group]"
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Points that are eliminated together, for they are seen by few images of many."""
-
-    points: Int[ndarray, " n"]
-    rows: Int[ndarray, " k"]
-    """Of their observations, point by point."""
-    images: Int[ndarray, " i"]
-    """That see any of them."""
-    point: Int[ndarray, " k"]
-    """Of each observation, in `points`."""
-    image: Int[ndarray, " k"]
-    """Of each observation, in `images`."""
-    starts: Int[ndarray, " n"]
-    """Each point's first observation."""
-
-    def columns(self, shared: int) -> Int[ndarray, " d"]:
-        """Of the normal equations: those that all images share, and these images' grippers."""
-        return np.r_[:shared, (shared + 6 * self.images[:, None] + np.arange(6)).ravel()]
+    seen: Sightings
 
 
 @dataclass(frozen=True)
@@ -147,16 +124,6 @@ class _View:
     in_camera: Float[ndarray, "k 3"]
     residual: Float[ndarray, "k 2"]
     """Projected minus observed, px."""
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """The normal equations after the points are eliminated; cameras are X (6), intrinsics (c), grippers (6m)."""
-
-    schur: Float[ndarray, "d d"]
-    right: Float[ndarray, " d"]
-    point_steps: list
-    """Per group of points: V, W and its right side, to step the points back."""
 
 
 def adjust(
@@ -187,11 +154,10 @@ def adjust(
         tracks.x_px[order],
         intrinsics,
         free,
-        [np.flatnonzero(tracks.image[order] == i) for i in range(len(base_from_gripper))],
         smooth_errors(base_from_gripper) if systematic is None else systematic,
         noise,
         chi2.ppf(0.5, 2 * np.bincount(point) - 3),
-        _groups(point, tracks.image[order]),
+        Sightings.of(point, tracks.image[order], len(base_from_gripper)),
     )
     recon_scaled = recon_from_camera.copy()
     recon_scaled[:, :3, 3] *= scale
@@ -257,24 +223,6 @@ def _usable(tracks: Tracks) -> Int[ndarray, " k"]:
     return order[np.bincount(tracks.point[order])[tracks.point[order]] >= 2]
 
 
-def _groups(point: Int[ndarray, " k"], image: Int[ndarray, " k"]) -> list[_Group]:
-    """Points in the order of the first image that sees them: those beside each other are seen by few others."""
-    if len(point) == 0:
-        return []
-    starts = np.searchsorted(point, np.arange(point[-1] + 1))
-    seen = np.diff(np.r_[starts, len(point)])
-    by_first = np.argsort(image[starts], kind="stable")
-    groups = []
-    for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)):
-        counts = seen[points]
-        begins = np.cumsum(counts) - counts
-        rows = np.repeat(starts[points] - begins, counts) + np.arange(counts.sum())
-        images, of_image = np.unique(image[rows], return_inverse=True)
-        of_point = np.repeat(np.arange(len(points)), counts)
-        groups.append(_Group(points, rows, images, of_point, of_image, begins))
-    return groups
-
-
 def _minimise(
     bundle: Bundle,
     view: _View,
@@ -307,7 +255,7 @@ def _view(bundle: Bundle, problem: _Problem) -> _View:
     gripper = bundle.base_from_gripper
     x_rotation, x_offset = bundle.gripper_from_camera[:3, :3], bundle.gripper_from_camera[:3, 3]
     in_gripper = np.empty((len(problem.image), 3))
-    for i, rows in enumerate(problem.rows_of_image):
+    for i, rows in enumerate(problem.seen.rows):
         points = bundle.points_in_base[problem.point[rows]]
         in_gripper[rows] = (points - gripper[i, :3, 3]) @ gripper[i, :3, :3]
     in_camera = (in_gripper - x_offset) @ x_rotation
@@ -371,11 +319,10 @@ def _normal_equations(
     weights: Float[ndarray, " k"],
     precision: Float[ndarray, "s s"],
     damping: float,
-) -> _Normal:
-    m, c = len(bundle.base_from_gripper), len(problem.free.std)
-    shared, size = 6 + c, 6 + c + 6 * m
-    root = np.sqrt(weights)
-    residual = view.residual * root[:, None]
+) -> Normal:
+    """Of X (6), the intrinsics that are free (c) and the grippers (6m)."""
+    c, root = len(problem.free.std), np.sqrt(weights)
+    shared = 6 + c
     x_rotation = bundle.gripper_from_camera[:3, :3]
     by_gripper_axes = (by_point(bundle.camera, view.in_camera) * root[:, None, None]) @ x_rotation.T
     by_base_axes = np.empty_like(by_gripper_axes)
@@ -390,57 +337,29 @@ def _normal_equations(
         common[:, :, 6:] = by_lens * root[:, None, None]
     own = np.empty((len(root), 2, 6))
 
-    hessian, right = np.zeros((size, size)), np.zeros(size)
-    for i, rows in enumerate(problem.rows_of_image):
+    for i, rows in enumerate(problem.seen.rows):
         from_base = bundle.base_from_gripper[i, :3, :3].T
         by_base_axes[rows] = by_gripper_axes[rows] @ from_base
         own[rows, :, :3] = -by_base_axes[rows]
         own[rows, :, 3:] = np.cross(by_base_axes[rows], (view.in_gripper[rows] @ from_base)[:, None])
-        block = np.concatenate([common[rows], own[rows]], axis=2).reshape(-1, shared + 6)
-        columns = np.r_[0:shared, shared + 6 * i : shared + 6 * i + 6]
-        hessian[np.ix_(columns, columns)] += block.T @ block
-        right[columns] -= block.T @ residual[rows].ravel()
-    diagonal = np.arange(size)
+    weighted = Derivatives(common, own, by_base_axes, view.residual * root[:, None])
+    hessian, right = with_points_held(weighted, problem.seen)
     hessian[shared:, shared:] += precision
     right[shared:] -= precision @ step_between(problem.reported, bundle.base_from_gripper).ravel()
-    hessian[diagonal[6:shared], diagonal[6:shared]] += problem.free.std**-2.0
+    hessian[range(6, shared), range(6, shared)] += problem.free.std**-2.0
     right[6:shared] -= _lens_step(bundle, problem) / problem.free.std**2
-    hessian[diagonal, diagonal] *= 1 + damping
-
-    point_steps = []
-    for group in problem.groups:
-        count, columns = len(group.points), group.columns(shared)
-        j_point, missed = by_base_axes[group.rows], residual[group.rows]
-        transposed = np.swapaxes(j_point, 1, 2)
-        v = np.add.reduceat(transposed @ j_point, group.starts)
-        v[:, range(3), range(3)] *= 1 + damping
-        v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
-        w = np.zeros((count, 3, len(columns)))
-        w[:, :, :shared] = np.add.reduceat(transposed @ common[group.rows], group.starts)
-        of_image = shared + 6 * group.image[:, None] + np.arange(6)
-        w[group.point[:, None, None], np.arange(3)[None, :, None], of_image[:, None, :]] = (
-            transposed @ own[group.rows]
-        )
-        g = np.add.reduceat((transposed @ missed[..., None])[..., 0], group.starts)
-        factor = np.linalg.cholesky(v)
-        half = np.linalg.solve(factor, np.concatenate([w, g[..., None]], axis=2)).reshape(3 * count, -1)
-        hessian[np.ix_(columns, columns)] -= half[:, :-1].T @ half[:, :-1]
-        right[columns] += half[:, :-1].T @ half[:, -1]
-        point_steps.append((group.points, columns, v, w, g))
-    return _Normal(hessian, right, point_steps)
+    hessian[np.diag_indices(len(right))] *= 1 + damping
+    return without_points(hessian, right, weighted, problem.seen, damping)
 
 
-def _moved(bundle: Bundle, problem: _Problem, normal: _Normal) -> Bundle:
+def _moved(bundle: Bundle, problem: _Problem, normal: Normal) -> Bundle:
     """The bundle after one Gauss-Newton step."""
-    step = np.linalg.solve(normal.schur, normal.right)
-    points = bundle.points_in_base.copy()
-    for chosen, columns, v, w, g in normal.point_steps:
-        points[chosen] += np.linalg.solve(v, -(g + w @ step[columns])[..., None])[..., 0]
+    step = np.linalg.solve(normal.hessian, normal.right)
     c = len(problem.free.std)
     return Bundle(
         retract(bundle.gripper_from_camera, step[:6]),
         retract(bundle.base_from_gripper, step[6 + c :].reshape(-1, 6)),
-        points,
+        normal.stepped(bundle.points_in_base, step),
         with_parameters(bundle.camera, parameters(bundle.camera) + problem.free.directions @ step[6 : 6 + c]),
     )
 
@@ -462,7 +381,7 @@ def _equations(
     told = step_between(problem.reported, bundle.base_from_gripper).ravel()
     c = len(problem.free.std)
     of_lens, of_poses = slice(6, 6 + c), slice(6 + c, None)
-    seen = normal.schur[of_poses, of_poses] - precision
+    seen = normal.hessian[of_poses, of_poses] - precision
     by_images = normal.right[of_poses] + precision @ told
     x = bundle.gripper_from_camera
     _, by_unknown = residuals(x, 1.0, np.eye(4), problem.reported, bundle.base_from_gripper @ x)
@@ -470,11 +389,11 @@ def _equations(
     unseen = np.linalg.qr(by_unknown[:, 6:])[0]  # the similarity
     known = np.linalg.inv(seen + float(np.trace(seen)) / len(seen) * unseen @ unseen.T)
     known = (known + known.T) / 2
-    coupling = normal.schur[of_lens, of_poses]
+    coupling = normal.hessian[of_lens, of_poses]
     by_lens = -known @ coupling.T
     prior = np.zeros((13 + c, 13 + c))
     prior[range(7), range(7)] = PRIOR_STD**-2.0
-    prior[13:, 13:] = normal.schur[of_lens, of_lens] + coupling @ by_lens
+    prior[13:, 13:] = normal.hessian[of_lens, of_lens] + coupling @ by_lens
     gradient = np.concatenate([np.zeros(13), coupling @ (known @ by_images) - normal.right[of_lens]])
     jacobian = np.concatenate([by_unknown, by_lens], axis=1)
     region = Region.of_poses(jacobian)
@@ -543,6 +462,4 @@ def median_reprojection(
     if base_from_gripper is not None:
         bundle = replace(bundle, base_from_gripper=base_from_gripper)
     length = np.linalg.norm(_view(bundle, adjusted.problem).residual, axis=1)
-    return np.array(
-        [np.median(length[rows]) if len(rows) else np.nan for rows in adjusted.problem.rows_of_image]
-    )
+    return np.array([np.median(length[rows]) if len(rows) else np.nan for rows in adjusted.problem.seen.rows])

@@ -15,6 +15,7 @@ from numpy import ndarray
 from scipy.stats import f as f_distribution
 
 from jcr.calibration.bundle import Adjusted
+from jcr.calibration.elimination import Derivatives, with_points_held, without_points
 from jcr.camera import by_parameters, by_point, parameter_names, parameters, project
 from jcr.geometry import step_between
 from jcr.records import Intrinsics
@@ -125,13 +126,13 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
     common = np.concatenate([-by_gripper, at_x, by_camera @ lens, by_camera * units, sheared], axis=2)
     own = np.concatenate([-by_base, turned, (x_px - [camera.cx, camera.cy])[..., None], sheared], axis=2)
 
-    at = base + len(names)
-    of_all = np.r_[0 : 6 + c, base : at + 1]
-    each = np.arange(m)[:, None]
-    of_image = np.hstack([6 + c + 6 * each + np.arange(6), at + 1 + each, at + 1 + m + each])
-    hessian, right = _without_points(
-        _Columns(common, own, of_all, of_image, image), by_base, residual, weight, point, len(points)
-    )
+    root = np.sqrt(weight)[:, None, None]
+    weighted = Derivatives(common * root, own * root, by_base * root, residual * root[..., 0])
+    normal = without_points(*with_points_held(weighted, problem.seen), weighted, problem.seen)
+    each = common.shape[2] + own.shape[2] * np.arange(m)
+    poses_of_images = (each[:, None] + np.arange(6)).ravel()
+    order = np.r_[0 : 6 + c, poses_of_images, 6 + c : common.shape[2], each + 6, each + 7]
+    hessian, right = normal.hessian[np.ix_(order, order)], normal.right[order]
     told = step_between(problem.reported, bundle.base_from_gripper).ravel()
     poses = slice(6 + c, base)
     hessian[poses, poses] += adjusted.precision
@@ -153,61 +154,6 @@ def nuisance(adjusted: Adjusted, used: Intrinsics) -> Nuisance:
 def nuisance_columns(camera: Intrinsics, images: int) -> int:
     """How many columns there are beside those of the adjustment."""
     return len(parameter_names(camera)) + 1 + 2 * images
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """Derivatives of observations: columns that all images share, and those of each image by itself."""
-
-    common: Float[ndarray, "k 2 s"]
-    own: Float[ndarray, "k 2 o"]
-    of_all: Int[ndarray, " s"]
-    """Places of the shared columns."""
-    of_image: Int[ndarray, "m o"]
-    """Places of each image's."""
-    image: Int[ndarray, " k"]
-
-    @property
-    def count(self) -> int:
-        """Of all columns."""
-        return len(self.of_all) + self.of_image.size
-
-
-def _without_points(
-    columns: _Columns,
-    by_point: Float[ndarray, "k 2 3"],
-    residual: Float[ndarray, "k 2"],
-    weight: Float[ndarray, " k"],
-    point: Int[ndarray, " k"],
-    count: int,
-) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
-    """Hessian and right side after the points: Schur's complement."""
-    root = np.sqrt(weight)[:, None]
-    common, own, to_point = (part * root[..., None] for part in (columns.common, columns.own, by_point))
-    scaled, d = residual * root, columns.count
-    hessian, right = np.zeros((d, d)), np.zeros(d)
-    for k, places in enumerate(columns.of_image):
-        rows = columns.image == k
-        block = np.concatenate([common[rows], own[rows]], axis=2).reshape(
-            -1, len(columns.of_all) + len(places)
-        )
-        at = np.r_[columns.of_all, places]
-        hessian[np.ix_(at, at)] += block.T @ block
-        right[at] -= block.T @ scaled[rows].ravel()
-    transposed = np.swapaxes(to_point, 1, 2)
-    v, w = np.zeros((count, 3, 3)), np.zeros((count, 3, d + 1))
-    np.add.at(v, point, transposed @ to_point)
-    v += (1e-9 * np.trace(v, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(3)
-    shared = np.zeros((count, 3, len(columns.of_all)))
-    np.add.at(shared, point, transposed @ common)
-    w[:, :, columns.of_all] = shared
-    axes = np.arange(3)[None, :, None]
-    np.add.at(w, (point[:, None, None], axes, columns.of_image[columns.image][:, None]), transposed @ own)
-    np.add.at(w[..., d], point, (transposed @ scaled[..., None])[..., 0])
-    half = np.linalg.solve(np.linalg.cholesky(v), w).reshape(3 * count, d + 1)
-    hessian -= half[:, :d].T @ half[:, :d]
-    right += half[:, :d].T @ half[:, d]
-    return hessian, right
 
 
 def _without_adjusted(

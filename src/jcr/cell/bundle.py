@@ -12,13 +12,20 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
+from jcr.calibration.elimination import (
+    Derivatives,
+    Normal,
+    Sightings,
+    point_blocks,
+    with_points_held,
+    without_points,
+)
 from jcr.calibration.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import retract, skew, step_between
 from jcr.least_squares import loss_weight
 from jcr.records import Intrinsics
 
-POINTS_AT_ONCE = 1024
 LOSS_SCALE = 2.0
 """Cauchy loss: observations count half at this many sigma."""
 CELLS = 8
@@ -116,7 +123,7 @@ def adjust_images(
     they start, where others than these images know them; the similarity is then theirs.
     """
     seen = np.bincount(pictures.point, minlength=len(scene.points_in_world))
-    order = np.argsort(pictures.point, kind="stable")
+    order = np.lexsort((pictures.rig[pictures.picture], pictures.point))
     order = order[seen[pictures.point[order]] >= 2]
     kept, point = np.unique(pictures.point[order], return_inverse=True)
     pictures = replace(pictures, picture=pictures.picture[order], x_px=pictures.x_px[order], point=point)
@@ -129,6 +136,7 @@ def adjust_images(
         held,
         started,
         chi2.ppf(0.5, np.maximum(2 * np.bincount(point) - 3, 1)),
+        Sightings.of(point, pictures.rig[pictures.picture], len(scene.world_from_rig)),
     )
     view = _view(scene, pictures)
     errors, damping = _pixel_errors(scene, view, problem), 1e-4
@@ -149,7 +157,7 @@ def adjust_images(
 
 @dataclass(frozen=True)
 class _Problem:
-    """What stays fixed; observations sorted by point."""
+    """What stays fixed; observations sorted by point, then by rig."""
 
     pictures: Pictures
     freedom: Freedom
@@ -161,6 +169,8 @@ class _Problem:
     median_square: Float[ndarray, " p"]
     """Median of a point's sum of squared residuals where an image coordinate's variance is 1: of the 2n errors of n
     views its position takes up 3."""
+    seen: Sightings
+    """By rigs."""
 
 
 @dataclass(frozen=True)
@@ -185,15 +195,6 @@ class _PixelErrors:
     inflation: float = 1.0
     """Of the variance of what many observations say together, because neighbours share errors; one for all cameras, for
     where points follow the few observations of one its own residuals do not show it."""
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """The normal equations after the points are eliminated, and by chunks what steps the points back."""
-
-    hessian: Float[ndarray, "d d"]
-    right: Float[ndarray, " d"]
-    point_steps: list[tuple[slice, ndarray, ndarray, ndarray]]
 
 
 def _view(scene: Scene, pictures: Pictures) -> _View:
@@ -245,27 +246,29 @@ def _pixel_errors(
     return _PixelErrors(sigma_px, max(1.0, sums / max(float((pull**2).sum()), 1e-300)))
 
 
-def _by_world(scene: Scene, view: _View, problem: _Problem) -> Float[ndarray, "k 2 3"]:
-    """Derivative of every observation by its point."""
-    pictures = problem.pictures
-    rig, camera = pictures.rig[pictures.picture], pictures.camera[pictures.picture]
+def _by_rig(scene: Scene, view: _View, problem: _Problem) -> Float[ndarray, "k 2 3"]:
+    """Derivative of every observation by its point, rig axes."""
+    camera = problem.pictures.camera[problem.pictures.picture]
     out = np.empty((len(camera), 2, 3))
     for c, lens in enumerate(scene.cameras):
         rows = camera == c
         out[rows] = by_point(lens, view.in_camera[rows]) @ scene.rig_from_camera[c, :3, :3].T
-    return out @ np.swapaxes(scene.world_from_rig[rig, :3, :3], 1, 2)
+    return out
+
+
+def _by_world(by_rig: Float[ndarray, "k 2 3"], scene: Scene, problem: _Problem) -> Float[ndarray, "k 2 3"]:
+    """The same, world axes."""
+    rig = problem.pictures.rig[problem.pictures.picture]
+    return by_rig @ np.swapaxes(scene.world_from_rig[rig, :3, :3], 1, 2)
 
 
 def _leverage(
     scene: Scene, view: _View, problem: _Problem, weight: Float[ndarray, " k"]
 ) -> Float[ndarray, " k"]:
     """Of each observation on itself through its point, mean of its two coordinates."""
-    j = _by_world(scene, view, problem)
-    normal = np.zeros((len(scene.points_in_world), 3, 3))
-    np.add.at(normal, problem.pictures.point, weight[:, None, None] * np.swapaxes(j, 1, 2) @ j)
-    normal += (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(3)
-    inverse = np.linalg.inv(normal)[problem.pictures.point]
-    return np.minimum(weight * np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
+    j = np.sqrt(weight)[:, None, None] * _by_world(_by_rig(scene, view, problem), scene, problem)
+    inverse = np.linalg.inv(point_blocks(j, problem.seen.starts))[problem.pictures.point]
+    return np.minimum(np.einsum("kai,kij,kaj->k", j, inverse, j) / 2, 1.0)
 
 
 def _weights(view: _View, errors: _PixelErrors, problem: _Problem) -> Float[ndarray, " k"]:
@@ -328,75 +331,42 @@ def _minimised(
 
 def _normal(
     scene: Scene, view: _View, problem: _Problem, weight: Float[ndarray, " k"], damping: float
-) -> _Normal:
-    pictures, freedom = problem.pictures, problem.freedom
-    lens_columns, mount_columns, first = freedom.lens_columns, freedom.mount_columns, freedom.first_rig
-    size = first + 6 * len(scene.world_from_rig)
-    hessian, right = np.zeros((size, size)), np.zeros(size)
-    root = np.sqrt(weight)
-    rig, camera = pictures.rig[pictures.picture], pictures.camera[pictures.picture]
-    schur, schur_right = np.zeros((size, size)), np.zeros(size)
-    steps = []
-    bounds = np.searchsorted(pictures.point, np.arange(0, len(scene.points_in_world), POINTS_AT_ONCE))
-    for begin, end in zip(bounds, [*bounds[1:], len(pictures.point)], strict=True):
-        rows = slice(int(begin), int(end))
-        k = end - begin
-        j = np.zeros((k, 2, size))
-        by_mount = np.empty((k, 2, 3))
-        for c, lens in enumerate(scene.cameras):
-            mine = np.flatnonzero(camera[rows] == c)
-            if not len(mine):
-                continue
-            x = view.in_camera[rows][mine]
-            by_mount[mine] = by_point(lens, x) @ scene.rig_from_camera[c, :3, :3].T
-            j[mine, :, lens_columns[c]] = by_parameters(lens, x) @ freedom.lenses[c].directions
-            if (columns := mount_columns[c]) is not None:
-                turned = by_mount[mine] @ skew(view.from_camera[rows][mine])
-                j[mine, :, columns] = np.concatenate([-by_mount[mine], turned], axis=2)
-        pose = scene.world_from_rig[rig[rows], :3, :3]
-        by_world = by_mount @ np.swapaxes(pose, 1, 2)
-        of_rig = np.concatenate([-by_world, by_world @ skew(view.from_rig[rows])], axis=2)
-        columns = first + 6 * rig[rows, None] + np.arange(6)
-        j[np.arange(k)[:, None, None], np.arange(2)[None, :, None], columns[:, None]] = of_rig
-        j *= root[rows, None, None]
-        by_world *= root[rows, None, None]
-        residual = view.residual[rows] * root[rows, None]
-        flat = j.reshape(-1, size)
-        hessian += flat.T @ flat
-        right -= flat.T @ residual.ravel()
-        local = pictures.point[rows] - pictures.point[begin]
-        starts = np.searchsorted(local, np.arange(local[-1] + 1))
-        transposed = np.swapaxes(by_world, 1, 2)
-        v = np.add.reduceat(transposed @ by_world, starts)
-        v[:, range(3), range(3)] *= 1 + damping
-        v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
-        w = np.add.reduceat(transposed @ np.concatenate([j, residual[..., None]], axis=2), starts)
-        half = np.linalg.solve(np.linalg.cholesky(v), w).reshape(-1, size + 1)
-        schur += half[:, :size].T @ half[:, :size]
-        schur_right += half[:, :size].T @ half[:, size]
-        first_point = int(pictures.point[begin])
-        steps.append((slice(first_point, first_point + len(v)), v, w[..., :size], w[..., size]))
-    lens_std, diagonal = _lens_std(problem), np.arange(size)
-    of_lens = np.arange(len(lens_std))
-    hessian[of_lens, of_lens] += lens_std**-2.0
-    right[of_lens] -= _lens_step(scene, problem) / lens_std**2
+) -> Normal:
+    """In the order of Imaged.covariance."""
+    freedom, first = problem.freedom, problem.freedom.first_rig
+    camera = problem.pictures.camera[problem.pictures.picture]
+    by_rig = _by_rig(scene, view, problem)
+    shared = np.zeros((len(camera), 2, first))
+    lenses = zip(scene.cameras, freedom.lenses, freedom.lens_columns, freedom.mount_columns, strict=True)
+    for c, (lens, free, of_lens, of_mount) in enumerate(lenses):
+        mine = camera == c
+        shared[mine, :, of_lens] = by_parameters(lens, view.in_camera[mine]) @ free.directions
+        if of_mount is not None:
+            turned = by_rig[mine] @ skew(view.from_camera[mine])
+            shared[mine, :, of_mount] = np.concatenate([-by_rig[mine], turned], axis=2)
+    by_world = _by_world(by_rig, scene, problem)
+    own = np.concatenate([-by_world, by_world @ skew(view.from_rig)], axis=2)
+    root = np.sqrt(weight)[:, None, None]
+    weighted = Derivatives(shared * root, own * root, by_world * root, view.residual * root[..., 0])
+    hessian, right = with_points_held(weighted, problem.seen)
+    lens_std = _lens_std(problem)
+    hessian[range(len(lens_std)), range(len(lens_std))] += lens_std**-2.0
+    right[: len(lens_std)] -= _lens_step(scene, problem) / lens_std**2
     if problem.held is not None:
         of_held = slice(first, first + len(problem.held))
         hessian[of_held, of_held] += problem.held
         right[of_held] -= problem.held @ _rig_step(scene, problem)
-    hessian[diagonal, diagonal] *= 1 + damping
-    return _Normal(hessian - schur, right + schur_right, steps)
+    hessian[np.diag_indices(len(right))] *= 1 + damping
+    return without_points(hessian, right, weighted, problem.seen, damping)
 
 
-def _moved(scene: Scene, problem: _Problem, normal: _Normal) -> Scene:
+def _moved(scene: Scene, problem: _Problem, normal: Normal) -> Scene:
     """The scene after one Gauss-Newton step; along the similarity that no image shows, the least one."""
     scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), 1e-300))
     scaled = scale[:, None] * normal.hessian * scale
     scaled[range(len(scale)), range(len(scale))] += 1e-12
     step = scale * np.linalg.solve(scaled, scale * normal.right)
-    points = scene.points_in_world.copy()
-    for rows, v, w, g in normal.point_steps:
-        points[rows] -= np.linalg.solve(v, (g + w @ step)[..., None])[..., 0]
+    points = normal.stepped(scene.points_in_world, step)
     return replace(stepped(scene, problem.freedom, step), points_in_world=points)
 
 
