@@ -1,0 +1,38 @@
+"""The calibration stage on simulated observations: how many of them it adjusts."""
+
+import numpy as np
+
+from benchmarks.attack import reconstructed
+from jcr.calibration import stage
+from jcr.calibration.bundle import adjust
+from jcr.calibration.stage import calibrate
+from jcr.geometry import step_between
+from jcr.records import Tracks
+from jcr.simulate.faults import faulty_capture
+
+
+def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypatch):
+    images = 8
+    found = faulty_capture(np.random.default_rng(3), images)
+    capture, reconstruction = reconstructed(found, estimated=False)
+    most = len(found.tracks.image) // 3
+    used: list[Tracks] = []
+
+    def watched(*arguments):
+        used.append(arguments[4])
+        return adjust(*arguments)
+
+    monkeypatch.setattr(stage, "MOST_OBSERVATIONS", most)
+    monkeypatch.setattr(stage, "adjust", watched)
+    hand_eye, again = (calibrate(capture, reconstruction) for _ in range(2))
+    tracks, given = used[0], found.tracks
+    assert hand_eye.inliers.all()
+    assert 0.95 * most < len(tracks.image) <= most
+    assert all(len(other.image) <= most for other in used)
+    assert (np.bincount(tracks.image, minlength=images) > 0.5 * most / images).all()
+    chosen = np.unique(tracks.point)
+    assert np.array_equal(np.bincount(tracks.point)[chosen], np.bincount(given.point)[chosen])
+    assert np.array_equal(hand_eye.gripper_from_camera, again.gripper_from_camera)
+    missed = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    assert hand_eye.refinement is not None
+    assert (np.abs(missed) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
