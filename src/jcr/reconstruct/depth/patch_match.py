@@ -158,7 +158,7 @@ def _score(v, u, p0, p1, p2, greys, others, asked, weight, weighted, moments, a,
     for n in range(len(others)):
         if not (asked[v, u] >> n) & 1:
             continue
-        if left == 1 and len(others) >= BEST and first + 1 <= 2 * least and first + second <= 2 * least:
+        if left == 1 and len(others) >= BEST and first + 1 <= 2 * least:
             return np.float32(-1)
         left -= 1
         score = _correlation(v, u, p0, p1, p2, n, greys, others, weight, weighted, moments, a, b, k)
@@ -331,45 +331,14 @@ def spread_planes(
 def to_the_peak(planes, score, greys, others, asked, weight, weighted, moments, a, b, k, step):
     """Move each plane to the peak of the parabola through its score and those `step` (relative) off."""
     h, w = score.shape
+    views = (greys, others, asked, weight, weighted, moments, a, b, k)
     for v in range(h):
         for u in range(w):
             p0, p1, p2 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
             rx, ry = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
             delta = np.float32(step * (p0 * rx + p1 * ry + p2))
-            left = _score(
-                v,
-                u,
-                p0,
-                p1,
-                p2 - delta,
-                greys,
-                others,
-                asked,
-                weight,
-                weighted,
-                moments,
-                a,
-                b,
-                k,
-                np.float32(-2),
-            )
-            right = _score(
-                v,
-                u,
-                p0,
-                p1,
-                p2 + delta,
-                greys,
-                others,
-                asked,
-                weight,
-                weighted,
-                moments,
-                a,
-                b,
-                k,
-                np.float32(-2),
-            )
+            left = _score(v, u, p0, p1, p2 - delta, *views, np.float32(-2))
+            right = _score(v, u, p0, p1, p2 + delta, *views, np.float32(-2))
             curvature = left - 2 * score[v, u] + right
             if curvature < -1e-6:
                 shift = (left - right) / (2 * curvature)
