@@ -170,8 +170,9 @@ BENCHES = {
         measures=("src/jcr/reconstruct/dust3r",),
     ),
     "memory": Bench(
-        "peak memory against the budget for 8, 20 and 40 images, COLMAP and small networks",
+        "peak memory against the budget by number of images, COLMAP and small networks",
         measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py", "src/jcr/reconstruct/threads.py"),
+        long="40 images, too",
     ),
     "bag": Bench(
         "frames chosen from a minute of a robot's MCAP: which, time and memory", True, measures=(*READING,)

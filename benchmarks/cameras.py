@@ -218,9 +218,9 @@ def _page(
     beyond = 100 * np.mean([draw.sigmas > 3 for draw in every])
     placed = [row for row in real if row.draw is not None]
     lines = [
-        f"> Simulated cells of {COUNT} poses an arm, {of_each} draws of each kind: {100 * _inside(every, 0.95):.0f} % of "
-        f"{len(every)} answers lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that of "
-        f"99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
+        f"> Simulated cells of {COUNT} poses an arm, {of_each} draws of each kind: {100 * _inside(every, 0.95):.0f} % "
+        f"of {len(every)} answers lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that "
+        f"of 99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
     ]
     if placed:
         errors = np.array([_size(row.draw) for row in placed if row.draw is not None])
