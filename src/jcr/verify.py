@@ -1,4 +1,4 @@
-"""Is yesterday's calibration still true of today's images? What `jcr verify` answers."""
+"""Is yesterday's calibration still valid of today's images? What `jcr verify` answers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -75,9 +75,9 @@ class Verification:
     def verdict(self) -> str:
         """What has moved, in words."""
         if self.fixed is not None:
-            return f"{self.fixed} has moved" if self.moved else "still true"
+            return f"{self.fixed} has moved" if self.moved else "still valid"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
-        return f"{moved[self.cause]} has moved" if self.moved else "still true"
+        return f"{moved[self.cause]} has moved" if self.moved else "still valid"
 
     @property
     def advice(self) -> str:

@@ -1,4 +1,4 @@
-"""`jcr verify`: is yesterday's calibration still true of today's few images?"""
+"""`jcr verify`: is yesterday's calibration still valid of today's few images?"""
 
 import sys
 from dataclasses import dataclass, field
