@@ -35,9 +35,9 @@ class VerifyOptions:
     """What counts as moved."""
 
     alpha: float = 1e-3
-    """Rate of false alarms: moved means less likely than this when nothing has moved."""
+    """False-alarm rate: the probability of reporting a movement when nothing has moved."""
     tolerance: tuple[float, float] = (0.5, 0.05)
-    """MM DEG: drifts smaller than both are no alarm, however significant."""
+    """MM DEG: drifts smaller than both raise no alarm, however significant."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +83,17 @@ class Verification:
     def advice(self) -> str:
         """What to do, where something has moved."""
         if self.fixed is not None:
-            return (
-                f"{self.fixed} has moved; fasten it, and place it again (jcr add-camera, under another name)"
-            )
+            return f"{self.fixed} has moved; fasten it, and calibrate it again (jcr add-camera, under another name)"
         anew = "tighten the mount, then calibrate again from 8 or more images (jcr run)"
         if self.cause == "scene":
             return (
-                "the scene or the robot's base was moved as a whole; the map is no longer true, the camera still "
-                "fits: build the map again (jcr run)"
+                "the scene or the robot's base was moved as a whole; the camera's calibration is still valid, the map "
+                "is not: build it again (jcr run)"
             )
         if self.cause == "either":
             return (
-                f"moved: the camera on the gripper, or the whole scene; two more images with the wrist rotated tell "
-                f"which; if it is the camera, {anew}"
+                f"either the camera has moved on the gripper, or the whole scene has; two more images with the wrist "
+                f"rotated decide which; if it is the camera, {anew}"
             )
         return f"the camera has moved on the gripper; {anew}"
 
@@ -110,11 +108,13 @@ def verify(
     """
     report = progress or silent
     if not 0 < options.alpha < 0.5:
-        raise InputError(f"--alpha {options.alpha}: a rate of false alarms between 0 and 0.5")
+        raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
     folder = RunFolder(out)
     calibration, reconstruction = folder.calibrated()
     if not calibration.converged:
-        raise InputError(f"{out}: its calibration is rejected, so that nothing can be held against it")
+        raise InputError(
+            f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
+        )
     capture, options_then = folder.capture(), folder.options()
     if [image.image for image in calibration.images] != list(capture.images):
         raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")

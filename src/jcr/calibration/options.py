@@ -14,33 +14,35 @@ class CalibrateOptions:
     """How the hand-eye calibration is found."""
 
     require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """How exact the camera on the gripper must be known: 95 % of errors smaller than this, else exit status 3. Unset:
-    5 mm and 1°, enough to grasp with, and a calibration that is less exact gives a warning."""
+    """Required accuracy of the camera on the gripper: 95 % of errors must be below this, else exit status 3. Unset: a
+    calibration worse than 5 mm and 1°, which are enough for grasping, only gives a warning."""
     require_at: Literal["camera", "scene"] = "camera"
-    """Where the millimetres of --require count: scene is what the camera looks at, where rotation moves it too."""
+    """Where the millimetres of --require apply: at the camera, or in the scene it looks at, where a rotation error
+    also displaces points."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """One-sigma noise of the gripper poses per axis, at least; the data may say more."""
+    """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, else found."""
+    """Samples: metres per unit of the camera poses, known to 0.2 %; unset: 1 for a marker of known size, otherwise
+    estimated."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ARM")] = None
-    """Name of the arm (see `jcr simulate --help`), whose joint offsets and link errors then count as such; else the one
-    that the capture names."""
+    """Name of the arm (see `jcr simulate --help`), to model its joint offsets and link errors; unset: the arm named in
+    the capture, if any."""
     known_height: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
     """Planar or SCARA arms: the camera's height above the gripper's origin along its rotation axis."""
     known_length: Annotated[
         tuple[str, float, float, float, float, float] | None, tyro.conf.arg(metavar="IMAGE X1 Y1 X2 Y2 MM")
     ] = None
-    """A length that gives a lost scale: two pixels of one image, and their distance."""
+    """A known length, for a scale that the motion does not determine: two pixels of one image, and their distance."""
     focus: Literal["fixed", "varies"] = "fixed"
-    """varies: a focal length for each image, of a camera whose focus moved while the images were taken."""
+    """varies: estimate a focal length for each image, for a camera whose focus changed during the capture."""
     bundle_adjustment: Annotated[
-        bool, tyro.conf.arg(help="Use the camera poses alone; skip the refinement by image points.")
+        bool, tyro.conf.arg(help="Use camera poses only; skip the refinement with image points.")
     ] = True
     """Refine by the points that images share."""
 
 
 def check_options(options: CalibrateOptions) -> None:
-    """InputError, before any work, where a number or a name is none that can be."""
+    """Raise InputError, before any work, if a number or a name is not valid."""
     from jcr.handeye.arms import arm_named
 
     for flag, pair in (("--require", options.require), ("--robot-noise", options.robot_noise)):

@@ -49,33 +49,33 @@ class ReadOptions:
     """How the capture is read; a capture.json needs none of these."""
 
     pose_convention: ConventionName = "auto"
-    """How a table writes poses of the gripper in the base; auto goes by the names of its columns."""
+    """Notation of the gripper poses (base_from_gripper) in a table; auto: from the names of its columns."""
     pose_units: UnitsName = "auto"
-    """Of a table's positions and angles, or of joint angles; auto is what the convention or a column says."""
+    """Units of a table's positions and angles, or of joint angles; auto: those of the convention or of the columns."""
     pose_inverted: bool = False
-    """The poses are gripper_from_base, of the base in the gripper: invert them."""
+    """The poses are gripper_from_base, the base in the gripper frame: invert them."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Table of gripper poses; unset: poses.csv, .tsv, .txt or .npy beside the images."""
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there."""
+    """ROS camera_info YAML with the intrinsics; unset: camera_info.yaml beside the images, if there is one."""
     format: FormatName = "auto"
-    """What the capture is, where looking at its files does not tell (jcr docs captures)."""
+    """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
-    """How many frames to take from a recording: still, sharp and spread so that they show most."""
+    """How many frames to take from a recording: still, sharp, and chosen to determine the calibration best."""
     base_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """Recordings: tf frame or URDF link of the robot's base."""
     gripper_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Recordings: tf frame or URDF link that the camera is bolted to."""
+    """Recordings: tf frame or URDF link on which the camera is mounted."""
     camera_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the images. LeRobot: key of the camera, such as observation.images.wrist."""
     further_cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TOPIC[=base|=gripper] ...")] = ()
-    """Recordings: topics or keys of further cameras, fixed (=base) or on the same gripper (=gripper); a bag's tf tells
-    where neither is said."""
+    """Recordings: topics or keys of further cameras, fixed (=base) or on the same gripper (=gripper); by default a
+    bag's tf decides which."""
     joint_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Bags: topic of the joint states, read when --urdf is given. LeRobot: key of the state."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Robot description, for recordings with joint angles instead of gripper poses."""
     max_gap_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 100.0
-    """Recordings: a pose is interpolated between two that are at most so far apart, else it is stale."""
+    """Recordings: largest gap between two poses across which one is interpolated; beyond it the image is left out."""
     episode: tuple[int, ...] = (0,)
-    """LeRobot: episodes to take frames from; they must show one scene that nobody touched in between."""
+    """LeRobot: episodes to take frames from; they must show the same scene, untouched in between."""

@@ -20,40 +20,40 @@ from typing import Any
 from jcr.errors import InputError, NotTrustedError, printable
 
 COMMANDS = {
-    "board": "a calibration board to print, for those who want one",
-    "capture": "a capture taken live, with advice while one works",
+    "board": "draw a calibration board to print, if you want one",
+    "capture": "take a capture live, with advice on the next pose",
     "run": "everything: reconstruct, calibrate, map, report",
-    "calibrate": "up to calibration.json",
-    "check": "reads and judges a capture before any heavy work",
-    "predict": "pairwise pointmaps of a network, as a file",
-    "align": "global alignment of pairwise pointmaps alone",
-    "map": "(re)build the map of a run",
-    "query": "occupancy, distance, colour, label at points",
-    "add-camera": "where a fixed camera is, from its images of the scene of a run",
-    "export": "for ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
-    "measure": "support plane and the objects on it: height, footprint, label",
-    "view": "a run in 3D, in the browser",
-    "compare": "difference of two calibrations, and whether their errors explain it",
-    "verify": "has the camera moved? a calibration against a few new images",
-    "touch": "touch test: the map against points touched with the robot's tip",
-    "batch": "many captures, on this machine or a Ray cluster",
-    "simulate": "a simulated capture with ground truth",
-    "bench": "the tables and timings of the README (in the source)",
-    "models": "back ends, weights present or not, licences",
-    "docs": "the pages of the manual, in the terminal",
+    "calibrate": "reconstruct and calibrate only: calibration.json",
+    "check": "check a capture before any heavy work",
+    "predict": "write a network's pairwise pointmaps to a file",
+    "align": "align pairwise pointmaps globally, nothing else",
+    "map": "build or rebuild the map of a run",
+    "query": "query the map at points: occupancy, distance, colour, label",
+    "add-camera": "locate a fixed camera from its images of a run's scene",
+    "export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
+    "measure": "measure the support plane and the objects on it",
+    "view": "show a run in 3D, in the browser",
+    "compare": "compare two calibrations: do their uncertainties explain the difference?",
+    "verify": "has the camera moved? test a calibration with a few new images",
+    "touch": "touch test: compare points touched with the robot's tip with the map",
+    "batch": "run many captures, on this machine or a Ray cluster",
+    "simulate": "simulate a capture, with ground truth",
+    "bench": "measure the tables and timings of the README (from a checkout)",
+    "models": "list back ends with their licences; download weights",
+    "docs": "print the pages of the manual",
 }
 
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-Eye-in-hand calibration without a target: from images of a wrist camera and the gripper pose at each, the hand-eye
-transform, the metric scale, and a map in the robot's base frame.
+Eye-in-hand calibration without a target: estimate the hand-eye transform, the metric scale and a map in the robot's
+base frame, from images of a wrist camera and the gripper pose at each.
 
 {commands}
 
-jcr COMMAND --help    arguments and examples of one command
-jcr --version         the version
-jcr --completion bash a script that completes commands, options and files; also zsh, fish
+jcr COMMAND --help     arguments and examples of a command
+jcr --version          the version
+jcr --completion bash  a script that completes commands, options and files; also zsh, fish
 
 examples:
   jcr run captures/table out/table
@@ -64,13 +64,13 @@ examples:
 _DISK = {
     errno.ENOSPC: "make room on that disk, or choose another folder; finished results are kept",
     errno.EDQUOT: "make room in that quota, or choose another folder; finished results are kept",
-    errno.EFBIG: "the disk takes no file of that size; choose another folder",
-    errno.EROFS: "choose a folder on a disk that can be written",
-    errno.EACCES: "choose a folder that you may write, or files that you may read",
-    errno.EPERM: "choose a folder that you may write, or files that you may read",
-    errno.EIO: "the disk fails; copy what is on it and choose another",
-    errno.EISDIR: "a folder is where a file belongs; move it away",
-    errno.ENOTDIR: "a file is where a folder belongs; move it away",
+    errno.EFBIG: "the disk cannot hold a file of that size; choose another folder",
+    errno.EROFS: "choose a folder on a writable disk",
+    errno.EACCES: "choose a folder that you can write to, or files that you can read",
+    errno.EPERM: "choose a folder that you can write to, or files that you can read",
+    errno.EIO: "the disk is failing; copy its files and use another",
+    errno.EISDIR: "there is a folder where a file belongs; move it away",
+    errno.ENOTDIR: "there is a file where a folder belongs; move it away",
     errno.ELOOP: "a link leads back to itself; put a file or a folder there",
     errno.ENAMETOOLONG: "choose a shorter name",
 }

@@ -1,4 +1,4 @@
-"""`jcr add-camera`: where a fixed camera of the cell is."""
+"""`jcr add-camera`: locates a fixed camera of the cell."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,12 +11,12 @@ from jcr.cli.output import Output
 
 @dataclass(frozen=True)
 class Arguments:
-    """Place a fixed camera by images of the scene that a run calibrated and mapped with the wrist's: base_from_camera.
+    """Locate a fixed camera (base_from_camera) from its images of the scene of a run.
 
-    OUT is the run folder, whose capture must still be where it was. No marker is needed: what the images share with
-    those of the wrist camera tells. One image will do; of a camera whose intrinsics are not given the focal length is
-    estimated with the rest, and the answer says when the image does not show it. The camera becomes part of the run
-    (OUT/cameras.json, the report, `jcr export`). Exit status 3 where it cannot be placed; nothing is kept then.
+    OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
+    matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated too,
+    and the output says if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
+    report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
 
     examples:
       jcr add-camera out/table overhead.png --intrinsics overhead.json
@@ -25,10 +25,10 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Images of one fixed camera, all of one size."""
+    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES...")]
+    """Images of one fixed camera, all of the same size."""
     name: str | None = None
-    """Of the camera; by default that of the first image's file."""
+    """Name of the camera; by default the file name of the first image."""
     intrinsics: Path | None = None
     """JSON with fx, fy, cx, cy and distortion as in capture.json, in pixels of these images; unset: estimated."""
     output: Output = field(default_factory=Output)

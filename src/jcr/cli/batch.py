@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Run many captures, each into a folder of its own in OUT, and rank them in OUT/summary.csv and .html.
+    """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 
-    A capture that fails fails alone. The same command again runs what is missing or has changed. Exit status 3
-    when one or more failed or are rejected.
+    A capture that fails does not stop the others. The same command again runs only what is missing or has changed. The
+    exit status is 3 if any capture failed or was rejected.
 
     examples:
       jcr batch captures/* out/all

@@ -1,4 +1,4 @@
-"""`jcr calibrate`: where the camera sits on the gripper: calibration.json and a report."""
+"""`jcr calibrate`: the pose of the camera on the gripper: calibration.json and a report."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 class Arguments:
     """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
 
-    CAPTURE may also be the samples of easy_handeye2 or MoveIt Calibration: their marker's poses need no images.
+    CAPTURE may also be a samples file of easy_handeye2 or MoveIt Calibration, whose marker poses need no images.
 
     examples:
       jcr calibrate examples/tabletop out/tabletop

@@ -1,4 +1,4 @@
-"""`jcr capture`: a capture taken live, image by image, with advice while one works."""
+"""`jcr capture`: takes a capture live, image by image, with advice on the next pose."""
 
 import os
 import sys
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Collect a capture with a camera and the gripper poses of a robot, and see what is still missing.
+    """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
-    Each image is taken when the arm rests, and kept when it is sharp and still; OUT/live.html shows the
-    images, what they cover and the pose that adds most. Ctrl-C loses nothing: the same command resumes.
+    An image is taken when the arm rests, and kept if it is sharp and nothing moves; OUT/live.html shows the images,
+    what they cover and the pose that would help most. After Ctrl-C the same command resumes.
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
@@ -39,28 +39,28 @@ class Arguments:
     """
 
     out: Annotated[Path, tyro.conf.Positional]
-    """Folder of the capture; one that was begun is continued."""
+    """Folder of the capture; an unfinished capture is continued."""
     camera: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "0"
-    """V4L2 device number, realsense[:SERIAL], address of a stream (rtsp://…), or a recording (video file, .bag)."""
+    """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     optics: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
     """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
     hand), or tcp (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
-    """How poses are typed, and how the next pose is printed; auto: as the arm writes them."""
+    """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
     """Units of typed and printed poses; auto: those of the convention."""
     robot: RobotName | None = None
-    """The arm: the next pose is printed as joint angles too, within its limits."""
+    """The arm: the next pose is then also printed as joint angles, within the arm's limits."""
     listen: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "127.0.0.1:7464"
-    """With tcp: address and port to listen on; any but this machine's own needs a token."""
+    """With tcp: address and port to listen on; any but a loopback address needs a token."""
     token: str | None = None
-    """With tcp: what the client must send first; better given as JCR_TOKEN, which other users do not see."""
+    """With tcp: the token that the client must send first; better set as JCR_TOKEN, which other users cannot see."""
     timeout: Annotated[float, tyro.conf.arg(metavar="S")] = 600.0
-    """With tcp: end when no pose came for this many seconds."""
+    """With tcp: stop after this many seconds without a pose."""
     intrinsics_from: Path | None = None
-    """JSON file whose "intrinsics" the camera has (a capture.json or calibration.json); else those that the camera
-    stores (RealSense), else estimated."""
+    """JSON file with the camera's "intrinsics" (a capture.json or calibration.json); unset: those stored in the camera
+    (RealSense), otherwise estimated."""
     collect: CollectOptions = field(default_factory=CollectOptions)
     output: Output = field(default_factory=Output)
 

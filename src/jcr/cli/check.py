@@ -1,4 +1,4 @@
-"""`jcr check`: reads and judges a capture before any heavy work."""
+"""`jcr check`: checks a capture before any heavy work."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Judge a capture: files, units, motion, observability, convention of the poses, what to add.
+    """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
 
-    Exit status 3 when a calibration of it would be rejected, with the reason and the remedy.
+    The exit status is 3 if its calibration would be rejected; the message says why, and what to do.
 
     examples:
       jcr check captures/table
@@ -34,18 +34,18 @@ class Arguments:
     """Folder of the capture, or another format (jcr docs captures)."""
     read: ReadOptions = field(default_factory=ReadOptions)
     suggest: int = 0
-    """Propose this many gripper poses that would shrink the uncertainty most."""
+    """Propose this many gripper poses, those that would reduce the uncertainty most."""
     poses_only: bool = False
-    """Look at no features: files, units and motion alone."""
+    """Check files, units and motion only; look for no features in the images."""
     thorough: bool = False
-    """Register all images at full size. Else 8 of them are, which takes seconds, and all where these show a fault."""
+    """Register all images at full size. By default 8 are registered, in seconds, and all only if these show a fault."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """One-sigma noise of the gripper poses per axis; unset: found, or 0.5 mm and 0.1°."""
+    """Noise (1 sigma per axis) of the gripper poses; unset: estimated, or 0.5 mm and 0.1°."""
     reach: Annotated[
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
     ] = None
-    """Box that proposed gripper positions stay in (m, base)."""
+    """Box that contains all proposed gripper positions (m, base frame)."""
     seed: int = 0
     """Seed of the registration and of the proposals."""
     output: Output = field(default_factory=Output)

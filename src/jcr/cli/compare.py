@@ -15,12 +15,12 @@ UNLIKELY = 1e-3
 
 @dataclass(frozen=True)
 class Arguments:
-    """The difference of two calibrations in mm and degrees, and whether what both report explains it.
+    """Compare two calibrations: their difference in mm and degrees, and whether their covariances explain it.
 
-    Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's
-    reference.json, or the folder that holds one; with `std_mm` and `std_deg` where its own errors are known).
-    χ² is the squared distance in standard deviations of both, p its chance where nothing else is wrong; of two
-    calibrations of one arm, systematic errors that both share make p too large.
+    Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's reference.json, or
+    the folder that holds one; with `std_mm` and `std_deg` if its errors are known). χ² is the squared difference in
+    units of both covariances, p the probability of a larger one if nothing else is wrong. For two calibrations of one
+    arm p is too large, because they share systematic errors.
 
     examples:
       jcr compare out/tabletop examples/tabletop
@@ -28,9 +28,9 @@ class Arguments:
     """
 
     out: Annotated[Path, tyro.conf.Positional]
-    """The calibration to judge."""
+    """The calibration to compare."""
     reference: Annotated[Path, tyro.conf.Positional]
-    """What to hold it against."""
+    """The calibration to compare it with."""
     output: Output = field(default_factory=Output)
 
 

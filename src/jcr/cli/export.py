@@ -1,4 +1,4 @@
-"""`jcr export`: a run's calibration and map in the formats of other tools."""
+"""`jcr export`: writes a run's calibration and map in the formats of other tools."""
 
 import sys
 from collections.abc import Callable
@@ -35,7 +35,7 @@ FormatName = Literal[
 class Arguments:
     """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
 
-    Frames and units are named in every file. Map, images and cameras are in the robot's base frame, metres.
+    Every file names its frames and units. Map, images and cameras are in the robot's base frame, in metres.
 
     examples:
       jcr export out/table ros2 --parent-frame tool0 --child-frame camera_color_optical_frame
@@ -50,34 +50,34 @@ class Arguments:
         FormatName | None,
         tyro.conf.Positional,
         tyro.conf.arg(
-            help=f"{', '.join(get_args(FormatName))}; left out: all are listed with what they hold."
+            help=f"{', '.join(get_args(FormatName))}; without it, all are listed with their contents."
         ),
     ] = None
     path: Annotated[Path | None, tyro.conf.Positional] = None
     """File or (nerfstudio, colmap) new folder to write; by default in OUT/export."""
     parent_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "tool0"
-    """The gripper frame whose poses the capture has."""
+    """The gripper frame whose poses the capture contains."""
     child_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "camera_color_optical_frame"
     """The camera's optical frame: x right, y down, z forward."""
     base_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "base_link"
-    """The robot's base, the frame of everything mapped."""
+    """The robot's base, the frame of the map."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Another camera of the cell (cameras.json), for what is about one camera; unset: the run's own, and in ros2 and
-    urdf all. A fixed one's parent is the base frame."""
+    """Another camera of the cell (cameras.json), for formats with one camera; unset: the run's own camera, and for ros2
+    and urdf all cameras. The parent of a fixed camera is the base frame."""
     to_root: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
-    """Give the transform of this link instead, from which the camera's other frames hang (e.g. camera_link)."""
+    """Export the transform to this link instead, the root of the camera's own frames (e.g. camera_link)."""
     root_from_optical: Annotated[
         tuple[float, float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="X Y Z QX QY QZ QW"),
     ] = None
-    """Of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL` prints
-    it; by default they share their origin and are rotated as REP-103 has it."""
+    """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
+    prints it; by default the same origin, with axes as in REP-103."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Metres, for octomap and esdf; by default the map's cell."""
+    """Voxel size (m) for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None
-    """How places count that nobody has seen: by default as occupied in esdf, as free (left out) in spheres."""
+    """How unseen space counts: by default as occupied in esdf, as free (left out) in spheres."""
     excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Metres by which spheres may reach into free space; by default two cells of the map."""
+    """Metres by which spheres may extend into free space; by default two cells of the map."""
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     link_images: bool = False
@@ -114,7 +114,7 @@ def main(arguments: Arguments) -> int:
         facts["line"] = line
     arguments.output.result(line and line + "\n", facts)
     if run.doubt is not None:
-        raise NotTrustedError(f"rejected, and the file says so: {run.doubt}")
+        raise NotTrustedError(f"the calibration is rejected, as the file says too: {run.doubt}")
     return 0
 
 

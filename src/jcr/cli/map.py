@@ -25,9 +25,9 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
     add: tyro.conf.UseAppendAction[tuple[tuple[Path, Path], ...]] = ()
-    """A new image, and a file with its base_from_gripper (4x4 in metres: .json, .npy, or text); again for more,
-    oldest first. The calibration stays. What a new image sees through is removed from the map; a thing that
-    was not there before needs two new images. This and every later map of the run has them (OUT/added)."""
+    """A new image, and a file with its base_from_gripper (4x4 in metres: .json, .npy, or text); repeat for more, oldest
+    first. The calibration is not changed. What a new image sees through is removed from the map; a new object needs two
+    new images. They are kept for every later map of the run (OUT/added)."""
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """The plane that carries the scene, and height, footprint and box of each object on it, with one sigma.
+    """Measure the support plane, and the height, footprint and box of each object on it, with 1 sigma.
 
-    OUT is the folder of a run. What the objects are is for `jcr map --segments` to say.
+    OUT is the folder of a run. `jcr map --segments` selects how the scene is divided into objects.
 
     examples:
       jcr measure out/tabletop

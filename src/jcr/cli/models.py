@@ -16,9 +16,9 @@ from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
 
 @dataclass(frozen=True)
 class Arguments:
-    """List what can reconstruct a capture, under which licence, and what of it is on this machine; or get weights.
+    """List the back ends with their licences, and what is installed on this machine; or download weights.
 
-    Those that `--backend auto` may take come first, in its order. The list downloads nothing.
+    Those that `--backend auto` may try come first, in its order. Listing downloads nothing.
 
     examples:
       jcr models
@@ -28,7 +28,7 @@ class Arguments:
     """
 
     action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
-    """list, or get: download the weights of one."""
+    """list; or get: download the weights of a back end."""
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
     """For get: the back end whose weights are downloaded."""
     accept_licence: bool = False

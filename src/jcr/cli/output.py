@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Output:
-    """What the command says; its result is on stdout, all else on stderr."""
+    """What the command prints: its result on stdout, everything else on stderr."""
 
     json: bool = False
     """Print the result as one JSON object."""
     quiet: bool = False
-    """Nothing on stderr but errors: no progress, notes or warnings."""
+    """Print only errors on stderr: no progress, notes or warnings."""
 
     def result(self, text: str, facts: Mapping[str, object]) -> None:
         """Print the result at once: `facts` with --json, else the text for people."""

@@ -1,4 +1,4 @@
-"""`jcr query`: what the map knows at points."""
+"""`jcr query`: queries the map at points."""
 
 import io
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,re
 class Arguments:
     """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
 
-    Points are metres in the robot's base frame. Distances are NaN outside of the mapped workspace.
+    Points are in metres, in the robot's base frame. Distances are NaN outside of the mapped workspace.
 
     examples:
       jcr query out/table points.csv
@@ -33,12 +33,12 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run, with its map.safetensors."""
     points: Annotated[Path, tyro.conf.Positional]
-    """.csv (three columns, a header line is fine), .npy of shape (n, 3), or .ply."""
+    """.csv (three columns, header line optional), .npy of shape (n, 3), or .ply."""
     write: Path | None = None
-    """.csv or .npy (a structured array) to write; by default points.answers.csv beside the points, and nothing with
+    """File to write, .csv or .npy (a structured array); by default points.answers.csv beside the points, or none with
     --json, which prints the answers."""
     unknown: Literal["occupied", "free", "report"] = "report"
-    """How places count that nobody has seen: solid, empty, or as occupancy one half."""
+    """How unseen space counts: as solid, as empty, or with occupancy 0.5."""
     output: Output = field(default_factory=Output)
 
 

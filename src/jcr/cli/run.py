@@ -20,9 +20,9 @@ from jcr.segment.options import SegmentOptions
 class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
-    CAPTURE is a folder with capture.json and images, or what `jcr docs captures` lists: images and a table of poses,
-    bags, LeRobot data sets, COLMAP models … OUT gets calibration.json, reconstruction.npz,
-    cloud.ply, map.safetensors, report.html and log.txt. The same command resumes an interrupted run.
+    CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
+    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, cloud.ply,
+    map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
 
     examples:
       jcr run examples/tabletop out/tabletop
@@ -43,7 +43,7 @@ class Arguments:
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     no_map: bool = False
-    """Calibration and report alone: no dense depth, no cloud, no map; needs no torch."""
+    """Calibration and report only: no dense depth, cloud or map. Needs no torch."""
     output: Output = field(default_factory=Output)
 
 

@@ -1,4 +1,4 @@
-"""`jcr touch`: is the map where the robot's tip feels it?"""
+"""`jcr touch`: compares the map with points touched by the robot's tip."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,12 +11,12 @@ from jcr.cli.output import Output
 
 @dataclass(frozen=True)
 class Arguments:
-    """The error in task space: points touched with a calibrated tip, against the same points of the map.
+    """Measure the error in task space: touch points with a calibrated tip and compare them with the map.
 
-    OUT is the folder of a run, POINTS a CSV with a line per point: image, x_px, y_px (the pixel of an image of the run
-    that shows the point) and x_m, y_m, z_m (the tip in the base frame as it touches it). Three points or more, spread
-    over the scene; corners and printed marks are best. Exit status 3 when the errors are more than the reported
-    uncertainty explains.
+    OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the
+    run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). Use three or more
+    points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
+    than the reported uncertainty explains.
 
     examples:
       jcr touch out/table touched.csv

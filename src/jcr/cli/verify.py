@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Hold a calibration against new images: has the camera moved on the gripper since?
+    """Test a calibration with new images: has the camera moved on the gripper since?
 
-    OUT is the run folder of the calibration, whose capture must still be where it was; CAPTURE a capture of any
-    format with one or more new images of the same scene (two or three tell a moved camera from a moved table),
-    or five or more of another. Exit status 3 when something has moved, or when the images cannot tell.
+    OUT is the run folder of the calibration; its capture must still be at its old path. CAPTURE is a capture in any
+    format with one or more new images of the same scene (two or three distinguish a moved camera from a moved table),
+    or with five or more images of another scene. The exit status is 3 if something has moved, or if the images cannot
+    decide.
 
     examples:
       jcr verify out/table captures/this-morning
@@ -36,8 +37,7 @@ class Arguments:
     capture: Annotated[Path, tyro.conf.Positional]
     """The new images and their poses: a capture folder, or another format (jcr docs captures)."""
     camera: str | None = None
-    """A fixed camera of the run, to be held against an image of the same scene by it, in place of CAPTURE: has it
-    moved?"""
+    """Test this fixed camera of the run instead; CAPTURE is then a new image from it, of the same scene."""
     read: ReadOptions = field(default_factory=ReadOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     output: Output = field(default_factory=Output)

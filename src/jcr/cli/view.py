@@ -15,8 +15,8 @@ from jcr.cli.output import Output
 class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
-    The page is served until Ctrl-C, to this machine alone unless --host says otherwise. Needs viser: pip
-    install 'jcr-handeye[view]'.
+    The page is served until Ctrl-C, and only to this machine unless --host is given. Needs viser: pip install
+    'jcr-handeye[view]'.
 
     examples:
       jcr view out/table
@@ -29,15 +29,15 @@ class Arguments:
     urdf: Path | None = None
     """The robot, shown at the pose of each image; its root link is the base of the gripper poses."""
     joints: Path | None = None
-    """Its joint values (rad, m), a row an image: .csv or .npy. Left out, values are found that put TIP at each gripper
-    pose: one of the ways the robot may have stood."""
+    """Its joint values (rad, m), one row per image: .csv or .npy. Unset: one inverse-kinematics solution that puts TIP
+    at each gripper pose."""
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
-    """The URDF's link whose poses the capture has."""
+    """The URDF link whose poses the capture contains."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen on. Beyond 127.0.0.1 the address that is printed carries a token, without which nobody gets
-    in; there is no encryption."""
+    """Address to listen on. For any but 127.0.0.1 the printed address contains a token, which is required; there is no
+    encryption."""
     port: int = 8080
-    """Port to listen on; 0 takes a free one."""
+    """Port to listen on; 0 selects a free one."""
     output: Output = field(default_factory=Output)
 
 

@@ -23,14 +23,14 @@ V4L2_MANUAL_EXPOSURE = 1
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What a camera keeps to while images are taken."""
+    """Camera settings that stay fixed during the capture."""
 
     camera_size: tuple[int, int] | None = None
-    """Resolution in pixels, WIDTH HEIGHT; unset: what the camera gives (a RealSense: 1280 720)."""
+    """Resolution in pixels, WIDTH HEIGHT; unset: the camera's default (RealSense: 1280 720)."""
     exposure: float | None = None
     """Fix the exposure, in the camera's own unit (V4L2: 0.1 ms, RealSense: µs); unset: automatic."""
     focus: float | None = None
-    """Fix the focus, in the camera's own unit; unset: autofocus is switched off where the camera is when it opens."""
+    """Fix the focus, in the camera's own unit; unset: autofocus is switched off and the current focus kept."""
 
 
 @dataclass(frozen=True)

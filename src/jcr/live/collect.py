@@ -33,9 +33,9 @@ class CollectOptions:
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
     ] = None
-    """Box that proposed gripper positions stay in (m, base)."""
+    """Box that contains all proposed gripper positions (m, base frame)."""
     wanted: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = ENOUGH
-    """One-sigma uncertainty of the camera on the gripper that the live page aims at."""
+    """Target uncertainty (1 sigma) of the camera on the gripper, for the live page."""
 
 
 def collect(

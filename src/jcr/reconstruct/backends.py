@@ -350,42 +350,43 @@ class ReconstructOptions:
     """What turns images into camera poses and pointmaps."""
 
     backend: BackendName = "auto"
-    """auto takes the first of the list that needs no input of its own and whose package and weights are on this
-    machine (jcr models), and the next such one where its result is rejected."""
+    """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
+    (jcr models), in this order, and the next only if the result is rejected."""
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
     features: Literal["auto", "sift", "xfeat", "aliked"] = "auto"
-    """What is matched between images; selects the back end colmap. SIFT, or learned features for little texture, whose
-    weights come with the extra match; auto tries sift, then xfeat where it is installed and the first is rejected."""
+    """Features that are matched between images; selects the back end colmap. SIFT, or learned features for little
+    texture (extra match); auto tries sift, then, if the result is rejected and it is installed, xfeat."""
     seed: int = 0
     """Same seed, same result on the same machine."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks and the map's training run."""
+    """Device on which networks run and the map is trained."""
     memory_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 8.0
-    """Most that the process may take of main memory (peak resident set, the program included), and a network of a
-    GPU's. What it will take is said beforehand; what does not fit is done in smaller parts, or refused."""
+    """Memory limit of the process (peak resident set, the program included), and of a network on a GPU. The expected
+    use is printed beforehand; what does not fit is done in smaller parts, or refused."""
     dense: Annotated[
-        bool, tyro.conf.arg(help="Make no dense depth, which only the map needs; networks predict it anyway.")
+        bool,
+        tyro.conf.arg(help="Estimate no dense depth, which only the map needs; networks predict it anyway."),
     ] = True
     """Estimate the dense depth that the map needs."""
     priors: Annotated[
         bool,
         tyro.conf.arg(
-            help="Leave plain surfaces without depth, instead of the planes that their colour and the matched depth "
-            "around them speak for; the map takes these for surfaces, never for a view of free space."
+            help="Leave plain surfaces without depth. By default they are filled with planes where their colour and "
+            "the matched depth around them support it; the map uses these as surfaces, never as evidence of free space."
         ),
     ] = True
     """Fill plain surfaces with planes. Networks predict them anyway."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
-    """A network's weights, a path or a hub id; unset: the published ones. Under auto they are taken for DUSt3R's or
+    """A network's weights, as path or hub id; unset: the published ones. With --backend auto they must be DUSt3R's or
     MASt3R's."""
     predictions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A network's output as an npz file (jcr docs predictions); selects the back end predictions."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """Camera poses that were found elsewhere, a COLMAP model or transforms.json; selects the back end given."""
+    """Camera poses from another tool, a COLMAP model or transforms.json; selects the back end given."""
     pair_graph: Literal["auto", "complete", "window", "robot"] = "auto"
-    """Pairs of images that dust3r and mast3r see; robot leaves out those without a common view."""
+    """Pairs of images that dust3r and mast3r process; robot leaves out pairs without a common view."""
 
     def with_absolute_paths(self) -> "ReconstructOptions":
         """The same with paths that hold in every working folder."""

@@ -11,7 +11,7 @@ class CloudOptions:
     """Which points of the pointmaps enter the map."""
 
     confidence_percentile: Annotated[float, tyro.conf.arg(metavar="PERCENT")] = 20.0
-    """Drop this share (%) of the points that rest on matching or a prediction alone, the least confident first."""
+    """Drop this share (%) of the points that have only matching or a prediction as support, least confident first."""
     confidence_threshold: float | None = None
     """Keep points of at least this confidence (in the back end's own unit) instead of a percentile."""
     max_points: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 200_000
@@ -33,13 +33,12 @@ class MapOptions:
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="XMIN YMIN ZMIN XMAX YMAX ZMAX"),
     ] = None
-    """Box of the map in the base frame (m); unset: it holds the points and the
-    cameras."""
+    """Box of the map in the base frame (m); unset: a box around the points and the cameras."""
     cell: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
-    """Side (m) of the finest feature cells; what was seen is kept at half of it."""
+    """Side (m) of the finest feature cells; seen space is recorded at half of it."""
     max_cells: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 4_000_000
     """Enlarge the cells until the workspace holds no more than this many."""
     max_seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0
-    """Stop the training after this time at the latest; it stops by itself on a plateau."""
+    """Stop the training after this time at the latest; it stops earlier on a plateau."""
     map_seed: int = 0
     """Seed of the samples and of the initial weights."""

@@ -11,13 +11,13 @@ class TabletopOptions:
     """What counts as an object on the table."""
 
     object_lowest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.008
-    """Height (m) above the plane from which points found an object; lower ones may join it."""
+    """Height (m) above the plane that an object must reach; its lower points may then belong to it."""
     object_highest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.6
     """Height (m) above the plane beyond which nothing belongs to an object."""
     object_gap: Annotated[float, tyro.conf.arg(metavar="M")] = 0.01
     """Objects with this much space (m) between them, seen from above, are separated."""
     object_smallest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.015
-    """Objects whose points span less (m) than this are taken for noise."""
+    """Objects whose points span less (m) than this are treated as noise."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class SegmentOptions:
     """How the scene is divided into objects."""
 
     segments: Literal["auto", "labels", "tabletop", "sam", "none"] = "auto"
-    """labels: labels/NAME.png beside the images' folder; tabletop: the plane that carries the scene and what stands
-    on it; sam: Segment Anything 2 (pip install 'jcr-handeye[sam]'); auto: labels where there are some, else tabletop."""
+    """labels: labels/NAME.png in the capture's folder; tabletop: the support plane and what stands on it; sam: Segment
+    Anything 2 (pip install 'jcr-handeye[sam]'); auto: labels if there are any, otherwise tabletop."""
     sam_weights: Annotated[str, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)
