@@ -241,25 +241,27 @@ def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
     """Which of two is kept, noting why, and the account of both; `one` is known to be doubtful."""
     if isinstance(other.failure, InputError) and not BACKENDS[other.backend].hub_id:
         raise other.failure
+    about = _about(one.backend, one.name)
+    about += "," * ("," in about)
     if one.hand_eye is None:
-        nothing = f"{_about(one.backend, one.name)}, failed ({one.failure})"
+        nothing = f"{about} failed ({one.failure})"
         if other.hand_eye is None:
             # The licence of weights that were used belongs to this answer, too.
             failure = NotTrustedError(f"{other.failure}; {nothing}")
             return replace(other, failure=failure), (one.attempt(), other.attempt())
         kept = other.noted(f"{nothing}; {other.told()} was used instead")
         return kept, (one.attempt(), other.attempt())
-    doubt = f"{_about(one.backend, one.name)}, is rejected ({one.hand_eye.warnings[0]})"
+    doubt = f"{about} is rejected ({one.hand_eye.warnings[0]})"
     if other.hand_eye is None:
         kept = one.noted(f"{doubt}, and {other.name} failed ({other.failure})")
         return kept, (one.attempt(), other.attempt())
     untrusted = f"rejected: {one.hand_eye.warnings[0]}"
     if other.hand_eye.converged:
-        kept = other.noted(f"{doubt}; {other.told()} is, and was used instead of {one.told()}")
+        kept = other.noted(f"{doubt}; {other.told()} is accepted, and was used instead of {one.told()}")
         return kept, (one.attempt(untrusted), other.attempt())
     kept, left = (other, one) if other.missed_m < one.missed_m else (one, other)
-    words = f"{doubt}, nor is {other.name}; {kept.told()} was used and not {left.told()}"
-    farther = f"rejected, and its leave-one-out error is not the smaller one: {left.told()}"
+    words = f"{doubt}, and so is {other.name}; {kept.told()} was used and not {left.told()}"
+    farther = f"rejected, and its leave-one-out error is the larger one: {left.told()}"
     attempts = tuple(tried.attempt(farther if tried is left else None) for tried in (one, other))
     return kept.noted(words), attempts
 

@@ -85,7 +85,7 @@ def check(
     if move < 5e-3 and turn > np.radians(5):
         remarks.append(
             f"the gripper moves by at most {1e3 * move:.2g} mm while it rotates by {np.degrees(turn):.0f}°: "
-            "positions that were divided by 1000 look so"
+            "the positions may have been divided by 1000"
         )
     if isinstance(capture, Capture):
         _, _, unused = robot_errors(capture, CalibrateOptions())

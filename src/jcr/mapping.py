@@ -36,7 +36,7 @@ def require_map(options: ReconstructOptions) -> None:
     """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
     if not options.dense:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
-    require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do without")
+    require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do not need it")
 
 
 def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:

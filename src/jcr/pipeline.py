@@ -156,7 +156,7 @@ def add_camera(
     earlier = RunFolder(Path(out)).calibration()
     if earlier.doubt is not None:
         raise NotTrustedError(
-            f"{out}: no camera can be placed by a calibration that is rejected: {earlier.doubt}"
+            f"{out}: its calibration is rejected, so no camera can be located with it: {earlier.doubt}"
         )
     options = RunOptions(made_with.reconstruct, made_with.calibrate)
     with held(Path(out)) as folder:

@@ -127,7 +127,7 @@ class RunFolder:
         calibration = self.calibration()
         if calibration.mount == "base":
             raise InputError(
-                f"{self.path}: is of a camera that watches the gripper; this needs one that the gripper carries"
+                f"{self.path}: is for a camera that watches the gripper; this needs a camera on the gripper"
             )
         if calibration.gripper_from_camera is None:
             raise InputError(

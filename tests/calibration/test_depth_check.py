@@ -75,7 +75,7 @@ def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
     content = calibration_file(capture, reconstruction, replace(hand_eye, depth_check=check), {}, "0")
-    said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long by the robot"
+    said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
     assert said in summary(content)
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
     assert depth_check(replace(capture, depths=None), reconstruction, hand_eye) is None

@@ -99,7 +99,10 @@ def test_what_no_number_of_images_reaches_is_not_promised():
     given, _ = pairs(12, 12)
     content, html = page(given, calibrate_poses(given, CalibrateOptions(require=(0.01, 0.001))))
     assert content.requirement is not None and content.requirement.more_images is None
-    assert "a dozen more images would not do" in (shortfall(content) or "") and "would not do" in html
+    assert (
+        "a dozen more images would not be enough" in (shortfall(content) or "")
+        and "would not be enough" in html
+    )
     met = page(given, calibrate_poses(given))
     assert shortfall(met[0]) is None and 'class="verdict good"' in met[1]
 

@@ -105,7 +105,7 @@ def test_samples_of_markers_are_solved_without_images(name: str, tmp_path: Path,
     pairs = read_source(path)
     assert isinstance(pairs, PosePairs) and pairs.is_metric
     assert_same_calibration(pairs.base_from_gripper, pairs.recon_from_camera, problem)
-    with pytest.raises(jcr.InputError, match="no images; `jcr calibrate` solves it"):
+    with pytest.raises(jcr.InputError, match="no images; use `jcr calibrate`"):
         jcr.read_capture(path)
 
 
@@ -223,7 +223,11 @@ def scaled(folder: Path, convention: str, header: str, position: float = 1, angl
 
 RPY = "image,x,y,z,roll,pitch,yaw"
 FAULTS = {
-    "column missing": (lambda f: edit_line(f, 0, lambda line: line.replace("qw", "q")), {}, "show no pose"),
+    "column missing": (
+        lambda f: edit_line(f, 0, lambda line: line.replace("qw", "q")),
+        {},
+        "contain no pose",
+    ),
     "column of the convention missing": (
         lambda f: None,
         {"pose_convention": "kuka"},
@@ -237,7 +241,7 @@ FAULTS = {
     "word for a number": (
         lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",here"),
         {},
-        "row 2, column qw: 'here' is no number",
+        "row 2, column qw: 'here' is not a number",
     ),
     "NaN": (
         lambda f: edit_line(f, 2, lambda line: line.rsplit(",", 1)[0] + ",nan"),
@@ -382,7 +386,7 @@ def test_what_is_no_capture_is_told_what_would_be_one(tmp_path: Path):
     with pytest.raises(jcr.InputError, match="holds no capture.json, nor anything else"):
         jcr.read_capture(tmp_path)
     (tmp_path / "notes.md").write_text("hello")
-    with pytest.raises(jcr.InputError, match="say what it is with --format") as caught:
+    with pytest.raises(jcr.InputError, match="give its format with --format") as caught:
         jcr.read_capture(tmp_path / "notes.md")
     assert all(name in str(caught.value) for name in FORMATS)
 
@@ -424,7 +428,7 @@ def test_swapped_poses_of_samples_are_named(tmp_path: Path, problem: HandEyeProb
 def test_a_stamp_that_64_bits_do_not_hold_is_refused(text: str):
     """By fuzzing: the first made floats of all the stamps beside it, the third was too large to compare."""
     assert stamp_ns("9200000000000000000", "a table") == 9_200_000_000_000_000_000
-    with pytest.raises(jcr.InputError, match="no time stamp"):
+    with pytest.raises(jcr.InputError, match="not a time stamp"):
         stamp_ns(text, "a table")
 
 

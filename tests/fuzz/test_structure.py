@@ -98,7 +98,7 @@ MANY = {
     "columns": (
         "poses.csv",
         ",".join(f"c{k}" for k in range(30_000)) + "\n" + ",".join("0" * 30_000),
-        "show no pose",
+        "contain no pose",
     ),
 }
 

@@ -99,7 +99,7 @@ def test_samples_are_taken_by_service_and_at_rest_and_the_next_pose_is_proposed(
         played.at = k
         until(lambda k=k: len(proposed) == k + 1)
     assert proposed[0] is None and np.linalg.det(proposed[2][:3, :3]) == pytest.approx(1)
-    assert session.take() == (False, "the gripper is where images/002.png was taken; move on")
+    assert session.take() == (False, "the gripper is where images/002.png was taken; move to another pose")
     session.stop()
 
     by_hand = Session(

@@ -506,7 +506,7 @@ def read_hand_eye(path: Path) -> Known:
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; correct it there") from None
     if found.gripper_from_camera is None:
-        raise InputError(f"{file}: has no gripper_from_camera; the calibration it is from found none")
+        raise InputError(f"{file}: has no gripper_from_camera; that calibration failed")
     transform = require_rigid(np.array(found.gripper_from_camera), f"{file}: gripper_from_camera")
     if (uncertainty := found.uncertainty) is not None:
         budget = {} if uncertainty.budget is None else vars(uncertainty.budget)
@@ -553,7 +553,7 @@ def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
     kind = content.get("format")
     if kind != FORMAT:
         raise InputError(
-            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; use the jcr that wrote it"
+            f"{file}: format {shown(kind)}, this version reads {FORMAT!r}; use the version of jcr that wrote it"
         )
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.

@@ -330,13 +330,13 @@ def _in_words(
         px = value[0] * camera.fx
         return (
             f"the images are sheared by {abs(px):.1f} ± {significant(std[0] * camera.fx)} px from top to bottom ({p}), "
-            "as a rolling shutter does of a camera that moves: take the images at rest"
+            "as by the rolling shutter of a moving camera: take the images at rest"
         )
     if fault.kind == "shear of each":
         px = camera.fx * float(np.sqrt(np.mean(value**2)))
         return (
-            f"each image is sheared by itself, {px:.1f} px from top to bottom (rms, {p}), as a rolling shutter does of "
-            "a camera that moves: take the images at rest"
+            f"each image is sheared by itself, {px:.1f} px from top to bottom (rms, {p}), as by the rolling shutter "
+            "of a moving camera: take the images at rest"
         )
     units = dict(zip(equations.names, equations.units, strict=True))
     names = _freed(fault.kind, equations)

@@ -333,7 +333,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
             gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
-            remark = "the motions do not show the scale: it is taken as 1, as the marker's size says"
+            remark = "the scale is unobservable from these motions: it is taken as 1, from the marker's size"
             return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)

@@ -24,8 +24,8 @@ NOTABLE_ERRORS = 0.03, 0.003
 """mm, degrees; real arms err by more, and of less nobody need hear."""
 SHORT = "not as exact as needed"
 SCALE_FROM_ROBOT = (
-    "the scale comes from the robot's positions alone: were all of them too long by one factor, no image would show it, "
-    "and ± does not hold it; the size of a board or --known-length would show it"
+    "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no image shows it, and ± "
+    "does not include it; the size of a board or --known-length would show it"
 )
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
@@ -44,8 +44,8 @@ def summary(content: "CalibrationFile") -> str:
             and not more_images_help(content.uncertainty.budget)
         ):
             lines.append(
-                "most of ± is systematic error of the robot: more images of the same region will hardly help, another "
-                "region of the workspace or its joint angles (capture.json: joints and robot) would"
+                "most of ± comes from systematic robot errors: more images of the same region will hardly help; images "
+                "of another region of the workspace, or the joint angles (capture.json: joints and robot), would"
             )
         required = content.requirement
         reach = required is not None and bool(required.more_images)
@@ -114,9 +114,9 @@ def shortfall(content: "CalibrationFile") -> str | None:
         and content.uncertainty.budget is not None
         and not more_images_help(content.uncertainty.budget)
     ):
-        more = "systematic errors of the robot are most of it: name the arm (--robot) or add its joint angles"
+        more = "most of it comes from systematic robot errors: name the arm (--robot) or add its joint angles"
     else:
-        more = "a dozen more images would not do; take them nearer to the scene, or with a better camera or robot"
+        more = "a dozen more images would not be enough; move closer to the scene, or use a better camera or robot"
     return f"{SHORT}: {reached_in_words(required)}; {more}"
 
 
@@ -152,7 +152,7 @@ def robot_in_words(content: "CalibrationFile") -> list[str]:
             lines.append(f"robot: joint{'s' * (len(off) > 1)} {named} seem off by {sizes} ({chance})")
         else:
             lines.append(
-                f"robot: poses near each other err alike, by {errors.translation_mm:.2g} mm and "
+                f"robot: neighbouring poses have similar errors, {errors.translation_mm:.2g} mm and "
                 f"{errors.rotation_deg:.2g}° per axis ({chance}): joint offsets or link errors"
             )
     if (angles := content.angle_ratio) is not None:
@@ -232,14 +232,14 @@ def pixels(held_out: "HeldOut | HeldOutError") -> str:
 def depth_in_words(check: DepthCheck) -> str:
     """What the robot says of a depth camera: its scale, and its noise near and far."""
     off, std = check.off_percent, check.std_percent
-    size = f"{abs(off):.2g} ± {std:.1g} % too {'long' if off > 0 else 'short'} by the robot"
+    size = f"are {abs(off):.2g} ± {std:.1g} % too {'long' if off > 0 else 'short'} compared with the robot's"
     if abs(off) < 2 * std:
-        size = f"right by the robot ({off:+.2g} ± {std:.1g} %)"
+        size = f"agree with the robot's ({off:+.2g} ± {std:.1g} %)"
     noise = " and ".join(
         f"{significant(1e3 * float(np.hypot(check.noise_m, check.noise_per_m * z**2)))} mm at {z:.2f} m"
         for z in check.distances_m
     )
-    return f"depth camera: its lengths are {size}; noise {noise} (1 σ); the map has them corrected"
+    return f"depth camera: its lengths {size}; noise {noise} (1 σ); the map uses corrected depth"
 
 
 def scale_in_words(check: "ScaleCheck | NetworkScale") -> str:
@@ -250,4 +250,4 @@ def scale_in_words(check: "ScaleCheck | NetworkScale") -> str:
     if off > 100:
         return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
     direction = "long" if off > 0 else "short"
-    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} by the robot's"
+    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} compared with the robot's"

@@ -96,7 +96,7 @@ def stamp_ns(text: str, where: str) -> int:
             raise ValueError
         return stamp
     except (ArithmeticError, ValueError):  # of Decimal each has its own name
-        raise InputError(f"{where}: {shown(text)} is no time stamp; give seconds or nanoseconds") from None
+        raise InputError(f"{where}: {shown(text)} is not a time stamp; give seconds or nanoseconds") from None
 
 
 def _unnamed(file: Path, cells: Cells, options: ReadOptions) -> dict[str, tuple[str, ...]]:
@@ -138,7 +138,7 @@ def _shown(columns: dict[str, tuple[str, ...]], where: str) -> str:
             "(--pose-convention yaskawa); say which"
         )
     raise InputError(
-        f"{where}: its columns ({', '.join(columns)}) show no pose; name them x, y, z and qx, qy, qz, qw or roll, "
+        f"{where}: its columns ({', '.join(columns)}) contain no pose; name them x, y, z and qx, qy, qz, qw or roll, "
         "pitch, yaw, or give --pose-convention"
     )
 
@@ -158,6 +158,6 @@ def _numbers(cells: tuple[str, ...], name: str, where: str) -> list[float]:
     for row, cell in enumerate(cells, start=1):
         if not is_number(cell):
             raise InputError(
-                f"{where}: row {row}, column {name}: {shown(cell)} is no number; correct or drop the row"
+                f"{where}: row {row}, column {name}: {shown(cell)} is not a number; correct or drop the row"
             )
     return [float(cell) for cell in cells]

@@ -65,7 +65,7 @@ def read_capture(
     found = read_source(path, options, into=into, progress=progress)
     if isinstance(found, PosePairs):
         raise InputError(
-            f"{path}: gives camera poses and no images; `jcr calibrate` solves it, as does solve_hand_eye"
+            f"{path}: has camera poses but no images; use `jcr calibrate`, or solve_hand_eye in Python"
         )
     return found
 
@@ -100,9 +100,7 @@ def read_source(
         remarks = [remark for remark in (how_turned(found), how_scaled(found)) if remark is not None]
         return replace(found, notes=(*found.notes, *remarks))
     if into is None:
-        raise InputError(
-            f"{path}: its images lie inside of it; say where to put the chosen ones: into=FOLDER"
-        )
+        raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
     return _extracted(path, options, Path(into), reader, progress or silent)
 
 
@@ -172,6 +170,6 @@ def _of_file(file: Path) -> str:
         if isinstance(content, dict) and "data" in content:
             return "industrial"
     raise InputError(
-        f"{file}: nothing that jcr reads by its name or content; say what it is with --format "
+        f"{file}: not recognised by its name or content; give its format with --format "
         f"({', '.join(FORMATS)}), see jcr docs captures"
     )

@@ -75,7 +75,9 @@ def gripper_poses(
         raise InputError(f"{file}: names an image more than once; keep one row per image")
     known = [k for k, name in enumerate(images) if _plain(name) in row_of]
     if not known:
-        raise InputError(f"{file}: knows none of the images; it has {table.images[0]}, they have {images[0]}")
+        raise InputError(
+            f"{file}: lists none of the images; it lists {table.images[0]}, the images are called {images[0]}"
+        )
     rows = [row_of[_plain(images[k])] for k in known]
     notes = ()
     if unknown := len(images) - len(known):

@@ -125,7 +125,7 @@ def dispatch(arguments: Sequence[str]) -> int:
             return _fail(2, str(error))
         return 0
     if name not in COMMANDS:
-        return _fail(2, f"{name!r} is no command of jcr; there are {', '.join(COMMANDS)} (jcr --help)")
+        return _fail(2, f"{name!r} is not a jcr command; choose from {', '.join(COMMANDS)} (jcr --help)")
     return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
 
 

@@ -97,11 +97,11 @@ def _explain(
         axis = _axis_words(u[:, 0], "base")
         cure = f"tilt the wrist by 20° or more away from {axis} in two images"
         if unseen.sum() == 1 and not loses_scale:
-            return (f"offset along {axis}: all rotations are about it (planar or SCARA motion)",), (
+            return (f"translation along {axis}: all rotations are about it (planar or SCARA motion)",), (
                 f"{cure}, or give the camera's known height along it",
             )
         names = (
-            f"offset along {axis}: all rotations are about it (one fixed axis)",
+            f"translation along {axis}: all rotations are about it (one fixed axis)",
             "scale: the camera moves on circles about one axis only",
             f"rotation of the camera about {axis}",
         )
@@ -110,10 +110,10 @@ def _explain(
         return _lost_scale(base_from_gripper, recon_from_camera)
     weakest = found.direction[0]
     what, axis = max(
-        (("offset", weakest[:3]), ("turn", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
+        (("translation", weakest[:3]), ("rotation", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
     )
     return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
-        "rotate the wrist more, about axes at right angles to each other, in three or more images",
+        "rotate the wrist more, about perpendicular axes, in three or more images",
     )
 
 

@@ -134,7 +134,7 @@ def judged(hand_eye: HandEye) -> HandEye:
 def _doubts(hand_eye: HandEye):
     """Reasons not to trust the answer, worst first, each with its remedy."""
     for name, cure in zip(hand_eye.observability.unobservable, hand_eye.observability.advice, strict=False):
-        yield f"the motions do not show the {name}; {cure}"
+        yield f"unobservable from these motions: {name}; {cure}"
     used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
     noise = hand_eye.robot_noise
     disagree = used < max(3, MIN_SHARE_USED * n) and n > 2
@@ -157,13 +157,13 @@ def _doubts(hand_eye: HandEye):
             (
                 std[3:6].max(),
                 MAX_STD[1],
-                f"the orientation is known to ±{np.degrees(std[3:6].max()):.1f}° only",
+                f"the rotation is known to ±{np.degrees(std[3:6].max()):.1f}° only",
             ),
             (std[6], MAX_STD[2], f"the scale is known to ±{100 * std[6]:.0f} % only"),
         ):
             if value > limit:
                 # Of few images half the uncertainty may be that the robot's noise is hardly known.
-                tell = ", or say how well the robot repeats (--robot-noise MM DEG)"
+                tell = ", or give the robot's repeatability (--robot-noise MM DEG)"
                 unknown = noise.given is None and used < FEW
                 yield f"{text}; add images, rotated by 20° or more about different axes{tell if unknown else ''}"
 
@@ -177,19 +177,19 @@ def _remarks(hand_eye: HandEye):
     ):
         yield (
             f"gripper poses and images disagree by {1e3 * metres:.2g} mm and "
-            f"{np.degrees(radians):.2g}° per axis, more than the robot noise that was given "
-            f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is counted"
+            f"{np.degrees(radians):.2g}° per axis, more than the given robot noise "
+            f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is used"
         )
     held_out = hand_eye.held_out
     if held_out is not None:
         typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.together[0]
         if held_out.translation_mm > max(3 * typical, 2.0):
             yield (
-                f"the leave-one-out error is {held_out.translation_mm:.1f} mm though the fit's residual "
-                f"is {typical:.1f} mm: too few images for this motion; add some"
+                f"the leave-one-out error ({held_out.translation_mm:.1f} mm) is well above the fit's residual "
+                f"({typical:.1f} mm): too few images for this motion; add some"
             )
     if len(hand_eye.inliers) < FEW:
-        yield f"{len(hand_eye.inliers)} images cannot outvote a wrong one; take 8 or more"
+        yield f"with {len(hand_eye.inliers)} images a wrong one cannot be identified; take 8 or more"
 
 
 def _disagreement(hand_eye: HandEye) -> tuple[float, float]:

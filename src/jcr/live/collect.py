@@ -87,7 +87,7 @@ def _taken(
 ) -> Picture | str:
     for name, pose in zip(live.names, live.poses, strict=True):
         if not farther(pose, ask.base_from_gripper, SAME_PLACE):
-            return f"the gripper is where {name} was taken; move on"
+            return f"the gripper is where {name} was taken; move to another pose"
     taken = picture(frames, kept, patience_s)
     if ask.current is not None and farther(ask.base_from_gripper, ask.current(), REST):
         return "the arm moved while the image was taken; let it rest"

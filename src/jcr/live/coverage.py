@@ -95,7 +95,7 @@ def next_lines(found: Coverage) -> list[str]:
         return []
     lines = pose_lines(found.next_pose.base_from_gripper, found.words, found.next_joints)
     if found.words.arm is not None and found.next_joints is None:
-        lines.append(f"no joint angles of a {found.words.arm.name} reach this within its limits: go near it")
+        lines.append(f"a {found.words.arm.name} cannot reach this pose within its joint limits: go near it")
     return lines
 
 

@@ -47,13 +47,13 @@ def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> 
         grey, sharpness = brightness_and_sharpness(frame.image)
         usual = float(np.median([one.sharpness for one in kept])) if kept else 0.0
         if np.abs(now - before).mean() > STILL:
-            reason = "the image moves; let the arm come to rest and nothing move in view"
+            reason = "the image is not still; wait until the arm and everything in view is at rest"
         elif (fault := exposure_fault(grey)) is not None:
             reason = f"the image is {fault}; change light or exposure"
         elif sharpness < BLURRED * usual:
             reason = f"the image is blurred ({100 * sharpness / usual:.0f} % of the usual sharpness)"
         elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
-            reason = "the gripper moved but the image is as before; is the stream frozen, the camera another?"
+            reason = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
         else:
             return Picture(frame.image, now, sharpness, frame.depth_mm)
         if frame.time_s > end:

@@ -111,7 +111,7 @@ def _body(live: LiveFolder, found: Coverage, headline: str, wanted: tuple[float,
         pose = found.next_pose
         next_pose = (
             f"<p>{1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.turned_rad):.0f}° from "
-            f"{escape(str(found.like))}. Look that the arm is free to go there.</p><pre>{lines}</pre>"
+            f"{escape(str(found.like))}. Check that the arm can move there without collision.</p><pre>{lines}</pre>"
         )
     return (
         f'<section class="verdict {_kind(headline, found, wanted)}"><h2>{escape(headline)}</h2>'

@@ -39,4 +39,4 @@ def states(host: str) -> Iterator[State]:
             time.sleep(POLL_S)
     finally:
         robot.disconnect()
-    raise InputError(f"{where}: the robot says nothing more; check that it is on; the same command resumes")
+    raise InputError(f"{where}: the robot stopped sending; check that it is on; the same command resumes")

@@ -40,7 +40,7 @@ def states(host: str, port: int) -> Iterator[State]:
                 yield _state(stream.read(4), stream.read, where)
     except TimeoutError:
         raise InputError(
-            f"{where}: silent for {TIMEOUT_S:.0f} s; is the robot on, the address right?"
+            f"{where}: silent for {TIMEOUT_S:.0f} s; is the robot on, and the address right?"
         ) from None
     except OSError as error:
         raise InputError(f"{where}: {error}; check the address, and that the robot is on") from None
@@ -50,7 +50,7 @@ def _state(head: bytes, read: Callable[[int], bytes], where: str) -> State:
     length = struct.unpack("!i", head)[0] if len(head) == 4 else 0
     if length not in BEFORE_3_0 and length not in SINCE_3_0:
         raise InputError(
-            f"{where}: a packet of {length} bytes is none of a UR real-time port; use 30003 or 30013"
+            f"{where}: a packet of {length} bytes does not come from a UR real-time port; use 30003 or 30013"
             if head
             else f"{where}: the robot closed the connection; is another program using the port?"
         )

@@ -32,7 +32,7 @@ def motion_section(result: RunResult | PosesResult) -> str:
         says = f"<p>The motions leave unseen:</p><ul>{items}</ul>"
     spreads = ""
     if uncertainty is not None:
-        offset = _spreads("offset along", uncertainty.translation_std_mm, " mm")
+        offset = _spreads("translation along", uncertainty.translation_std_mm, " mm")
         turn = _spreads("rotation about", uncertainty.rotation_std_deg, "°")
         spreads = (
             f'<h3>What that leaves uncertain</h3><div class="columns">{offset}{turn}</div>'
