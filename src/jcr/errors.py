@@ -14,4 +14,4 @@ class InputError(ValueError):
 
 
 class NotTrustedError(RuntimeError):
-    """No trustworthy answer exists for sound input; the message gives the reason and the remedy (exit 3)."""
+    """The input is sound but the result is rejected; the message gives the reason and the remedy (exit status 3)."""

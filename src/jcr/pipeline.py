@@ -42,11 +42,11 @@ def run(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Everything: calibration, cloud, map and report of a capture in the folder `out`.
+    """Calibrate a capture and write calibration, cloud, map and report to the folder `out`.
 
-    Finished stages are taken from `out` when capture and options are unchanged. Raises InputError on input
-    that cannot be used, or where the map is asked for and torch is not installed, and NotTrustedError when no
-    camera poses are found (calibration.json then says why).
+    Finished stages are reused from `out` if capture and options are unchanged. Raises InputError if the input cannot be
+    used, or if a map is requested and torch is not installed, and NotTrustedError if no camera poses are found
+    (calibration.json then says why).
     """
     options = _with_backend(options, backend, capture)
     check_options(options.calibrate)
@@ -70,9 +70,9 @@ def calibrate(
     backend: str | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Reconstruction, calibration and report of a capture in the folder `out`; raises as `run` does.
+    """Calibrate a capture and write calibration and report to the folder `out`; raises as `run` does.
 
-    There is no dense depth: only a map and a known length need it, and `build_map` makes it where it is missing.
+    No dense depth is estimated: only a map and a known length need it, and `build_map` adds it if it is missing.
     """
     options = _with_backend(options, backend, capture)
     options = _with_dense(options, options.calibrate.known_length is not None)
@@ -116,11 +116,11 @@ def build_map(
     add: Sequence[tuple[Path, Path]] = (),
     progress: Progress | None = None,
 ) -> RunResult:
-    """Cloud, map and report again, from the capture and the calibration that the run folder `out` names.
+    """Build cloud, map and report again, from the capture and the calibration of the run folder `out`.
 
-    `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map and
-    not the calibration, and every later map of the folder has them. Where the folder was made without dense depth,
-    the reconstruction gets it.
+    `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map but not the
+    calibration, and are used in every later map of the folder. If the folder was made without dense depth, it is
+    added to the reconstruction.
     """
     made_with = RunFolder(Path(out)).options()
     reconstruct = replace(made_with.reconstruct, dense=True)
@@ -146,11 +146,11 @@ def add_camera(
     *,
     progress: Progress | None = None,
 ) -> RunResult:
-    """A fixed camera placed in the run folder `out` by images of the scene that was mapped there.
+    """Locate a fixed camera from its images of the scene of the run folder `out`.
 
-    `intrinsics` is a JSON file as capture.json has them; None: they are estimated. The camera becomes part of the run,
-    cameras.json and the report. Raises InputError for images that are not of one camera or fit no intrinsics, and
-    NotTrustedError, with nothing kept, where they do not show the camera's place or the run is not calibrated.
+    `intrinsics` is a JSON file in the form of capture.json; None: they are estimated. The camera becomes part of the
+    run, of cameras.json and of the report. Raises InputError if the images are not from one camera or do not fit the
+    intrinsics, and NotTrustedError, writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
     made_with, capture = RunFolder(Path(out)).options(), RunFolder(Path(out)).capture()
     earlier = RunFolder(Path(out)).calibration()
@@ -184,9 +184,9 @@ def add_camera(
 
 
 def measure(out: str | Path) -> Measured:
-    """The support plane of a run and what stands on it, from its cloud and its calibration.
+    """Measure the support plane of a run and the objects on it, from its cloud and its calibration.
 
-    Raises InputError where there is no map, and when no plane carries the scene.
+    Raises InputError if there is no map, or if there is no support plane.
     """
     folder = RunFolder(Path(out))
     return measured(folder.cloud(), folder.calibration())

@@ -56,11 +56,11 @@ def read_capture(
     into: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Capture:
-    """The capture at a path, in any format of the page `captures`.
+    """Read the capture at a path, in any format of the page `captures`.
 
-    The images of a recording (bag, LeRobot) are put in the new folder `into`, which is a capture folder itself.
-    Raises InputError naming the file, the fault and its remedy: anything missing, unreadable, of another size,
-    not rigid, in millimetres, or fewer than three frames.
+    The images of a recording (bag, LeRobot) are extracted to the new folder `into`, itself a capture folder. Raises
+    InputError with the file, the fault and its remedy, if anything is missing, unreadable, of another size, not rigid
+    or in millimetres, or if there are fewer than three frames.
     """
     found = read_source(path, options, into=into, progress=progress)
     if isinstance(found, PosePairs):

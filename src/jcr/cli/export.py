@@ -121,10 +121,10 @@ def main(arguments: Arguments) -> int:
 def export_run(
     out: str | Path, format: FormatName, path: str | Path | None = None, **options: object
 ) -> Path:
-    """Write the run folder `out` in a format of `jcr export` and return the file's, or the new folder's, path.
+    """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does; of a
-    calibration that is rejected the file says so.
+    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does; if the
+    calibration is rejected, the file says so.
     """
     named = None if path is None else Path(path)
     return _written(Arguments(Path(out), format, named, **options))[2]  # pyright: ignore[reportArgumentType]

@@ -46,21 +46,21 @@ def solve_hand_eye(
 ) -> HandEye:
     """Hand-eye calibration with unknown scale from camera poses of your own.
 
-    Takes two stacks (n,4,4), n ≥ 2: gripper poses in the base (m) and camera poses in any frame and unit, of
-    the same instants in the same order. `robot_noise` is the one-sigma noise of the gripper poses per axis
-    (m, rad), at least: the residuals may say more. `camera_covariance` (6n,6n) is that of the camera poses where
-    they are not exact beside the gripper's, as records.CameraEvidence defines it.
+    Takes two stacks (n,4,4), n ≥ 2, taken at the same instants and in the same order: gripper poses in the base frame
+    (m) and camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses (1 sigma
+    per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n), as records.CameraEvidence defines it, is
+    needed if the camera poses are not exact compared with the gripper poses.
 
-    `robot` names the arm (jcr.handeye.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), from the base on:
-    they tell how its joint offsets and link errors bend the poses. Of a robot alone the angles are found from the
-    poses; with neither, errors are those that poses near each other share. `systematic` is their covariance where it is
-    known already (systematic.py).
+    `robot` names the arm (jcr.handeye.arms.ROBOT_NAMES) and `joints` (n,dof) are its angles (rad), starting at the base:
+    they determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed from
+    the poses; with neither, systematic errors are assumed to vary smoothly over the poses. `systematic` is their
+    covariance, if it is known already (systematic.py).
 
-    `scale` (metres per unit of the camera poses, 1 where these are metric) is known to `scale_std` (relative); without
-    it the scale is found.
+    `scale` (metres per unit of the camera poses, 1 if these are metric) is known to `scale_std` (relative); without it
+    the scale is estimated.
 
-    Raises InputError on shapes, values or counts that cannot be poses, and on poses or angles that are not of the robot;
-    degenerate motion is an answer (`observability`, `converged`), not an exception.
+    Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
+    robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")

@@ -18,10 +18,10 @@ FILE = "map.safetensors"
 
 
 def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
-    """The map of a run folder (or a map file itself).
+    """Load the map of a run folder (or a map file itself).
 
-    Raises InputError where there is none, where it is damaged, where another version of jcr wrote it, and where its
-    packages are not installed.
+    Raises InputError if there is none, if it is damaged, if another version of jcr wrote it, or if its packages are not
+    installed.
     """
     path = Path(folder)
     path = path / FILE if path.is_dir() else path
