@@ -307,7 +307,7 @@ def _details(
         blocks["Uncertainty, 1 σ per axis"] = budget_in_words(uncertainty.budget)
     if (check := calibration.depth_check) is not None:
         blocks["Depth camera"] = {
-            "its lengths, by the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
+            "scale error, compared with the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
             **{
                 f"noise at {z:.2f} m, 1 σ": f"{significant(1e3 * float(check.std_m(np.array(z))))} mm"
                 for z in check.distances_m
@@ -338,7 +338,7 @@ def _robot(calibration: CalibrationFile) -> dict[str, str]:
     """What the poses tell of the robot itself."""
     items = {}
     if (errors := calibration.robot_errors) is not None and errors.p is not None:
-        items["poses near each other err alike"] = (
+        items["errors shared by neighbouring poses"] = (
             f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis (p = {errors.p:.2g})"
         )
         for k, joint in enumerate(errors.joints or [], start=1):
