@@ -136,7 +136,7 @@ def _worst(std: Float[ndarray, "k 7"]) -> tuple[Float[ndarray, " k"], Float[ndar
 
 def _tiles(found: Coverage, wanted: tuple[float, float]) -> str:
     mm, deg = _worst(found.expected_std)
-    cells = [("pictures", str(found.pictures), "")]
+    cells = [("images", str(found.pictures), "")]
     if len(mm):
         cells += [
             ("translation, expected σ", f"{mm[-1]:.2g} mm", f"wanted {wanted[0]:g} mm"),
