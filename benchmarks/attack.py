@@ -18,8 +18,9 @@ from jcr.geometry import step_between
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
-DRAWS, FEW, CLEAN = 10, 3, 100
-"""Of what is random by itself, of what only the noise makes random, and of nothing wrong; with --long twice as many."""
+DRAWS, FEW, CLEAN = 7, 2, 70
+LONG_TIMES = 3
+"""Of what is random by itself, of what only the noise makes random, and of nothing wrong; with --long so many times."""
 IMAGES = 12
 LOOSE = (3.0, 3.0)
 """m, rad: gripper poses by which structure from motion is hardly held."""
@@ -155,7 +156,7 @@ def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
 
 def run(long: bool = False) -> str:
     """Markdown: the claim, the table of faults, and false alarms."""
-    times = 2 if long else 1
+    times = LONG_TIMES if long else 1
     rows = {case: [_one(case, seed) for seed in range(times * case.draws)] for case in CASES}
     clean = [_clean(seed) for seed in range(times * CLEAN)]
     return page(rows, clean)

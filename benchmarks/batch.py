@@ -18,7 +18,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Intrinsics
 from jcr.simulate.problem import hand_eye_problem
 
-CAPTURES, MANY, IMAGES = 60, 200, 6
+CAPTURES, MANY, IMAGES = 32, 200, 6
 """MANY with --long."""
 LENS = Intrinsics(30.0, 30.0, 15.5, 11.5, 32, 24)
 

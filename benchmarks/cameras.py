@@ -25,7 +25,7 @@ from jcr.records import Capture, CellCamera
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 from jcr.simulate.robots import PresetName
 
-DRAWS, MANY_DRAWS = 20, 40
+DRAWS, MANY_DRAWS = 10, 40
 """Of each kind of cell; with --long."""
 COUNT = 10
 """Poses of each arm."""

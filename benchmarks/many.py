@@ -17,7 +17,7 @@ from jcr.capture.read import read_capture
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.simulate.capture import SimulateOptions, simulate
 
-SIZES, LONG_SIZES = (8, 16, 32, 64), (8, 16, 32, 50, 64, 128, 200)
+SIZES, LONG_SIZES = (8, 16, 32), (8, 16, 32, 50, 64, 128, 200)
 
 
 def run(long: bool = False) -> str:

@@ -15,7 +15,8 @@ from jcr.reconstruct.dust3r.weights import LoadedNetwork
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.preprocess import PreparedImages, image_grid
 
-IMAGES, HEIGHT, WIDTH = 10, 64, 96
+IMAGES, MANY_IMAGES, HEIGHT, WIDTH = 6, 10, 64, 96
+"""MANY_IMAGES with --long."""
 VIT_LARGE = {
     "enc_embed_dim": 1024,
     "enc_depth": 24,
@@ -38,21 +39,22 @@ class Measured:
     peak_gb: float
 
 
-def run() -> str:
-    """Both ways over all ordered pairs of ten small images, as a Markdown table."""
+def run(long: bool = False) -> str:
+    """Both ways over all ordered pairs of small images, as a Markdown table."""
+    count = MANY_IMAGES if long else IMAGES
     network = random_network(VIT_LARGE)
-    colors = np.random.default_rng(0).integers(0, 256, (IMAGES, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    colors = np.random.default_rng(0).integers(0, 256, (count, HEIGHT, WIDTH, 3), dtype=np.uint8)
     images = PreparedImages(colors, image_grid((WIDTH, HEIGHT), WIDTH), None, None)
     once = measure(lambda: encode_once(network, images))
     per_pair = measure(lambda: encode_per_pair(network, images))
     difference = np.abs(once.pairs.pts3d_in_other_view - per_pair.pairs.pts3d_in_other_view).max()
     size = np.abs(per_pair.pairs.pts3d_in_other_view).mean()
-    estimate = estimate_memory(network, IMAGES, len(once.pairs.edges), HEIGHT, WIDTH)
+    estimate = estimate_memory(network, count, len(once.pairs.edges), HEIGHT, WIDTH)
     expected = (estimate.weights + estimate.features + estimate.per_pair + estimate.pointmaps) / GB
     return (
-        f"> Encoding every image once predicts the pairs of {IMAGES} images {per_pair.wall_s / once.wall_s:.1f} times "
+        f"> Encoding every image once predicts the pairs of {count} images {per_pair.wall_s / once.wall_s:.1f} times "
         "as fast as both images of every pair.\n\n"
-        f"{IMAGES} images of {WIDTH}x{HEIGHT}, {len(once.pairs.edges)} ordered pairs, ViT-L with DPT heads, "
+        f"{count} images of {WIDTH}x{HEIGHT}, {len(once.pairs.edges)} ordered pairs, ViT-L with DPT heads, "
         f"random weights, float32, {torch.get_num_threads()} threads\n\n"
         "| way | wall time | processor time | peak memory |\n"
         "|---|---|---|---|\n"
@@ -86,7 +88,8 @@ def measure(way: Callable[[], PairPredictions]) -> Measured:
 def encode_once(network: Dust3r, images: PreparedImages) -> PairPredictions:
     """As `jcr predict` does, without its cache."""
     loaded = LoadedNetwork(network, "random", "", is_metric=False)
-    names, poses = tuple(map(str, range(IMAGES))), np.tile(np.eye(4), (IMAGES, 1, 1))
+    count = len(images.colors)
+    names, poses = tuple(map(str, range(count))), np.tile(np.eye(4), (count, 1, 1))
     return predict_pairs(loaded, images, names, poses, PairOptions("complete", cache_gb=0))[0]
 
 

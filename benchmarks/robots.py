@@ -28,7 +28,7 @@ from jcr.simulate.robots import BentProblem, PresetName, bent_problem
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 COUNTS = (8, 12, 30)
-DRAWS, MANY_DRAWS = 2, 8
+DRAWS, MANY_DRAWS = 1, 8
 """Of each arm; with --long."""
 INTRINSICS_STD = 0.005
 """Of the focal length, relative, and of the principal point, of the width."""
@@ -211,7 +211,8 @@ def run(out: Path | None = None, long: bool = False) -> str:
     """Markdown: the claims, then tables; an image in `out` shows the shares beyond three sigma."""
     draws, image = (MANY_DRAWS, "robots_long.png") if long else (DRAWS, "robots.png")
     rows = measure(draws=draws)
-    intrinsics = measure_intrinsics(draws=draws // 2)
+    of_intrinsics = (draws + 1) // 2
+    intrinsics = measure_intrinsics(draws=of_intrinsics)
     if out is not None:
         write_bytes(out / image, _figure(rows))
     return page(rows, draws, intrinsics, image)
@@ -261,7 +262,7 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str
         lines += [
             "",
             f"Intrinsics drawn around the true ones ({100 * INTRINSICS_STD:g} % of the focal length and of the width), "
-            f"{POINTS} points seen with {PIXEL_STD} px, {draws // 2} draws of each arm, nothing known of them: "
+            f"{POINTS} points seen with {PIXEL_STD} px, {(draws + 1) // 2} draws of each arm, nothing known of them: "
             "held as given, or measurements of that error in the bundle adjustment. Their σ holds what calibrations "
             "from real images differ by beside it, which simulated ones do not: squared distances are below one.",
             "",

@@ -170,7 +170,7 @@ def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]
     for given, said in {
         ("pairs", "captures"): "takes no folder of captures",
         ("cameras", "captures", "--boards", "a=charuco"): "takes no --boards",
-        ("pairs", "--long"): "has no --long",
+        ("bag", "--long"): "has no --long",
         ("all", "--long", "--out", "pages"): "of one bench at a time",
     }.items():
         assert dispatch(["bench", *given]) == 2
