@@ -7,6 +7,7 @@ import json
 import re
 import runpy
 import shlex
+import tomllib
 from html import unescape
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 import tyro
+import yaml
 
 from benchmarks.freshness import OLD
 from jcr.cli import COMMANDS, configuration, dispatch
@@ -199,3 +201,12 @@ def test_picture_shows_what_there_is():
         for name in unescape(text).split(", ")
     }
     assert not rooms() - shown
+
+
+def test_version_and_date_of_the_release_are_the_same_everywhere():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    latest = re.search(r"^## (\S+) — (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert latest is not None
+    assert (cited["version"], str(cited["date-released"])) == latest.groups()
+    assert latest[1] == version
