@@ -87,7 +87,7 @@ BENCHES = {
         of_captures=True,
         of_boards=True,
         measures=(*SOLVER, *FEATURES, *READING),
-        long="SIFT with and without the gate, XFeat without it, and ALIKED, too",
+        long="all captures, SIFT with and without the gate, XFeat without it, and ALIKED, too",
     ),
     "cameras": Bench(
         "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld images of captures in DIR",
@@ -107,9 +107,9 @@ BENCHES = {
     ),
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time",
-        True,
         draws=True,
         measures=("src/jcr/handeye", "src/jcr/simulate/problem.py"),
+        long="15 draws instead of 4",
     ),
     "robots": Bench(
         "arms with systematic errors: is the answer within its sigma, and nearer than others'",
@@ -157,7 +157,7 @@ BENCHES = {
     "models": Bench(
         "any-view models from predictions with published errors, beside COLMAP and direct alignment",
         measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/views_at_once", "src/jcr/reconstruct/direct"),
-        long="errors as on DTU and 7-Scenes, too",
+        long="a textured table and errors as on DTU and 7-Scenes, too",
     ),
     "model_cost": Bench(
         "seconds and memory of any-view networks with random weights, beside what is estimated",
@@ -179,7 +179,7 @@ BENCHES = {
     "memory": Bench(
         "peak memory against the budget by number of images, COLMAP and small networks",
         measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py", "src/jcr/reconstruct/threads.py"),
-        long="40 images, too",
+        long="20 and 40 images, too",
     ),
     "bag": Bench(
         "frames chosen from a minute of a robot's MCAP: which, time and memory", True, measures=(*READING,)

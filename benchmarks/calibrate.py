@@ -28,7 +28,8 @@ VISION = (2e-4, np.radians(0.02))
 """m, rad per axis of the camera poses, as structure from motion leaves them."""
 SCALE = 2.0
 """Inside the only range that the paper's grid search covers."""
-TRIALS = 15
+TRIALS, MANY_TRIALS = 4, 15
+"""With --long."""
 MANY = 15
 """Images among which some have a wrong pose."""
 WRONG = (0, 1, 2, 3, 4, 5)
@@ -41,34 +42,42 @@ Spoilt = dict[tuple[str, int], Float[ndarray, "t 3"]]
 """By method and number of wrong images."""
 
 
-def run(out: Path | None = None) -> str:
+def run(out: Path | None = None, long: bool = False) -> str:
     """Markdown tables: accuracy over noise and image count, with outliers, and time; a figure goes to `out`."""
+    trials, image = (MANY_TRIALS, "calibrate_long.png") if long else (TRIALS, "calibrate.png")
     missed = {
-        (name, noise, count): _all_missed(solver, noise, count, 0)
+        (name, noise, count): _all_missed(solver, noise, count, 0, trials)
         for noise in NOISES
         for count in COUNTS
         for name, solver in _solvers().items()
     }
     spoilt = {
-        (name, wrong): _all_missed(solver, NOISES[1], MANY, wrong)
+        (name, wrong): _all_missed(solver, NOISES[1], MANY, wrong, trials)
         for wrong in WRONG
         for name, solver in _solvers().items()
     }
     if out is not None:
-        write_bytes(out / "calibrate.png", _figure(missed, spoilt))
-    named = {wrong: _named(wrong) for wrong in WRONG}
-    lines = [*_claims(missed, spoilt, named), "", *_accuracy(missed), "", *_outliers(spoilt, named), *_time()]
+        write_bytes(out / image, _figure(missed, spoilt))
+    named = {wrong: _named(wrong, trials) for wrong in WRONG}
+    lines = [
+        *_claims(missed, spoilt, named, trials),
+        "",
+        *_accuracy(missed, trials, image),
+        "",
+        *_outliers(spoilt, named, trials),
+        *_time(),
+    ]
     return "\n".join(lines) + "\n"
 
 
-def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int]) -> list[str]:
+def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     def middle(errors: Float[ndarray, "t 3"]) -> str:
         mm, deg, _ = np.median(errors, axis=0)
         return f"{mm:.2f} mm, {deg:.3f}°"
 
     ours, papers = ("jcr, bundle adjustment", GRID)
     at = {name: middle(missed[name, NOISES[1], 10]) for name in (ours, papers)}
-    most = max(wrong for wrong in WRONG if named[wrong] == TRIALS)
+    most = max(wrong for wrong in WRONG if named[wrong] == trials)
     others = min(
         np.median(errors[:, 0])
         for (name, wrong), errors in spoilt.items()
@@ -77,7 +86,7 @@ def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int]) -> list[str]:
     return [
         f"> Simulated poses, robot noise 0.5 mm and 0.1°, 10 images: {at[ours]} off (median), the paper's grid search "
         f"{at[papers]}.",
-        f"> {most} wrong gripper poses among {MANY} images are all named, and no others, in {named[most]} of {TRIALS} "
+        f"> {most} wrong gripper poses among {MANY} images are all named, and no others, in {named[most]} of {trials} "
         f"captures, and the translation is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other method is "
         f"off by {others:.0f} mm or more.",
     ]
@@ -127,9 +136,11 @@ def problem_of(seed: int, count: int, noise: tuple[float, float]) -> HandEyeProb
     )
 
 
-def _all_missed(solver: Solver, noise: tuple[float, float], count: int, wrong: int) -> Float[ndarray, "t 3"]:
+def _all_missed(
+    solver: Solver, noise: tuple[float, float], count: int, wrong: int, trials: int
+) -> Float[ndarray, "t 3"]:
     """mm, degrees and percent of scale in every trial."""
-    return np.array([_missed(_spoilt(seed, count, noise, wrong)[0], solver, seed) for seed in range(TRIALS)])
+    return np.array([_missed(_spoilt(seed, count, noise, wrong)[0], solver, seed) for seed in range(trials)])
 
 
 def _spoilt(
@@ -145,23 +156,23 @@ def _spoilt(
     return problem, bad
 
 
-def _named(wrong: int) -> int:
+def _named(wrong: int, trials: int) -> int:
     """In how many trials the solver rejects just the wrong images."""
     right = 0
-    for seed in range(TRIALS):
+    for seed in range(trials):
         problem, bad = _spoilt(seed, MANY, NOISES[1], wrong)
         solved: HandEye = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         right += np.array_equal(np.flatnonzero(~solved.inliers), bad)
     return right
 
 
-def _accuracy(missed: Missed) -> list[str]:
+def _accuracy(missed: Missed, trials: int, image: str) -> list[str]:
     lines = [
-        f"Median error over {TRIALS} simulated captures (seeds 0 to {TRIALS - 1}): mm / degrees / % of scale. "
+        f"Median error over {trials} simulated captures (seeds 0 to {trials - 1}): mm / degrees / % of scale. "
         f"Vision noise {1e3 * VISION[0]:.1f} mm, {np.degrees(VISION[1]):.2f}°. OpenCV's methods cannot find the scale "
         "and are given it.",
         "",
-        "![errors by noise, images and wrong poses](calibrate.png)",
+        f"![errors by noise, images and wrong poses]({image})",
     ]
     for noise in NOISES:
         lines += [
@@ -195,7 +206,7 @@ def _missed(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[float, 
     )
 
 
-def _outliers(spoilt: Spoilt, named: dict[int, int]) -> list[str]:
+def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     lines = [
         f"{MANY} images, some of them with another image's gripper pose, robot noise 0.5 mm, 0.1°: median error",
         "",
@@ -204,7 +215,7 @@ def _outliers(spoilt: Spoilt, named: dict[int, int]) -> list[str]:
     ]
     for name in _solvers():
         lines.append(f"| {name} | " + " | ".join(_cell(spoilt[name, wrong]) for wrong in WRONG) + " |")
-    told = " | ".join(f"{named[wrong]} of {TRIALS}" for wrong in WRONG)
+    told = " | ".join(f"{named[wrong]} of {trials}" for wrong in WRONG)
     return [*lines, f"| *captures in which jcr names the wrong ones, and no others* | {told} |"]
 
 
