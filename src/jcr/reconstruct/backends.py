@@ -311,7 +311,7 @@ BACKENDS: dict[str, Backend] = {
             metric=True,
             options=("board",),
             selected_by="board",
-            accuracy="0.6 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
+            accuracy="0.7 mm and 0.20° from the reference of a real capture (jcr docs results/real)",
         ),
         Backend(
             "predictions",
@@ -321,7 +321,7 @@ BACKENDS: dict[str, Backend] = {
             options=("predictions",),
             selected_by="predictions",
             keeps_order=True,
-            accuracy="0.95 mm and 0.051° from simulated predictions (jcr docs results/predictions)",
+            accuracy="0.74 mm and 0.047° from simulated predictions (jcr docs results/predictions)",
         ),
         Backend("given", _given, "your reconstruction's", options=("cameras",), selected_by="cameras"),
     )
