@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from jcr.geometry import apply, retract, rotation_exp, skew, step_between, transform
+from jcr.handeye import solve
 from jcr.least_squares import loss_weight, minimise
+from jcr.simulate.problem import hand_eye_problem
 
 TIME = np.linspace(0, 4, 60)
 
@@ -116,3 +119,18 @@ def test_weights_are_the_losses_slopes():
     for name, rho in losses.items():
         numeric = (rho(squared + 1e-6) - rho(squared - 1e-6)) / 2e-6
         np.testing.assert_allclose(loss_weight(name, squared), numeric, rtol=1e-6)
+
+
+def test_small_systems_are_solved_by_one_blas_thread(monkeypatch: pytest.MonkeyPatch):
+    """With two, and other work on the machine, a calibration took minutes and not seconds."""
+    seen: list[int] = []
+
+    def look(*arguments: object, **options: object) -> None:
+        seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        raise InterruptedError
+
+    monkeypatch.setattr(solve, "robust_fit", look)
+    problem = hand_eye_problem(np.random.default_rng(0), 6)
+    with threadpool_limits(2, user_api="blas"), pytest.raises(InterruptedError):
+        solve.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    assert seen and set(seen) == {1}

@@ -23,7 +23,7 @@ from jcr.handeye.components import Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, residuals
 from jcr.handeye.fit import left_out
 from jcr.handeye.systematic import Region, smooth_errors
-from jcr.least_squares import loss_weight
+from jcr.least_squares import loss_weight, one_blas_thread
 from jcr.records import Budget, Intrinsics, Tracks
 
 MIN_SIGMA_PX = 0.05
@@ -126,6 +126,7 @@ class _View:
     """Projected minus observed, px."""
 
 
+@one_blas_thread
 def adjust(
     base_from_gripper: Float[ndarray, "m 4 4"],
     start: tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]],

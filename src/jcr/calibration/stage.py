@@ -28,6 +28,7 @@ from jcr.handeye.fit import Cues, exceeds
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import SCALE_STD, judged, solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
+from jcr.least_squares import one_blas_thread
 from jcr.records import (
     Capture,
     HandEye,
@@ -51,6 +52,7 @@ METRIC_STD = 0.005
 """Relative; a printed marker has the size that its maker says to half a percent."""
 
 
+@one_blas_thread
 def calibrate(
     capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions | None = None
 ) -> HandEye:

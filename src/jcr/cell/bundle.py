@@ -23,7 +23,7 @@ from jcr.calibration.elimination import (
 from jcr.calibration.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import retract, skew, step_between
-from jcr.least_squares import loss_weight
+from jcr.least_squares import loss_weight, one_blas_thread
 from jcr.records import Intrinsics
 
 LOSS_SCALE = 2.0
@@ -114,6 +114,7 @@ class Imaged:
     """Median of each image; not a number where it took no part."""
 
 
+@one_blas_thread
 def adjust_images(
     scene: Scene, pictures: Pictures, freedom: Freedom, held: Float[ndarray, "r r"] | None = None
 ) -> Imaged:

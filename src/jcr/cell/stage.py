@@ -34,6 +34,7 @@ from jcr.cell.ties import Answer, Placed, Tie, tied
 from jcr.geometry import inverse, motion_length, scale_translation, step_between
 from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
+from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
 from jcr.rounding import significant
@@ -59,6 +60,7 @@ LEAST_POSES = 3
 """Of another arm, or of another camera on the gripper: images."""
 
 
+@one_blas_thread
 def place_cameras(
     capture: Capture,
     others: Sequence[CellCamera],

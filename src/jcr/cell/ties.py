@@ -21,6 +21,7 @@ from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, SCALE, Poses, predict, residuals, residuals_by_camera
 from jcr.handeye.systematic import Region
+from jcr.least_squares import one_blas_thread
 
 LARGEST_TURN = 0.5
 """rad, and of the logarithm of scale, in one step."""
@@ -98,6 +99,7 @@ class Answer:
         return j
 
 
+@one_blas_thread
 def tied(
     imaged: Imaged, ties: Sequence[Tie], scale: float, noise: tuple[float, float] | None = None
 ) -> Answer:

@@ -16,6 +16,7 @@ from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.robust import robust_fit
 from jcr.handeye.systematic import systematic_errors
+from jcr.least_squares import one_blas_thread
 from jcr.records import HandEye, HeldOut, RobotNoise
 
 MAX_NOISE = (0.02, np.radians(3.0))
@@ -31,6 +32,7 @@ SURPRISE = 1.5
 """Times the robot noise that was given; more is worth saying."""
 
 
+@one_blas_thread
 def solve_hand_eye(
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
-from threadpoolctl import threadpool_limits
 
 from jcr.errors import NotTrustedError
 from jcr.geometry import adjoint, inverse, retract, twist_from_step
+from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.reconstruct.global_alignment.depths import fused_depth
@@ -168,9 +168,7 @@ def solve_free(problem: Problem, options: AlignOptions) -> Solution:
     return gauss_newton(images, state, problem.layout, cameras, coarse.pair_spread, FINE_TOLERANCE)
 
 
-# The matrices are small. BLAS threads gain nothing on them, and on a busy machine wait for each other: with the
-# other core taken, 15 images took 3 to 6 times as long.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_blas_thread
 def gauss_newton(
     images: list[ImageObservations],
     state: State,
