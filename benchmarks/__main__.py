@@ -351,7 +351,7 @@ def heading(arguments: Arguments) -> str:
 
     measured = f"{date.today().isoformat()}, {commit_now(paths_of(arguments.name) or ())}"
     return (
-        f"# jcr bench {arguments.name}\n\n{BENCHES[arguments.name].what}\n\n"
+        f"# jcr bench {arguments.name}{' --long' if arguments.long else ''}\n\n{BENCHES[arguments.name].what}\n\n"
         f"    {shlex.join(command)}\n\n{measured}. {machine()}\n\n"
     )
 
