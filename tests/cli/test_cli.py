@@ -190,7 +190,7 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["fly"], "no command"),
+        (["fly"], "not a jcr command"),
         (["run"], "required"),
         (["run", "nowhere", "out"], "nowhere"),
         (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
@@ -236,5 +236,5 @@ def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: 
     text = " ".join(capsys.readouterr().out.replace("│", " ").split()).partition("positional arguments")[2]
     assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 8.0)" in text
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
-    assert "--no-bundle-adjustment Use the camera poses alone" in text
+    assert "--no-bundle-adjustment Use camera poses only" in text
     assert text.index("--pose-convention") < text.index("--require") < text.index("--backend")

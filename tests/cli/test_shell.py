@@ -61,7 +61,7 @@ def test_every_command_takes_json_and_quiet(name: str):
 def test_json_is_one_object_and_quiet_is_silence(
     commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("benchmarks.run.run", lambda: "| a |\n")
+    monkeypatch.setattr("benchmarks.run.run", lambda long: "| a |\n")
     for name, line in commands.items():
         assert dispatch([*line, "--quiet", "--json"]) == 0, name
         told = capsys.readouterr()

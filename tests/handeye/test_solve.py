@@ -179,7 +179,7 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
         inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
         # Whether at random or alike, six images hardly tell.
         assert min(np.divide(solved.robot_noise.together, given)) > 1.5
-        assert any("more than the robot noise that was given" in warning for warning in solved.warnings)
+        assert any("more than the given robot noise" in warning for warning in solved.warnings)
     # Binomial: 47.5 ± 1.5; none where the given noise is believed.
     assert inside >= 42
 
