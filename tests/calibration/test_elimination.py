@@ -26,7 +26,7 @@ def test_the_step_is_that_of_the_whole_system(monkeypatch, together: int):
         whole[k, :, :SHARED] = rows.shared[k]
         whole[k, :, SHARED + OWN * image[k] :][:, :OWN] = rows.own[k]
         whole[k, :, size + 3 * point[k] :][:, :3] = rows.by_point[k]
-    expected = -np.linalg.lstsq(whole.reshape(-1, whole.shape[2]), rows.residual.ravel())[0]
+    expected = -np.linalg.lstsq(whole.reshape(-1, whole.shape[2]), rows.residual.ravel(), rcond=None)[0]
     normal = without_points(*with_points_held(rows, seen), rows, seen)
     step = np.linalg.solve(normal.hessian, normal.right)
     assert step == pytest.approx(expected[:size], rel=1e-5, abs=1e-6)
