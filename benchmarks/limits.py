@@ -58,12 +58,8 @@ class Trial:
     """Done to the capture folder after it was simulated."""
 
 
-def trials(long: bool) -> list[Trial]:
-    """Everything that is made worse, each from harmless to hopeless: every other one, or all."""
-    return _all_trials() if long else _all_trials()[::2]
-
-
-def _all_trials() -> list[Trial]:
+def trials() -> list[Trial]:
+    """Everything that is made worse, each from harmless to hopeless."""
     plain = SimulateOptions(images=COUNT, seed=SEED, robot_noise=NOISE)
     return [
         *(Trial("images", f"{n}", replace(plain, images=n)) for n in (3, 4, 5, 8)),
@@ -131,7 +127,7 @@ class Verdict:
 def run(out: Path | None = None, long: bool = False) -> str:
     """Markdown, with what is made worse down the page; what the camera saw goes to an image in `out`."""
     image = "limits_long.png" if long else "limits.png"
-    verdicts = [_verdict(trial) for trial in trials(long)]
+    verdicts = [_verdict(trial) for trial in trials()[:: 1 if long else 2]]
     if out is not None:
         write_bytes(out / image, _sheet(verdicts))
     rotations = [_rotation(degrees) for degrees in ROTATIONS]

@@ -29,7 +29,7 @@ WAYS: tuple[tuple[FeatureName, bool], ...] = (
 """Features, and whether the robot checks them; all with --long."""
 FEW: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)
 """SIFT with the gate is what `real` measures."""
-EVERY = 3
+EVERY = 4
 """Of so many captures one, without --long."""
 
 
@@ -66,7 +66,7 @@ def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
     if unknown := board_of.keys() - {folder.name for folder in folders}:
         raise InputError(f"--boards {', '.join(sorted(unknown))}: no such capture in {captures}")
     rows, remade = [], {}
-    for folder in folders if long else folders[1::EVERY]:
+    for folder in folders if long else folders[::EVERY]:
         reference = stored = reference_of(folder)
         if (board := board_of.get(folder.name)) is not None and (made := by_board(folder, board)) is not None:
             reference, remade[folder.name] = made, f"`{board}`, {apart(made, stored)} from that stored"

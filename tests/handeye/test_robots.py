@@ -11,7 +11,7 @@ from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_exp, step_axes, step_between, transform
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.inverse_kinematics import inverse_kinematics, required_posture
-from jcr.handeye.mounting import mounted_arm
+from jcr.handeye.mounting import LengthError, mounted_arm
 from jcr.handeye.robots import (
     ErrorSizes,
     bent_kinematics,
@@ -332,7 +332,13 @@ def test_joint_angles_contradict_positions_that_are_all_too_long(name):
         ):
             poses = bent.copy()
             poses[:, :3, 3] *= factor
-            with pytest.raises(InputError, match=f"{said} for a {name}"):
+            with pytest.raises(LengthError, match=f"{said} for a {name}"):
+                mounted_arm(arm, joints, poses)
+        # So far off that without the factor nothing agrees.
+        for factor in (0.3048, 1.25, 2.54):
+            poses = bent.copy()
+            poses[:, :3, 3] *= factor
+            with pytest.raises(LengthError, match=f"for a {name}"):
                 mounted_arm(arm, joints, poses)
 
 

@@ -45,32 +45,41 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4
         fit_known_scale(base_from_gripper, nominal, start, NOISE)
         for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_turn), (tool, base))
     ]
+    _require_length(arm, base_from_gripper, nominal)
     best = min(fits, key=lambda fit: float((fit.residual / np.repeat(NOISE, 3)) ** 2 @ np.ones(6) @ weights))
-    metres, radians = np.sqrt((best.residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+    metres, radians = _apart(best.residual)
     if metres > AGREE[0] * arm.reach or radians > AGREE[1]:
         raise InputError(
             f"joint angles and gripper poses disagree on a {arm.name}: {1e3 * metres:.0f} mm, "
             f"{np.degrees(radians):.1f}° apart; check the robot, the order of its joints and their unit (rad)"
-        )
-    factor, std = _length(base_from_gripper, nominal)
-    if abs(factor - 1) > max(ALIKE, SURE * std):
-        raise LengthError(
-            f"the gripper positions are {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % too "
-            f"{'long' if factor > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "
-            "positions, and that this is the robot"
         )
     frames = arm.parent_from_joint.copy()
     frames[0] = best.base_from_recon @ frames[0]
     return with_tool(replace(arm, parent_from_joint=frames), inverse(best.gripper_from_camera))
 
 
-def _length(base_from_gripper: Poses, nominal: Poses) -> tuple[float, float]:
-    """Reported positions over those of the nominal arm, and the relative standard deviation that the residuals leave."""
+def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
+    """LengthError where one factor on all positions makes them agree with the nominal arm, and it is not 1."""
     tool, scale, base = closed_form(base_from_gripper, nominal)
-    if scale <= 0:  # no motion shows it
-        return 1.0, np.inf
-    residual, j = residuals(tool, float(scale), base, base_from_gripper, nominal)
+    factor = float(scale)
+    if factor <= 0:  # no motion shows it
+        return
+    residual, j = residuals(tool, factor, base, base_from_gripper, nominal)
+    metres, radians = _apart(residual)
+    if metres > AGREE[0] * arm.reach * factor or radians > AGREE[1]:
+        return
     left = max(6 * len(nominal) - j.shape[2], 1)
     noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
     j /= np.repeat(noise, 3)[:, None]
-    return float(scale), float(expected_std(np.einsum("nij,nik->jk", j, j))[6])
+    std = factor * float(expected_std(np.einsum("nij,nik->jk", j, j))[6])
+    if abs(factor - 1) > max(ALIKE, SURE * std):
+        raise LengthError(
+            f"the gripper positions are {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % too "
+            f"{'long' if factor > 1 else 'short'} for a {arm.name} with these joint angles; check the unit of the "
+            "positions, and that this is the robot"
+        )
+
+
+def _apart(residual: Float[ndarray, "n 6"]) -> Float[ndarray, "2"]:
+    """m and rad, root mean square."""
+    return np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
