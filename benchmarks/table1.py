@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import norm
 
 from benchmarks.peers import grid_search
 from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
@@ -131,7 +132,8 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
     silent = sum(cell.silent for cell in ours)
     lines.append(
         f"> Of ours, {sum(bool(cell.trusted) for cell in ours)} of {len(ours)} are trusted, and {silent} of these are "
-        f"farther off on an axis than {SURPRISE:g} reported standard deviations."
+        f"farther off on an axis than {SURPRISE:g} reported standard deviations; were every σ right, one in "
+        f"{1 / (1 - (1 - 2 * norm.sf(SURPRISE)) ** 6):.0f} would be, of six axes, by chance."
     )
     return lines
 
