@@ -112,7 +112,7 @@ BENCHES = {
         long="15 draws instead of 4",
     ),
     "robots": Bench(
-        "arms with systematic errors: is the answer within its sigma, and nearer than others'",
+        "arms with systematic errors: is the result within its sigma, and nearer than others'",
         draws=True,
         measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "src/jcr/simulate/problem.py"),
         long="8 draws of every arm instead of 1",
@@ -124,7 +124,7 @@ BENCHES = {
         long="all levels, not every other one",
     ),
     "attack": Bench(
-        "captures with one silent fault: named, refused, or wrong; and false alarms",
+        "captures with one silent fault: reported, rejected, or wrong; and false alarms",
         measures=(*SOLVER, "src/jcr/simulate/observations.py", "src/jcr/simulate/faults.py"),
         long="three times as many draws of everything",
     ),
@@ -289,7 +289,7 @@ def _all(arguments: Arguments) -> int:
     for name in (name for name, bench in BENCHES.items() if bench.of_captures):
         if arguments.captures is None:
             del names[name]
-            absent.append(f"{name}: no folder of captures was named")
+            absent.append(f"{name}: no folder of captures was given")
         else:
             boards = ["--boards", *arguments.boards] if arguments.boards and BENCHES[name].of_boards else []
             given[name] = [str(arguments.captures), *boards]

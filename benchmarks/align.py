@@ -209,9 +209,9 @@ def _kinds(draws: int) -> str:
 def _hand_eye(draws: int) -> str:
     rows = [
         f"With the robot's poses, mean camera errors and median calibration errors over {draws} draws, "
-        f"{_size(SMALL)}. The robot pose noise is not told but estimated. `jcr` keeps the alignment that promises the "
+        f"{_size(SMALL)}. The robot pose noise is not given but estimated. `jcr` keeps the alignment that promises the "
         "smaller error; error / sigma is the true error of the calibration over the reported one, 1 where honest.\n",
-        "| robot noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
+        "| robot pose noise | images | cameras aligned freely | as kept (kinematic) | calibration | error / sigma |",
         "|---|---|---|---|---|---|",
     ]
     for noise in ((0.0, 0.0), (5e-4, float(np.radians(0.1)))):

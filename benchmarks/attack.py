@@ -20,7 +20,7 @@ from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
 DRAWS, FEW, CLEAN = 7, 2, 70
 LONG_TIMES = 3
-"""Of what is random by itself, of what only the noise makes random, and of nothing wrong; with --long so many times."""
+"""Of what is random by itself, of what only the noise makes random, and of nothing wrong; with --long times this."""
 IMAGES = 12
 LOOSE = (3.0, 3.0)
 """m, rad: gripper poses by which structure from motion is hardly held."""
@@ -180,16 +180,16 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
     falsely = ", ".join(sorted({name for one in alarms for name in one.said})) or "none"
     lines = [
         f"> Captures with one silent fault (focus, zoom, intrinsics, rolling shutter, slip, delay): "
-        f"{100 * np.mean([bool(one.said) for one in known]):.0f} % are named, and "
-        f"{100 * np.mean([one.is_sound for one in known]):.0f} % of the answers are refused or within 3 reported "
-        f"standard deviations; of {len(clean)} captures with nothing wrong {len(alarms)} are called faulty.",
+        f"{100 * np.mean([bool(one.said) for one in known]):.0f} % are reported, and "
+        f"{100 * np.mean([one.is_sound for one in known]):.0f} % of the results are rejected or within 3 reported "
+        f"standard deviations; of {len(clean)} captures with nothing wrong {len(alarms)} are reported as faulty.",
         "",
-        f"{IMAGES} images, 500 points seen with 0.4 px of noise, robot noise 0.3 mm and 0.06° per axis, poses in the "
-        "order of the images. *named*: a warning or a refusal that says what is in the column beside it, with how many "
-        "of the draws say so. *sound*: refused, or within 3 reported standard deviations on every axis; against the "
-        "camera's place before and after a slip, whichever is farther.",
+        f"{IMAGES} images, 500 points seen with 0.4 px of noise, robot pose noise 0.3 mm and 0.06° per axis, poses in "
+        "the order of the images. *reported*: a warning or a rejection that says what is in the column beside it, with "
+        "how many of the draws say so. *sound*: rejected, or within 3 reported standard deviations on every axis; "
+        "against the camera's place before and after a slip, whichever is farther.",
         "",
-        "| what is wrong | draws | named | as | accepted | off, median: mm | ° | σ, median | sound |",
+        "| what is wrong | draws | reported | as | accepted | off, median: mm | ° | σ, median | sound |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for case, row in rows.items():
@@ -203,11 +203,12 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
     lines += [
         "",
         f"Nothing wrong: {len(clean)} captures of 8, 12 and 20 images, robots of 0.1 to 0.45 mm, intrinsics given "
-        f"and estimated in turn: {len(alarms)} named faulty ({falsely}), "
+        f"and estimated in turn: {len(alarms)} reported as faulty ({falsely}), "
         f"{sum(one.accepted for one in clean)} accepted, {sum(not one.is_sound for one in clean)} of these beyond 3 σ.",
         "",
         "Positions that are a few per cent too long, by a wrong link or a wrong unit, change nothing that an image "
-        "shows: scale comes from the robot. Only a length that is known otherwise (a board, `--known-length`) tells.",
+        "shows: scale comes from the robot. Only joint angles of a known arm, or a length that is known otherwise (a "
+        "board, `--known-length`), show it.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -37,7 +37,7 @@ GRID = "paper's grid search"
 
 Solver = Callable[[HandEyeProblem, int], tuple[np.ndarray, float]]
 Missed = dict[tuple[str, tuple[float, float], int], Float[ndarray, "t 3"]]
-"""By method, robot noise and number of images."""
+"""By method, robot pose noise and number of images."""
 Spoilt = dict[tuple[str, int], Float[ndarray, "t 3"]]
 """By method and number of wrong images."""
 
@@ -84,11 +84,11 @@ def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int], trials: int) 
         if wrong == most and "jcr" not in name
     )
     return [
-        f"> Simulated poses, robot noise 0.5 mm and 0.1°, 10 images: {at[ours]} off (median), the paper's grid search "
-        f"{at[papers]}.",
-        f"> {most} wrong gripper poses among {MANY} images are all named, and no others, in {named[most]} of {trials} "
-        f"captures, and the translation is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other method is "
-        f"off by {others:.0f} mm or more.",
+        f"> Simulated poses, robot pose noise 0.5 mm and 0.1°, 10 images: {at[ours]} off (median), the paper's grid "
+        f"search {at[papers]}.",
+        f"> {most} wrong gripper poses among {MANY} images are all identified, and no others, in {named[most]} of "
+        f"{trials} captures, and the translation is then {np.median(spoilt[ours, most][:, 0]):.2f} mm off; every other "
+        f"method is off by {others:.0f} mm or more.",
     ]
 
 
@@ -208,7 +208,7 @@ def _missed(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[float, 
 
 def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     lines = [
-        f"{MANY} images, some of them with another image's gripper pose, robot noise 0.5 mm, 0.1°: median error",
+        f"{MANY} images, some of them with another image's gripper pose, robot pose noise 0.5 mm, 0.1°: median error",
         "",
         "| method | " + " | ".join(f"{wrong} wrong" for wrong in WRONG) + " |",
         "|---" * (len(WRONG) + 1) + "|",
@@ -216,11 +216,11 @@ def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     for name in _solvers():
         lines.append(f"| {name} | " + " | ".join(_cell(spoilt[name, wrong]) for wrong in WRONG) + " |")
     told = " | ".join(f"{named[wrong]} of {trials}" for wrong in WRONG)
-    return [*lines, f"| *captures in which jcr names the wrong ones, and no others* | {told} |"]
+    return [*lines, f"| *captures in which jcr identifies the wrong ones, and no others* | {told} |"]
 
 
 def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
-    """PNG: median errors of the translation by robot noise, number of images and share of wrong gripper poses."""
+    """PNG: median errors of the translation by robot pose noise, number of images and share of wrong gripper poses."""
     figure = Figure(figsize=(14, 4.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for name in _solvers():
@@ -234,7 +234,7 @@ def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
         for axis, (x, errors) in zip(axes, series, strict=True):
             axis.plot(x, [np.median(e[:, 0]) for e in errors], marker=".", label=label, **style)
     titles = (
-        "robot noise, mm per axis (10 images)",
+        "robot pose noise, mm per axis (10 images)",
         "images (0.5 mm, 0.1°)",
         f"wrong poses, % of {MANY} images (0.5 mm, 0.1°)",
     )

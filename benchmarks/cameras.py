@@ -219,7 +219,7 @@ def _page(
     placed = [row for row in real if row.draw is not None]
     lines = [
         f"> Simulated cells of {COUNT} poses an arm, {of_each} draws of each kind: {100 * _inside(every, 0.95):.0f} % "
-        f"of {len(every)} answers lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that "
+        f"of {len(every)} results lie within their own 95 % ellipsoid, {100 * _inside(every, 0.99):.0f} % within that "
         f"of 99 %, {beyond:.1f} % are beyond 3 σ on an axis.",
     ]
     if placed:

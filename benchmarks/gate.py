@@ -32,7 +32,7 @@ ROBOT_NOISE = 0.2, 0.05
 """mm, degrees."""
 WRONG_SIGMAS = 5.0
 WRONG_MM, WRONG_DEG = 10.0, 1.0
-"""A trusted answer is wrong beyond its σ by so much and beyond what a person would call right."""
+"""An accepted result is wrong beyond its σ by so much and beyond what a person would call right."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Verdict:
 
 
 def run(long: bool = False) -> str:
-    """Markdown: for every kind of scene the share of right, trusted and wrong answers with the gate and without."""
+    """Markdown: for every kind of scene the share of right, accepted and wrong results with the gate and without."""
     verdicts, seeds = [], LONG_SEEDS if long else SEEDS
     with tempfile.TemporaryDirectory() as folder:
         for kind in KINDS:
@@ -93,20 +93,20 @@ def table(verdicts: Sequence[Verdict], seeds: Mapping[FeatureName, int]) -> str:
     total = len(verdicts) // 2
     head = (
         f"> Misleading scenes, {total} runs each way: with the robot's gate {right[True]} right and {wrong[True]} wrong "
-        f"that were trusted, without {right[False]} right and {wrong[False]} wrong."
+        f"that were accepted, without {right[False]} right and {wrong[False]} wrong."
     )
     return (
         "\n".join(
             [
                 head,
                 "",
-                f"{IMAGES} images of 640x480, robot noise {ROBOT_NOISE[0]} mm and {ROBOT_NOISE[1]}°; "
+                f"{IMAGES} images of 640x480, robot pose noise {ROBOT_NOISE[0]} mm and {ROBOT_NOISE[1]}°; "
                 f"{', '.join(f'{count} of each with {name}' for name, count in seeds.items())}. "
                 f"Wrong: over {WRONG_MM:.0f} mm or {WRONG_DEG:.0f}° off and beyond {WRONG_SIGMAS:.0f} of its own σ; "
-                "right: trusted and not wrong. Off: median distance from the truth, trusted or not.",
+                "right: accepted and not wrong. Off: median distance from the truth, accepted or not.",
                 "",
-                "| scene | features | gate: right / trusted / wrong | images registered | off, mm | s "
-                "| no gate: right / trusted / wrong | images registered | off, mm | s |",
+                "| scene | features | gate: right / accepted / wrong | images registered | off, mm | s "
+                "| no gate: right / accepted / wrong | images registered | off, mm | s |",
                 "|---" * 10 + "|",
                 *lines,
             ]
@@ -205,7 +205,7 @@ _ROLLS = {"rolls of 90°": 90.0, "rolls of 180°": 180.0}
 
 
 def _rolled(gripper_from_camera: Float[ndarray, "4 4"], step_deg: float) -> Transforms:
-    """Gripper motions that turn every image against the one before about the viewing axis."""
+    """Gripper motions that rotate every image against the one before about the viewing axis."""
     turns = np.radians(step_deg) * np.arange(IMAGES)[:, None] * np.array([0.0, 0.0, 1.0])
     about_axis = transform(rotation_exp(turns), np.zeros(3))
     return gripper_from_camera @ about_axis @ inverse(gripper_from_camera)

@@ -1,4 +1,4 @@
-"""`jcr bench limits`: where it breaks. One thing made worse at a time, until the answer is wrong or refused."""
+"""`jcr bench limits`: where it breaks. One thing made worse at a time, until the result is wrong or rejected."""
 
 import json
 import tempfile
@@ -34,13 +34,13 @@ SEED = 0
 NOISE = (0.5, 0.1)
 """Of the robot, mm and degrees, where it is not what is made worse."""
 WRONG_MM, WRONG_DEG = 20.0, 2.0
-"""Beyond this an answer is wrong; wrong and trusted is the worst fault there is."""
+"""Beyond this a result is wrong; wrong and accepted is the worst fault there is."""
 POSE_TRIALS = 15
 """Simulated pose sets behind a line without images."""
 ROTATIONS = (0.0, 1.0, 3.0, 6.0, 12.0, 25.0)
 """Degrees."""
 SURPRISE = 3.0
-"""Reported standard deviations beyond which a trusted answer is a silent fault."""
+"""Reported standard deviations beyond which an accepted result is a silent fault."""
 PICTURE = (213, 160)
 """Pixels of an example in the figure."""
 
@@ -77,7 +77,7 @@ def trials() -> list[Trial]:
         ),
         Trial("focal length given", "none", replace(plain, unknown_intrinsics=True)),
         *(
-            Trial("robot noise", f"{mm:g} mm, {mm / 5:g}°", replace(plain, robot_noise=(mm, mm / 5)))
+            Trial("robot pose noise", f"{mm:g} mm, {mm / 5:g}°", replace(plain, robot_noise=(mm, mm / 5)))
             for mm in (1.0, 3.0, 10.0)
         ),
         *(Trial("objects moved midway", f"{n}", plain, _redrawn(_moved(n), COUNT // 2)) for n in (1, 3, 8)),
@@ -116,11 +116,11 @@ class Verdict:
         return self.status == 0 and self.sigmas > SURPRISE
 
     @property
-    def answer(self) -> str:
+    def result(self) -> str:
         """In words."""
         if np.isnan(self.mm):
-            return "refused"
-        words = "trusted" if self.status == 0 else "not trusted"
+            return "rejected"
+        words = "accepted" if self.status == 0 else "rejected"
         return words + (", wrong" if self.wrong else "") + (", **silent wrong**" if self.silent else "")
 
 
@@ -134,29 +134,29 @@ def run(out: Path | None = None, long: bool = False) -> str:
     silent = [f"{v.trial.what} {v.trial.level}" for v in verdicts if v.silent]
     wrong = [v for v in verdicts if v.wrong and v.status == 0]
     lines = [
-        f"> Of {len(verdicts)} captures made worse in one way each, {sum(v.status == 0 for v in verdicts)} are trusted; "
-        f"{len(wrong)} of these are off by more than {WRONG_MM:g} mm or {WRONG_DEG:g}°, and "
+        f"> Of {len(verdicts)} captures made worse in one way each, {sum(v.status == 0 for v in verdicts)} are "
+        f"accepted; {len(wrong)} of these are off by more than {WRONG_MM:g} mm or {WRONG_DEG:g}°, and "
         + (
             f"{len(silent)} by more than {SURPRISE:g} reported standard deviations on an axis: {', '.join(silent)}."
             if silent
             else f"none by more than {SURPRISE:g} reported standard deviations on any axis."
         ),
         "",
-        f"{COUNT} images of the simulated tabletop (seed {SEED}), COLMAP back end, robot noise {NOISE[0]:g} mm and "
-        f"{NOISE[1]:g}° unless named. *wrong*: more than {WRONG_MM:g} mm or {WRONG_DEG:g}° off. **silent wrong**: "
+        f"{COUNT} images of the simulated tabletop (seed {SEED}), COLMAP back end, robot pose noise {NOISE[0]:g} mm and "
+        f"{NOISE[1]:g}° unless stated. *wrong*: more than {WRONG_MM:g} mm or {WRONG_DEG:g}° off. **silent wrong**: "
         f"exit status 0 and an error of more than {SURPRISE:g} reported standard deviations on an axis (σ), the one "
         "thing that must not happen.",
         "",
         f"![what the camera saw]({image})",
         "",
-        "| made worse | to | images used | exit status | answer | off: mm | ° | σ | reported ±: mm | said first |",
+        "| made worse | to | images used | exit status | result | off: mm | ° | σ | reported ±: mm | said first |",
         "|---" * 10 + "|",
         *map(_line, verdicts),
         "",
         f"Least rotation: views that rotate by so much about random axes, {COUNT} poses, no images, "
         f"{POSE_TRIALS} draws.",
         "",
-        "| rotated by | trusted | of those wrong | silent wrong | median off when trusted: mm | median ±σ: mm |",
+        "| rotated by | accepted | of those wrong | silent wrong | median off when accepted: mm | median ±σ: mm |",
         "|---" * 6 + "|",
         *rotations,
     ]
@@ -195,7 +195,7 @@ def _verdict(trial: Trial) -> Verdict:
 def _line(v: Verdict) -> str:
     numbers = "| | | " if np.isnan(v.mm) else f"{v.mm:.2f} | {v.deg:.3f} | {v.sigmas:.1f} | {v.std_mm:.1f}"
     return (
-        f"| {v.trial.what} | {v.trial.level} | {v.used} | {v.status} | {v.answer} | {numbers} | {v.reason} |"
+        f"| {v.trial.what} | {v.trial.level} | {v.used} | {v.status} | {v.result} | {numbers} | {v.reason} |"
     )
 
 
@@ -235,7 +235,7 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
                 spine.set(color=color, linewidth=3)
             off = "" if np.isnan(v.mm) else f", {v.mm:.1f} mm"
             axis.set_title(f"{kind}: {v.trial.level}", fontsize=7)
-            axis.set_xlabel(f"{v.answer.replace('**', '')}{off}", fontsize=7)
+            axis.set_xlabel(f"{v.result.replace('**', '')}{off}", fontsize=7)
     return png(figure, 90)
 
 

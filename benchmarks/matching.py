@@ -30,7 +30,7 @@ WAYS: tuple[tuple[FeatureName, bool], ...] = (
 FEW: tuple[tuple[FeatureName, bool], ...] = (("xfeat", True),)
 """SIFT with the gate is what `real` measures."""
 EVERY = 4
-"""Of so many captures one, without --long."""
+"""One capture in this many, without --long."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
         how = features + ("" if gate else " and no gate")
         told += [f"{sum(row.trusted for row in some)} of {len(some)} with {how}"] if some else []
     lines = [
-        f"> Real captures, {len({row.capture for row in rows})}: trusted calibrations from images alone: "
+        f"> Real captures, {len({row.capture for row in rows})}: accepted calibrations from images alone: "
         f"{', '.join(told)}.",
         "",
         "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
@@ -124,7 +124,7 @@ def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
             for name, board in remade.items()
         ),
         "",
-        "| capture | features | gate | images registered | off: mm | ° | in σ | joint | ±σ: mm | ° | trusted | s |",
+        "| capture | features | gate | images registered | off: mm | ° | in σ | joint | ±σ: mm | ° | accepted | s |",
         "|---" * 12 + "|",
         *map(line, rows),
         "",

@@ -84,10 +84,10 @@ def run(long: bool = False) -> str:
                     cells.setdefault((table, method), []).append(_cell(capture, place, reconstructed))
     shares = ", ".join(f"{level} {np.mean(values):.0f} %" for level, values in right.items())
     lines = [
-        f"Simulated scenes `measuring`, seed {', '.join(map(str, SEEDS))}, {IMAGES} images, with the robot noise and "
-        "the webcam of table1; medians. The predictions are the truth with errors: each camera rotated about the scene "
-        "and about itself, its distance and its depth wrong by smooth shares, depth edges smoothed, a little worse than "
-        f"published. Pairs right up to "
+        f"Simulated scenes `measuring`, seed {', '.join(map(str, SEEDS))}, {IMAGES} images, with the robot pose noise "
+        "and the webcam of table1; medians. The predictions are the truth with errors: each camera rotated about the "
+        "scene and about itself, its distance and its depth wrong by smooth shares, depth edges smoothed, a little "
+        f"worse than published. Pairs right up to "
         f"3° (area under the curve): {shares}. σ: the true error over the reported one. Surface: median distance of "
         "the cloud from the true surface.",
     ]

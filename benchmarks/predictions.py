@@ -40,13 +40,13 @@ class EndToEnd:
 
 
 def run(long: bool = False) -> str:
-    """Markdown: median errors and times over seeds, by robot noise and number of images."""
+    """Markdown: median errors and times over seeds, by robot pose noise and number of images."""
     seeds = MANY_SEEDS if long else SEEDS
     rows = [
         f"Simulated tabletop; true pointmaps at 128x96 with a network's errors (white 0.3 %, smooth distance 1 %, "
         f"2 % outliers, a unit per pair); `--backend predictions`, median of {seeds} draws. The last but one "
         "column is the true error over the reported one sigma: about 1 where the uncertainty is honest.\n",
-        "| robot noise | images | translation | rotation | scale | map surface | error / sigma | time |",
+        "| robot pose noise | images | translation | rotation | scale | map surface | error / sigma | time |",
         "|---|---|---|---|---|---|---|---|",
     ]
     claim = ""
@@ -61,7 +61,7 @@ def run(long: bool = False) -> str:
                 f"{surface:.1f} mm | {sigmas:.1f} | {seconds:.0f} s |"
             )
             claim = (
-                f"> The whole job from simulated predictions of {images} images, robot noise {noise[0]:g} mm and "
+                f"> The whole job from simulated predictions of {images} images, robot pose noise {noise[0]:g} mm and "
                 f"{noise[1]:g}°: {mm:.2f} mm and {deg:.3f}° off, the map's surface {surface:.1f} mm, "
                 f"in {seconds:.0f} s.\n"
             )

@@ -76,7 +76,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "other images; where two calibrations predict alike, the images cannot tell which is the better one.",
         "",
         "| capture | from | images used | off: mm | ° | in σ | joint | ±σ: mm | ° | leave-one-out "
-        "error: mm / ° | trusted | s |",
+        "error: mm / ° | accepted | s |",
         "|---" * 12 + "|",
         *map(_line, rows),
         "",
@@ -95,7 +95,7 @@ def _claims(rows: Sequence[Row]) -> list[str]:
     joint = [row.joint_sigmas for row in rows if row.trusted and row.joint_sigmas is not None]
     beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
     told = f" Rejected, and said so: {', '.join(refused)}." if refused else ""
-    return [f"> Real captures: {'; '.join(said) or 'none is trusted'}.{told}{beyond}"]
+    return [f"> Real captures: {'; '.join(said) or 'none is accepted'}.{told}{beyond}"]
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:

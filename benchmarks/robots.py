@@ -1,5 +1,5 @@
 """`jcr bench robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
-wrong, and is the answer nearer?
+wrong, and is the result nearer?
 """
 
 import io
@@ -42,7 +42,7 @@ KNOWN: dict[str, Solve] = {
     "joints known": lambda p: solve_hand_eye(
         p.base_from_gripper, p.recon_from_camera, joints=p.joints, robot=p.bent.arm
     ),
-    "robot named": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
+    "robot given": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera, robot=p.bent.arm),
     "nothing known": lambda p: solve_hand_eye(p.base_from_gripper, p.recon_from_camera),
     WHITE: lambda p: solve_hand_eye(
         p.base_from_gripper,
@@ -66,9 +66,9 @@ class Row:
     """Median."""
     deg: float
     accepted: float
-    """Share; what follows is of the accepted answers, nan where there is none or no sigma."""
+    """Share; what follows is of the accepted results, nan where there is none or no sigma."""
     beyond_3: float = np.nan
-    """Share of answers with more than three sigma on an axis of translation or rotation."""
+    """Share of results with more than three sigma on an axis of translation or rotation."""
     beyond_5: float = np.nan
     distance: float = np.nan
     """Squared Mahalanobis distance over its 6 degrees of freedom, mean."""
@@ -219,7 +219,7 @@ def run(out: Path | None = None, long: bool = False) -> str:
 
 
 def _figure(rows: list[Row]) -> bytes:
-    """A panel per number of images: share of accepted answers beyond three sigma, by size of the errors."""
+    """A panel per number of images: share of accepted results beyond three sigma, by size of the errors."""
     counts = sorted({row.count for row in rows})
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     for k, count in enumerate(counts):
@@ -233,7 +233,7 @@ def _figure(rows: list[Row]) -> bytes:
         axes.set_title(f"{count} images", fontsize=9)
         axes.set_ylim(0, 100)
         if k == 0:
-            axes.set_ylabel("% of accepted answers beyond 3 σ")
+            axes.set_ylabel("% of accepted results beyond 3 σ")
             axes.legend(fontsize=8)
     with io.BytesIO() as file:
         figure.savefig(file, format="png", dpi=110)
@@ -246,7 +246,7 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str
     white = [row for row in rows if row.known == WHITE and row.preset != "white" and row.accepted > 0]
     lines = [
         f"> Simulated arms with systematic errors, {', '.join(rows[0].arms)}: {_pooled(held):.1f} % of the accepted "
-        f"answers are beyond 3 of their own σ on an axis, {100 * max(row.beyond_3 for row in held):.0f} % in the worst "
+        f"results are beyond 3 of their own σ on an axis, {100 * max(row.beyond_3 for row in held):.0f} % in the worst "
         f"row, {100 * max(row.beyond_5 for row in held):.0f} % beyond 5 there; where errors count as independent "
         f"{_pooled(white):.0f} %, up to {100 * max((row.beyond_3 for row in white), default=np.nan):.0f} %.",
         "",
@@ -254,7 +254,7 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str
         "0.05 mm and 0.005°. OpenCV's method is given the scale and has no σ. White alone: independent errors of both "
         "sizes estimated, as HALCON's published model has them.",
         "",
-        f"![share of answers beyond three sigma]({image})",
+        f"![share of results beyond three sigma]({image})",
         "",
         *_table(rows),
     ]
@@ -272,7 +272,7 @@ def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str
 
 
 def _pooled(rows: Sequence[Row]) -> float:
-    """Per cent of all accepted answers beyond three sigma; all rows are of as many draws."""
+    """Per cent of all accepted results beyond three sigma; all rows are of as many draws."""
     accepted = sum(row.accepted for row in rows)
     return 100 * sum(row.accepted * row.beyond_3 for row in rows) / accepted if accepted else np.nan
 

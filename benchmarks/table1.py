@@ -42,7 +42,7 @@ RIGHT = (20.0, 2.0)
 """mm and degrees. The paper does not define `converged`, and its solver has no opinion: here it converged when it
 was right to this."""
 SURPRISE = 3.0
-"""Reported standard deviations on any axis, beyond which an answer that is trusted is a silent fault."""
+"""Reported standard deviations on any axis, beyond which a result that is accepted is a silent fault."""
 PAPERS = "paper's calibration"
 ON_COLMAP, ON_PREDICTIONS = "COLMAP", "simulated predictions"
 
@@ -94,7 +94,7 @@ def run(long: bool = False) -> str:
         f"Simulated scenes, {seeds} captures each (seeds 0 to {seeds * len(SCENES) - 1}, no two scenes share one; "
         f"{degraded}; intrinsics given), medians; the same images for every method. Converged: within {RIGHT[0]:g} mm "
         f"and {RIGHT[1]:g}° of the truth. δ_t (m) and δ_R are the paper's residuals over consecutive images; they hold "
-        "the robot pose noise, and are no smaller where the answer is exact. σ: the largest error "
+        "the robot pose noise, and are no smaller where the result is exact. σ: the largest error "
         "on an axis in reported "
         f"standard deviations. The paper's calibration is asked in a unit in which λ is {GRID_SCALE:g}, since its grid "
         "ends at 4.",
@@ -131,7 +131,7 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
     ours = [cell for many in cells.values() for cell in many if cell.trusted is not None]
     silent = sum(cell.silent for cell in ours)
     lines.append(
-        f"> Of ours, {sum(bool(cell.trusted) for cell in ours)} of {len(ours)} are trusted, and {silent} of these are "
+        f"> Of ours, {sum(bool(cell.trusted) for cell in ours)} of {len(ours)} are accepted, and {silent} of these are "
         f"farther off on an axis than {SURPRISE:g} reported standard deviations; were every σ right, one in "
         f"{1 / (1 - (1 - 2 * norm.sf(SURPRISE)) ** 6):.0f} would be, of six axes, by chance."
     )
@@ -140,7 +140,7 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
 
 def _table(cells: dict[Row, list[Cell]], counts: tuple[int, ...]) -> list[str]:
     lines = [
-        "| scene | images | method | converged | trusts itself | poses | δ_t | δ_R | off: mm | ° | scale % | σ |",
+        "| scene | images | method | converged | accepted | poses | δ_t | δ_R | off: mm | ° | scale % | σ |",
         "|---" * 12 + "|",
     ]
     for (scene, count, method), many in cells.items():

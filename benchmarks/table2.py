@@ -107,9 +107,9 @@ def _honesty(measurements: list[Measurement]) -> list[str]:
         f"error {np.median(percent):.2f} %; worst with 8 images {worst[8]:.1f} % (the paper's {PAPER_PERCENT[8]} %), "
         f"with 10 {worst[10]:.1f} % (the paper's {PAPER_PERCENT[10]} %).",
         "",
-        f"{len(found)} of {len(measurements)} heights measured, and {len(bounded)} given as lower bounds, of which "
-        f"{sum(m.error <= 0 for m in bounded)} hold. Of those measured {100 * np.mean(percent <= 3.1):.0f} % are "
-        f"within 3.1 %, median {np.median(percent):.2f} %, worst {percent.max():.2f} %. Of the errors "
+        f"{len(found)} of {len(measurements)} heights measured, and {len(bounded)} given as lower bounds; "
+        f"{sum(m.error <= 0 for m in bounded)} of these hold. Of those measured {100 * np.mean(percent <= 3.1):.0f} % "
+        f"are within 3.1 %, median {np.median(percent):.2f} %, worst {percent.max():.2f} %. Of the errors "
         f"{100 * np.mean(sigmas <= 1):.0f} % are within one stated sigma (68 % expected), "
         f"{100 * np.mean(sigmas <= 2):.0f} % within two (95 %); the largest is {sigmas.max():.1f} sigmas.",
     ]

@@ -78,7 +78,7 @@ DOCUMENTS = [
         if page.parent.name != "results" and page.name not in GENERATED
     ),
 ]
-MODULES = sorted((ROOT / "src" / "jcr").rglob("*.py"))
+MODULES = sorted([*(ROOT / "src" / "jcr").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")])
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
