@@ -55,7 +55,7 @@ def without_code(text: str) -> str:
 
 def faults(text: str) -> list[str]:
     """Every word that is not said, with what is."""
-    text = MEANT.sub(" ", without_code(text))
+    text = MEANT.sub(" ", re.sub(r"\s+", " ", without_code(text)))
     return [
         f"{found[0]!r}: {right}" for wrong, right in SAY.items() for found in re.finditer(wrong, text, re.I)
     ]
