@@ -49,6 +49,14 @@ def test_every_number_of_the_readme_is_in_the_results():
     assert quoted >= 8
 
 
+def test_the_manual_quotes_the_dense_depth_that_was_measured():
+    text = (ROOT / "docs" / "explanation" / "dense-depth.md").read_text().split("| before | now |", 1)[1]
+    now = " ".join(row.split("|")[-2] for row in text.split("\n\n")[0].splitlines() if "|" in row)
+    quoted = [number for number in MEASURED.findall(now) if number[1] == "%"]
+    assert len(quoted) >= 10
+    assert set(quoted) <= set(MEASURED.findall((RESULTS / "depth_long.md").read_text()))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(RESULTS.glob("*.md")), ids=lambda page: page.stem)
 def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page: Path):
