@@ -81,6 +81,8 @@ NO_DEFAULT = re.compile(r"\(default:(?:[\s│]|\x1b\[[0-9;]*m)+(?:None|True|Fals
 """In help: what is said of options that have no value, and of switches."""
 LONGEST_LINE = 2000
 """Characters of a message."""
+VALUES = {"FLOAT": "number", "INT": "whole number", "STR": "text"}
+"""tyro's names for the values of an option, and ours."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -234,7 +236,17 @@ def _flatten(box: str) -> str:
     blocks = re.split(r"^[─━-]{3,}$", "\n".join(lines), flags=re.MULTILINE)
     message = blocks[0] if text.startswith("╭") or len(blocks) == 1 else blocks[1]
     line = re.sub(r"\s+", " ", message).strip() or "the arguments cannot be understood"
+    line = re.sub(r"Error parsing (\S+): could not convert string to float:", r"\1 takes a number, not", line)
+    line = re.sub(r"Error parsing (\S+): invalid literal for int.*?:", r"\1 takes a whole number, not", line)
+    line = re.sub(r"Error parsing (\S+): no type matching \{(.*?)\} .*? from \[(.*?)\]\..*", _values, line)
     return re.sub(r"Expected one of \((.*?)\)", _choices, line)
+
+
+def _values(refused: re.Match[str]) -> str:
+    """tyro names Python's types for an option of several values, and each of its attempts."""
+    option, types, given = refused.groups()
+    words = [VALUES.get(name, name.lower()) for name in types.split()]
+    return f"{option} takes {len(words)} values ({', '.join(words)}), not {given}"
 
 
 def _choices(listed: re.Match[str]) -> str:
