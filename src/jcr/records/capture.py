@@ -1,0 +1,141 @@
+"""What goes in: the camera model's numbers, images with gripper poses, or poses alone."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+LensModel = Literal["pinhole", "rational", "fisheye"]
+COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Of each distortion, in OpenCV's order; ROS calls them plumb_bob, rational_polynomial and equidistant."""
+Coefficients = (
+    tuple[float, float, float, float]
+    | tuple[float, float, float, float, float]
+    | tuple[float, float, float, float, float, float, float, float]
+)
+
+
+def coefficients_of(values: Iterable[float]) -> Coefficients:
+    """Four, five or eight numbers as a model has them."""
+    return cast(Coefficients, tuple(float(value) for value in values))
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera with one of OpenCV's distortions, in pixels of a `width` x `height` image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """As many coefficients as COEFFICIENTS has names for the model."""
+    model: LensModel = "pinhole"
+
+    @property
+    def matrix(self) -> Float[ndarray, "3 3"]:
+        """K (3,3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+Mount = Literal["gripper", "base"]
+"""What a camera is bolted to: the gripper of an arm, or the ground that the arm's base stands on."""
+
+
+@dataclass(frozen=True)
+class CellCamera:
+    """A further camera of the robot's cell, and its images."""
+
+    name: str
+    mount: Mount
+    images: tuple[str, ...]
+    """Paths relative to the folder."""
+    image_size: tuple[int, int]
+    intrinsics: Intrinsics | None = None
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    folder: Path | None = None
+    """None: the capture's."""
+    frame: Int[ndarray, " k"] | None = None
+    """Rows of the capture at whose gripper poses the images were taken: of a camera on the same gripper, or of a fixed
+    one that watches what this gripper carries. None of others."""
+    arm: str | None = None
+    """The other arm that carries it; None: the capture's own, or none."""
+    base_from_gripper: Float[ndarray, "k 4 4"] | None = None
+    """Of the other arm, in its own base, at each image."""
+
+    @property
+    def watches_gripper(self) -> bool:
+        """Whether it is fixed and sees what the gripper carries instead of the scene."""
+        return self.mount == "base" and self.frame is not None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Images of one scene and the gripper pose at each, checked on reading."""
+
+    folder: Path
+    images: tuple[str, ...]
+    """Paths relative to `folder`; the names by which everything later speaks of an image."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    image_size: tuple[int, int]
+    """Width, height in pixels after EXIF rotation; the same for all images."""
+    intrinsics: Intrinsics | None = None
+    """None: unknown, to be estimated."""
+    intrinsics_std: Float[ndarray, " q"] | None = None
+    """Standard deviations of the given ones, in the order of camera.parameters, not a number where one is not stated."""
+    source: Path | None = None
+    """What it was read from, where that is not a capture.json in `folder`."""
+    cameras: Path | None = None
+    """A COLMAP model or transforms.json that holds the cameras' poses already."""
+    notes: tuple[str, ...] = ()
+    """What reading found that the user should know: how files were paired, frames left out."""
+    joints: Float[ndarray, "n dof"] | None = None
+    """Joint angles (rad) at each image, from the base on; None: not recorded."""
+    robot: str | None = None
+    """Name of the arm, one of jcr.handeye.arms.ROBOT_NAMES."""
+    urdf: Path | None = None
+    """Of the arm, where it was given."""
+    orientation: int = 1
+    """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
+    depths: tuple[str | None, ...] | None = None
+    """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
+    camera_name: str = "wrist"
+    mount: Mount = "gripper"
+    """base: a fixed camera, and the images show what the gripper carries."""
+    others: tuple[CellCamera, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@dataclass(frozen=True)
+class PosePairs:
+    """Gripper and camera poses of the same instants, the cameras found by somebody else: no image is needed."""
+
+    source: Path
+    images: tuple[str, ...]
+    """Names of the samples."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    recon_from_camera: Float[ndarray, "n 4 4"]
+    is_metric: bool
+    """The cameras' unit is the metre, as with a marker of known size."""
+    notes: tuple[str, ...] = ()
+    backend: str = "poses given"
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def image_index(self) -> Int[ndarray, " n"]:
+        """Rows of the samples with a camera pose: all, as in a Reconstruction that registered every image."""
+        return np.arange(len(self))

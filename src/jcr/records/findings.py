@@ -1,0 +1,86 @@
+"""What was found to speak against a calibration, or to be worth knowing: data, from which `words.py` makes sentences."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+from jaxtyping import Float
+from numpy import ndarray
+
+Severity = Literal["rejects", "warns", "informs"]
+Mend = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
+"""What would help: another reconstruction of the same images, other motions, more or other images, other intrinsics,
+corrected gripper poses, a firm mount, the arm's name or joint angles; or nothing."""
+Verdict = Literal["accepted", "accepted with warnings", "rejected"]
+
+
+class Kind(StrEnum):
+    """Every kind of finding there is."""
+
+    UNOBSERVABLE = "unobservable motion"
+    FEW_IMAGES = "few images"
+    FEW_AGREE = "few images agree"
+    POSES_CONTRADICT_IMAGES = "gripper poses contradict the images"
+    POSE_CONVENTION = "pose convention"
+    NOISE_ABOVE_GIVEN = "noise above the given one"
+    UNCERTAIN = "too uncertain"
+    LEAVE_ONE_OUT = "leave-one-out error"
+    NOT_EXACT_ENOUGH = "requirement not met"
+    FOCUS_BY_DISTANCE = "focal length changes with distance"
+    FOCUS_BY_IMAGE = "focal length differs between images"
+    ZOOM = "focal length changed once"
+    ROLLING_SHUTTER = "images sheared alike"
+    ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself"
+    INTRINSICS = "intrinsics contradict the images"
+    SLIP = "camera moved on the gripper"
+    DRIFT = "camera drifts on the gripper"
+    DELAY = "gripper poses early or late"
+    WRONG_MOUNT = "wrong mount"
+    ROBOT_UNUSED = "robot not used"
+    SYSTEMATIC_ERRORS = "systematic robot errors"
+    JOINT_OFFSETS = "joint offsets"
+    ANGLE_RATIO = "camera and gripper angles differ"
+    BOARD_SIZE = "board size contradicts the robot"
+    NETWORK_SCALE = "a network's metre contradicts the robot"
+    SCALE_ASSUMED = "scale assumed"
+    SCALE_FROM_ROBOT = "scale from the robot alone"
+    IMAGES_ROTATED = "images rotated"
+    BOARD_IN_VIEW = "board in view"
+    RECONSTRUCTION = "reconstruction"
+    NO_RECONSTRUCTION = "no reconstruction"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that was found, its size, and what would help."""
+
+    kind: Kind
+    severity: Severity
+    mend: Mend = "none"
+    images: tuple[str, ...] = ()
+    """Names of the images concerned; empty where it concerns all or none."""
+    joints: tuple[int, ...] = ()
+    """Joints concerned, the first is 1."""
+    value: float | None = None
+    """Size of what was found, in the unit of its kind (docs: reference/findings); None where it has no size."""
+    std: float | None = None
+    """One standard deviation of the value."""
+    p: float | None = None
+    """Chance of this or more where there is nothing to find."""
+    shift: Float[ndarray, "7"] | None = None
+    """How far the calibration would move if this were allowed for, in COVARIANCE_ORDER; its outer product is part of
+    the covariance. None where it adds nothing."""
+    details: Mapping[str, float | str] = field(default_factory=dict)
+    """Further numbers and names that the sentence needs."""
+
+
+RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """The verdict is that of the worst finding."""
+    severities = {finding.severity for finding in findings}
+    if "rejects" in severities:
+        return "rejected"
+    return "accepted with warnings" if "warns" in severities else "accepted"

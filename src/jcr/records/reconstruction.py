@@ -1,0 +1,72 @@
+"""What images alone give: camera poses, points, and pointmaps, up to one similarity."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.records.capture import Intrinsics
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of common 3D points, for bundle adjustment, whatever back end made them."""
+
+    image: Int[ndarray, " k"]
+    """Row of the reconstruction (not of the capture) that each observation belongs to."""
+    x_px: Float[ndarray, "k 2"]
+    """In the capture's original image, distorted as the camera made it."""
+    point: Int[ndarray, " k"]
+    """Row of `points_in_recon`."""
+    points_in_recon: Float[ndarray, "p 3"]
+    from_pointmaps: bool = False
+    """Matched between pointmaps, with errors that neighbours share, instead of found in the images."""
+
+
+@dataclass(frozen=True)
+class CameraEvidence:
+    """What the images alone say of the cameras, and how surely; the robot was not asked."""
+
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    covariance: Float[ndarray, "r r"]
+    """Of steps of the cameras (geometry.retract, recon axes), camera by camera; r = 6m. The recon frame is that of one
+    of the cameras, which is therefore exact."""
+
+
+NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
+"""What a depth rests on: nothing; images that show the same (or a network's prediction); a plane that the colours
+and the matched depths around it speak for; both."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
+
+    image_index: Int[ndarray, " m"]
+    """Rows of the capture that were registered, ascending."""
+    recon_from_camera: Float[ndarray, "m 4 4"]
+    intrinsics: Intrinsics
+    """Of the capture's original images: given, or estimated by the back end."""
+    pointmap_intrinsics: Intrinsics
+    """The undistorted pinhole grid in which the pointmaps live (size W x H)."""
+    points_in_recon: Float[ndarray, "m h w 3"]
+    confidence: Float[ndarray, "m h w"]
+    """At least 0; 0 means no estimate (the point may be anything, finite)."""
+    colors: UInt8[ndarray, "m h w 3"]
+    """RGB at the pointmap's pixels."""
+    tracks: Tracks
+    backend: str
+    is_metric: bool = False
+    """Whether the unit is meant to be the metre."""
+    metric_std: float | None = None
+    """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
+    notes: tuple[str, ...] = ()
+    """What was done: images not registered, matches left out."""
+    warnings: tuple[str, ...] = ()
+    """What the user must act on: intrinsics that cannot be used, a gripper pose that the images contradict."""
+    reason: UInt8[ndarray, "m h w"] | None = None
+    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
+    depth_std: Float[ndarray, "m h w"] | None = None
+    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
+    evidence: CameraEvidence | None = None
+    """In the same frame, where the robot's poses were used for `recon_from_camera` or cameras err beside them."""
