@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jcr.calibration.bundle import adjust
-from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 import jcr
 from jcr.calibration.bundle import adjust, median_reprojection
-from jcr.calibration.intrinsics_prior import ESTIMATED, MEASURED, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.camera import parameters, with_parameters
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.observations import LENS, observed

@@ -5,7 +5,7 @@ import numpy as np
 
 import jcr
 from jcr.calibration.consider import with_intrinsics_considered
-from jcr.calibration.intrinsics_prior import prior_of
+from jcr.adjust.intrinsics_prior import prior_of
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import inverse, transform
 from jcr.handeye.fit import Cues

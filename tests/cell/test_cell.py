@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jcr
-from jcr.calibration.intrinsics_prior import HELD, prior_of
+from jcr.adjust.intrinsics_prior import HELD, prior_of
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, project, unproject, with_parameters

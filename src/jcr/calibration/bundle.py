@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
-from jcr.calibration.intrinsics_prior import HELD, IntrinsicsPrior, off_by, prior_of
+from jcr.adjust.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
+from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, off_by, prior_of
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import apply, fit_similarity, inverse, retract, scale_translation, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.calibration.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point
 from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
 from jcr.handeye.closed_form import initial_estimate

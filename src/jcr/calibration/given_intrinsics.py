@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
-from jcr.calibration.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.equation import Poses

@@ -13,7 +13,7 @@ from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
-from jcr.calibration.intrinsics_prior import IntrinsicsPrior, prior_about
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined

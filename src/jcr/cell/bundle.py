@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.elimination import (
+from jcr.adjust.elimination import (
     Derivatives,
     Normal,
     Sightings,
@@ -20,7 +20,7 @@ from jcr.calibration.elimination import (
     with_points_held,
     without_points,
 )
-from jcr.calibration.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point, parameters, project, with_parameters
 from jcr.geometry import retract, skew, step_between
 from jcr.least_squares import loss_weight, one_blas_thread

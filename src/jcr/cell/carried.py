@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.calibration.intrinsics_prior import prior_about
+from jcr.adjust.intrinsics_prior import prior_about
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import MIN_OBSERVATIONS, calibrate, of_images

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.intrinsics_prior import prior_about
+from jcr.adjust.intrinsics_prior import prior_about
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import MIN_OBSERVATIONS, of_images

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.calibration.intrinsics_prior import off_by
+from jcr.adjust.intrinsics_prior import off_by
 from jcr.cell.bundle import Imaged, Scene, stepped
 from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import Equations, most_likely, posterior, solve

@@ -1,0 +1,326 @@
+"""Bundle adjustment of images, and what they alone show of their rigs and cameras: one similarity of the world is open.
+
+Reprojection errors under a Cauchy loss, over intrinsics, nuisances of single images, mounts, rigs and points. Points are
+eliminated (elimination.py); the rest is a small dense system, solved by Levenberg-Marquardt: least_squares.py without
+that elimination would hold a matrix of thousands of points. Where the images are weak, what the robots report may hold
+the rigs while everything moves (robots.py); `evidence` is what is left without it, so that nothing counts twice.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.adjust.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
+from jcr.adjust.pixel_noise import Layout, PixelNoise, pixel_noise, variance_ratios
+from jcr.adjust.scene import Freedom, Observations, Scene, similarities, stepped
+from jcr.camera import by_parameters, by_point, project
+from jcr.geometry import skew, step_between
+
+ENOUGH = 1e-5
+"""Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
+STEPS = 60
+FAINT = 1e-6
+"""Information that every column has (1/m², 1/rad²): an image that shows nothing is anywhere within a kilometre."""
+
+
+@dataclass(frozen=True)
+class RigInformation:
+    """Twice a cost that is quadratic in steps of the first rigs from a place of reference: sᵀ H s + 2 gᵀ s."""
+
+    world_from_rig: Float[ndarray, "m 4 4"]
+    information: Float[ndarray, "r r"]
+    gradient: Float[ndarray, " r"]
+
+    def steps(self, scene: Scene) -> Float[ndarray, " r"]:
+        """How far the rigs of a scene are from the reference."""
+        return step_between(self.world_from_rig, scene.world_from_rig[: len(self.world_from_rig)]).ravel()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageProblem:
+    """What stays fixed; observations sorted by point, then by rig."""
+
+    observations: Observations
+    points: Int[ndarray, " p"]
+    """Of the points that were given, those that two or more observations show."""
+    freedom: Freedom
+    prior: RigInformation | None
+    """What others than these images and the robots know of the rigs; it is part of the evidence."""
+    seen: Sightings
+    """By rigs."""
+    layout: Layout
+
+    @staticmethod
+    def of(
+        scene: Scene, observations: Observations, freedom: Freedom, prior: RigInformation | None = None
+    ) -> "ImageProblem":
+        """Of observations in any order; of several of one point in one image the first counts."""
+        order = np.lexsort((observations.image, observations.rig[observations.image], observations.point))
+        point, image = observations.point[order], observations.image[order]
+        order = order[np.r_[True, (np.diff(point) != 0) | (np.diff(image) != 0)]]
+        count = np.bincount(observations.point[order], minlength=len(scene.points_in_world))
+        order = order[count[observations.point[order]] >= 2]
+        kept, point = np.unique(observations.point[order], return_inverse=True)
+        used = replace(
+            observations, image=observations.image[order], x_px=observations.x_px[order], point=point
+        )
+        widths = np.array([camera.width for camera in freedom.start])
+        return ImageProblem(
+            observations=used,
+            points=kept,
+            freedom=freedom,
+            prior=prior,
+            seen=Sightings.of(point, used.rig[used.image], len(scene.world_from_rig)),
+            layout=Layout.of(used, widths),
+        )
+
+
+@dataclass(frozen=True)
+class View:
+    """Every observation's point as one scene has it."""
+
+    from_rig: Float[ndarray, "k 3"]
+    """From the rig to the point, rig axes."""
+    from_camera: Float[ndarray, "k 3"]
+    """From the camera to the point, rig axes."""
+    in_camera: Float[ndarray, "k 3"]
+    from_centre_px: Float[ndarray, "k 2"]
+    """Projection by the camera as it is in all images, from the principal point."""
+    residual_px: Float[ndarray, "k 2"]
+    """Projected minus observed."""
+
+    @property
+    def depth(self) -> Float[ndarray, " k"]:
+        """Along the optical axis."""
+        return self.in_camera[:, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageEvidence:
+    """What the images alone show, a normal distribution about a scene in the order of Freedom's columns."""
+
+    scene: Scene
+    problem: ImageProblem
+    information: Float[ndarray, "d d"]
+    """Priors of intrinsics and nuisances included; of the similarity as much as keeps it from being infinite, which is
+    nothing beside what it is tied by."""
+    gradient: Float[ndarray, " d"]
+    """Of half the squared distance, at the scene."""
+    noise: PixelNoise
+    view: View
+
+
+def view_of(scene: Scene, problem: ImageProblem) -> View:
+    """The observations' points as a scene projects them."""
+    observations = problem.observations
+    camera, k = problem.layout.camera, len(observations.image)
+    from_rig = np.empty((k, 3))
+    for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
+        points = scene.points_in_world[observations.point[rows]]
+        from_rig[rows] = (points - pose[:3, 3]) @ pose[:3, :3]
+    from_camera, in_camera, from_centre = np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 2))
+    residual = np.empty((k, 2))
+    log_focal, shear = scene.nuisances(problem.freedom)[:, observations.image]
+    for c, (lens, mount) in enumerate(zip(scene.cameras, scene.rig_from_camera, strict=True)):
+        rows = np.flatnonzero(camera == c)
+        from_camera[rows] = from_rig[rows] - mount[:3, 3]
+        in_camera[rows] = from_camera[rows] @ mount[:3, :3]
+        centre = np.array([lens.cx, lens.cy])
+        about = project(lens, in_camera[rows]) - centre
+        from_centre[rows] = about
+        moved = np.exp(log_focal[rows])[:, None] * about
+        moved[:, 0] += lens.fx / lens.height * shear[rows] * about[:, 1]
+        residual[rows] = moved + centre - observations.x_px[rows]
+    return View(from_rig, from_camera, in_camera, from_centre, residual)
+
+
+def noise_of(scene: Scene, view: View, problem: ImageProblem, before: PixelNoise | None = None) -> PixelNoise:
+    """Of the observations at a scene; several cameras are told apart where an estimate was made before."""
+    ratio = np.ones(len(scene.cameras))
+    if before is not None:
+        by_world = _by_world(_by_rig(scene, view, problem), scene, problem)
+        ratio = variance_ratios(
+            problem.layout, before, view.residual_px, view.depth, by_world, problem.seen.starts
+        )
+    return pixel_noise(problem.layout, view.residual_px, view.depth, ratio)
+
+
+def minimised(
+    scene: Scene,
+    problem: ImageProblem,
+    noise: PixelNoise,
+    robots: RigInformation | None,
+    damping: float = 1e-4,
+) -> tuple[Scene, View, float]:
+    """Levenberg-Marquardt with the weights that observations have at the start; also the damping at the end."""
+    view = view_of(scene, problem)
+    weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
+    held = [one for one in (problem.prior, robots) if one is not None]
+    cost = _cost(scene, view, problem, weight, held)
+    for _ in range(STEPS):
+        moved = _moved(scene, problem, _equations(scene, view, problem, weight, held, damping))
+        moved_view = view_of(moved, problem)
+        new_cost = _cost(moved, moved_view, problem, weight, held)
+        gained = cost - new_cost
+        if gained >= 0:
+            scene, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
+        else:
+            damping *= 10
+        if abs(gained) < ENOUGH:
+            break
+        if damping > 1e8:
+            return scene, view, 1e-4
+    return scene, view, damping
+
+
+def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvidence:
+    """What the images and the priors of their cameras show about a scene, whoever helped to find it."""
+    view = view_of(scene, problem)
+    weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
+    held = [] if problem.prior is None else [problem.prior]
+    normal = _equations(scene, view, problem, weight, held, 0.0)
+    information = normal.hessian
+    information[np.diag_indices(len(information))] += FAINT
+    if problem.prior is None:
+        # A unit of the world that is that of its rigs' places, all alike: what λ is counted in.
+        unseen = np.linalg.qr(similarities(scene, problem.freedom))[0]
+        of_rigs = information.diagonal()[problem.freedom.first_rig :]
+        information += float(of_rigs.mean()) * unseen @ unseen.T
+    return ImageEvidence(
+        scene=scene,
+        problem=problem,
+        information=information,
+        gradient=-normal.right,
+        noise=noise,
+        view=view,
+    )
+
+
+def median_reprojection_px(view: View, problem: ImageProblem) -> Float[ndarray, " n"]:
+    """Median reprojection error of every image; not a number where it took no part."""
+    length = np.linalg.norm(view.residual_px, axis=1)
+    image = problem.observations.image
+    out = np.full(len(problem.observations.rig), np.nan)
+    for k in np.unique(image):
+        out[k] = np.median(length[image == k])
+    return out
+
+
+def _by_rig(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "k 2 3"]:
+    """Derivative of every observation by its point, rig axes."""
+    camera = problem.layout.camera
+    out = np.empty((len(camera), 2, 3))
+    for c, lens in enumerate(scene.cameras):
+        rows = np.flatnonzero(camera == c)
+        out[rows] = by_point(lens, view.in_camera[rows]) @ scene.rig_from_camera[c, :3, :3].T
+    return _nuisances_applied(out, scene, problem)
+
+
+def _by_world(
+    by_rig: Float[ndarray, "k 2 3"], scene: Scene, problem: ImageProblem
+) -> Float[ndarray, "k 2 3"]:
+    """The same, world axes."""
+    out = np.empty_like(by_rig)
+    for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
+        out[rows] = by_rig[rows] @ pose[:3, :3].T
+    return out
+
+
+def _nuisances_applied(
+    by: Float[ndarray, "k 2 p"], scene: Scene, problem: ImageProblem
+) -> Float[ndarray, "k 2 p"]:
+    """Derivatives of projections by the cameras as derivatives of projections by the images' own, in place."""
+    if len(problem.freedom.nuisance.std) == 0:
+        return by
+    log_focal, shear = scene.nuisances(problem.freedom)[:, problem.observations.image]
+    along = np.array([camera.fx / camera.height for camera in scene.cameras])[problem.layout.camera] * shear
+    by *= np.exp(log_focal)[:, None, None]
+    by[:, 0] += along[:, None] * by[:, 1]
+    return by
+
+
+def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "k 2 l"]:
+    """Derivative of every observation by the steps of intrinsics and nuisances."""
+    freedom, camera = problem.freedom, problem.layout.camera
+    out = np.zeros((len(camera), 2, len(freedom.std)))
+    for c, (lens, prior, columns) in enumerate(
+        zip(scene.cameras, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
+    ):
+        rows = np.flatnonzero(camera == c)
+        out[rows, :, columns] = by_parameters(lens, view.in_camera[rows]) @ prior.directions
+    if len(freedom.nuisance.std):
+        image, about = problem.observations.image, view.from_centre_px
+        log_focal, _ = scene.nuisances(freedom)[:, image]
+        by_shear = np.array([lens.fx / lens.height for lens in scene.cameras])[camera] * about[:, 1]
+        of_focal, of_shear = freedom.nuisance.directions.reshape(2, -1, len(freedom.nuisance.std))[:, image]
+        out[:, :, freedom.nuisance_columns] = (np.exp(log_focal)[:, None] * about)[:, :, None] * of_focal[
+            :, None
+        ]
+        out[:, 0, freedom.nuisance_columns] += by_shear[:, None] * of_shear
+    return out
+
+
+def _cost(
+    scene: Scene,
+    view: View,
+    problem: ImageProblem,
+    weight: Float[ndarray, " k"],
+    held: list[RigInformation],
+) -> float:
+    cost = float(weight @ (view.residual_px**2).sum(1))
+    cost += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
+    for one in held:
+        steps = one.steps(scene)
+        cost += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
+    return cost
+
+
+def _equations(
+    scene: Scene,
+    view: View,
+    problem: ImageProblem,
+    weight: Float[ndarray, " k"],
+    held: list[RigInformation],
+    damping: float,
+) -> Normal:
+    """The normal equations in the order of Freedom's columns, without the points."""
+    freedom, first = problem.freedom, problem.freedom.first_rig
+    root = np.sqrt(weight)[:, None, None]
+    by_rig = _by_rig(scene, view, problem)
+    by_rig *= root
+    shared = np.zeros((len(weight), 2, first))
+    cameras = len(freedom.std)
+    shared[:, :, :cameras] = _by_cameras(scene, view, problem) * root
+    for c, columns in enumerate(freedom.mount_columns):
+        if columns is not None:
+            mine = np.flatnonzero(problem.layout.camera == c)
+            rotated = by_rig[mine] @ skew(view.from_camera[mine])
+            shared[mine, :, columns] = np.concatenate([-by_rig[mine], rotated], axis=2)
+    by_world, own = np.empty_like(by_rig), np.empty((len(weight), 2, 6))
+    for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
+        rotation = pose[:3, :3]
+        by_world[rows] = by_rig[rows] @ rotation.T
+        own[rows, :, :3] = -by_world[rows]
+        own[rows, :, 3:] = np.cross(by_world[rows], (view.from_rig[rows] @ rotation.T)[:, None])
+    weighted = Derivatives(shared, own, by_world, view.residual_px * root[..., 0])
+    hessian, right = with_points_held(weighted, problem.seen)
+    hessian[range(cameras), range(cameras)] += freedom.std**-2.0
+    right[:cameras] -= scene.camera_steps / freedom.std**2
+    for one in held:
+        of_rigs = slice(first, first + len(one.gradient))
+        hessian[of_rigs, of_rigs] += one.information
+        right[of_rigs] -= one.information @ one.steps(scene) + one.gradient
+    hessian[np.diag_indices(len(right))] *= 1 + damping
+    return without_points(hessian, right, weighted, problem.seen, damping)
+
+
+def _moved(scene: Scene, problem: ImageProblem, normal: Normal) -> Scene:
+    """The scene after one Gauss-Newton step; along the similarity that no image shows, the least one."""
+    scale = 1 / np.sqrt(np.maximum(normal.hessian.diagonal(), FAINT))
+    scaled = scale[:, None] * normal.hessian * scale
+    scaled[np.diag_indices(len(scale))] += 1e-12
+    step = scale * np.linalg.solve(scaled, scale * normal.right)
+    points = normal.stepped(scene.points_in_world, step)
+    return replace(stepped(scene, problem.freedom, step), points_in_world=points)

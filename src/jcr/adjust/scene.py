@@ -1,0 +1,156 @@
+"""What an adjustment moves, what was observed, and along which directions everything is free.
+
+A rig is what moves as one: the wrist of an arm at one instant with all cameras on it, or a fixed camera. A wrist camera
+alone is a rig an image. `world` has any origin and unit: images leave one similarity of it open.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.camera import parameters, with_parameters
+from jcr.geometry import retract, skew
+from jcr.records import Intrinsics
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """Which rig and which camera each image is of, and which points are seen in it."""
+
+    rig: Int[ndarray, " n"]
+    """Of each image."""
+    camera: Int[ndarray, " n"]
+    """Of each image."""
+    image: Int[ndarray, " k"]
+    """Of each observation; no point twice in one image."""
+    x_px: Float[ndarray, "k 2"]
+    """In the original image, distorted."""
+    point: Int[ndarray, " k"]
+
+
+@dataclass(frozen=True)
+class NuisancePrior:
+    """Independent directions in which each image may differ from its camera, with their standard deviations.
+
+    An image has two such parameters: the logarithm of its own focal length over the camera's, and a shear, by which x
+    moves from the image's top to its bottom in focal lengths, as a rolling shutter does it.
+    """
+
+    directions: Float[ndarray, "2n e"]
+    """Of the logarithms of all n images, then of their shears."""
+    std: Float[ndarray, " e"]
+
+    @staticmethod
+    def none(images: int) -> "NuisancePrior":
+        """Every image is as its camera is."""
+        return NuisancePrior(np.zeros((2 * images, 0)), np.zeros(0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Freedom:
+    """What may move beside rigs and points: the cameras' parameters, and where cameras are mounted on their rig.
+
+    The columns of all equations are, in this order: the intrinsics of each camera, nuisances, mounts (six each, rig
+    axes), rigs (six each, world axes).
+    """
+
+    intrinsics: tuple[IntrinsicsPrior, ...]
+    """One a camera, about where its parameters start."""
+    mounts: Bool[ndarray, " c"]
+    """Cameras whose place on the rig is sought; that of others is exact."""
+    nuisance: NuisancePrior
+    start: tuple[Intrinsics, ...]
+    """Of each camera, where its prior has its middle."""
+
+    @property
+    def std(self) -> Float[ndarray, " l"]:
+        """Of all camera columns."""
+        return np.concatenate([*(prior.std for prior in self.intrinsics), self.nuisance.std])
+
+    @property
+    def intrinsics_columns(self) -> list[slice]:
+        """Of each camera."""
+        ends = np.cumsum([0, *(len(prior.std) for prior in self.intrinsics)])
+        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    @property
+    def nuisance_columns(self) -> slice:
+        """After the intrinsics."""
+        begin = sum(len(prior.std) for prior in self.intrinsics)
+        return slice(begin, begin + len(self.nuisance.std))
+
+    @property
+    def mount_columns(self) -> list[slice | None]:
+        """Of each camera; None where it does not move."""
+        begin, out = self.nuisance_columns.stop, list[slice | None]()
+        for free in self.mounts:
+            out.append(slice(begin, begin + 6) if free else None)
+            begin += 6 * int(free)
+        return out
+
+    @property
+    def first_rig(self) -> int:
+        """Column; six for each rig follow."""
+        return self.nuisance_columns.stop + 6 * int(self.mounts.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Where everything is."""
+
+    world_from_rig: Float[ndarray, "m 4 4"]
+    rig_from_camera: Float[ndarray, "c 4 4"]
+    cameras: tuple[Intrinsics, ...]
+    points_in_world: Float[ndarray, "p 3"]
+    camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
+    """Of the intrinsics from where they start, along the directions of their priors, then of the nuisances; empty: all
+    are where they start."""
+
+    def nuisances(self, freedom: Freedom) -> Float[ndarray, "2 n"]:
+        """Of each image: logarithm of its focal length over the camera's, and its shear."""
+        return (freedom.nuisance.directions @ self.camera_steps[freedom.nuisance_columns]).reshape(2, -1)
+
+
+def at_start(scene: Scene, freedom: Freedom) -> Scene:
+    """The scene with its cameras where their priors have their middle."""
+    return replace(scene, cameras=freedom.start, camera_steps=np.zeros(len(freedom.std)))
+
+
+def stepped(scene: Scene, freedom: Freedom, step: Float[ndarray, " d"]) -> Scene:
+    """Cameras, mounts and rigs after a step in the order of the columns; points stay."""
+    along = scene.camera_steps + step[: len(freedom.std)]
+    cameras = tuple(
+        with_parameters(start, parameters(start) + prior.directions @ along[columns])
+        for start, prior, columns in zip(
+            freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True
+        )
+    )
+    mounts = scene.rig_from_camera.copy()
+    for c, columns in enumerate(freedom.mount_columns):
+        if columns is not None:
+            mounts[c] = retract(mounts[c], step[columns])
+    rigs = retract(scene.world_from_rig, step[freedom.first_rig :].reshape(-1, 6))
+    return replace(scene, world_from_rig=rigs, rig_from_camera=mounts, cameras=cameras, camera_steps=along)
+
+
+def similarities(scene: Scene, freedom: Freedom) -> Float[ndarray, "d 7"]:
+    """Steps of everything that a similarity of the world makes, which no image shows; scale first."""
+    first = freedom.first_rig
+    out = np.zeros((first + 6 * len(scene.world_from_rig), 7))
+    out[first:] = similarities_of_rigs(scene.world_from_rig)
+    for c, columns in enumerate(freedom.mount_columns):
+        if columns is not None:
+            out[columns.start : columns.start + 3, 0] = scene.rig_from_camera[c, :3, 3]
+    return out
+
+
+def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:
+    """The same of the rigs alone, r = 6m."""
+    position = world_from_rig[:, :3, 3]
+    rigs = np.zeros((len(position), 6, 7))
+    rigs[:, :3, 0], rigs[:, :3, 1:4] = position, np.eye(3)
+    rigs[:, :3, 4:], rigs[:, 3:, 4:] = -skew(position), np.eye(3)
+    return rigs.reshape(-1, 7)
