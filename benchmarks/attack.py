@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.calibration.bundle import adjust
 from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.calibration.bundle import adjust
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between

@@ -11,15 +11,14 @@ from numpy import ndarray
 from scipy.stats import chi2
 
 from jcr.adjust.intrinsics_prior import prior_of
+from jcr.adjust.robots import Adjusted, Placed, adjust
+from jcr.adjust.scene import Freedom, Scene
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
-from jcr.cell.bundle import Freedom, Scene, adjust_images
 from jcr.cell.stage import place_cameras
-from jcr.cell.ties import Answer, Placed, Tie, tied
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
-from jcr.handeye.systematic import smooth_errors
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
@@ -95,7 +94,7 @@ def run(captures: Path, long: bool = False) -> str:
     return _page(drawn, real, draws)
 
 
-def answered(problem: CellProblem, seed: int) -> Answer:
+def answered(problem: CellProblem, seed: int) -> Adjusted:
     """The cell from its images and poses; intrinsics are off by what is usual of given ones."""
     rng = np.random.default_rng([seed, 17])
     cameras = []
@@ -104,13 +103,15 @@ def answered(problem: CellProblem, seed: int) -> Answer:
         off = free.directions @ (free.std * rng.normal(size=len(free.std)))
         cameras.append(with_parameters(camera, parameters(camera) + off))
     mounts = np.array([False, *[problem.kind == "wrists"] * (len(cameras) - 1)])
-    scene = Scene(problem.world_from_rig, problem.rig_from_camera, tuple(cameras), problem.points_in_world)
-    imaged = adjust_images(scene, problem.pictures, Freedom(tuple(map(prior_of, cameras)), mounts))
-    ties = [
-        Tie(np.arange(COUNT) + COUNT * k, poses, smooth_errors(poses), start, problem.kind == "carried")
-        for k, (poses, start) in enumerate(zip(problem.reported, problem.starts, strict=True))
-    ]
-    return tied(imaged, ties, problem.scale)
+    scene = Scene(
+        world_from_rig=problem.world_from_rig,
+        rig_from_camera=problem.rig_from_camera,
+        cameras=tuple(cameras),
+        points_in_world=problem.points_in_world,
+    )
+    images = len(problem.observations.rig)
+    freedom = Freedom.of(cameras, [prior_of(camera) for camera in cameras], images, mounts)
+    return adjust(scene, problem.observations, freedom, problem.arms, scale=problem.scale)
 
 
 def _drawn(kind: Kind, preset: PresetName, draws: int) -> dict[str, list[Draw]]:
@@ -193,7 +194,7 @@ def _of_rows(capture: Capture, rows: list[int]) -> Capture:
     )
 
 
-def _against_robot(answer: Answer, rig: int, gripper: Float[ndarray, "4 4"]) -> Draw:
+def _against_robot(answer: Adjusted, rig: int, gripper: Float[ndarray, "4 4"]) -> Draw:
     """base_from_camera of a rig that no arm moved, against the pose that its arm reported and X, with errors of both."""
 
     def placed(p: Placed) -> Float[ndarray, "4 4"]:

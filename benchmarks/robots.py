@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from numpy import ndarray
 
 from benchmarks.peers import opencv
-from jcr.calibration.bundle import adjust
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
+from jcr.calibration.bundle import adjust
 from jcr.camera import parameters, with_parameters
 from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import jcr
+from jcr.adjust.images import ImageProblem, evidence, noise_of, view_of
 from jcr.adjust.intrinsics_prior import HELD, prior_of
+from jcr.adjust.robots import Adjusted, adjust
+from jcr.adjust.scene import Freedom, Scene, at_start, similarities
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, project, unproject, with_parameters
@@ -19,14 +22,11 @@ from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
 from jcr.cell import alone, carried, localise
 from jcr.cell.added import camera_of, read_added_cameras
-from jcr.cell.bundle import Freedom, Scene, adjust_images, similarities
 from jcr.cell.cameras_json import read_cameras
 from jcr.cell.found import CameraFound, PictureFound
 from jcr.cell.stage import place_cameras
-from jcr.cell.ties import Answer, Tie, tied
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
-from jcr.handeye.systematic import smooth_errors
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
@@ -39,7 +39,7 @@ OLD = 9
 SCALE = 0.37
 
 
-def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Answer:
+def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Adjusted:
     """As the stage does it, from starts that are near; intrinsics off by what is usual."""
     rng = np.random.default_rng(5)
     cameras, priors = [], []
@@ -50,26 +50,16 @@ def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bo
         priors.append(prior_of(cameras[-1]) if lens_off else prior_of(cameras[-1], HELD))
     move = np.eye(4) if world is None else world
     scene = Scene(
-        move @ problem.world_from_rig,
-        problem.rig_from_camera,
-        tuple(cameras),
-        apply(move, problem.points_in_world),
+        world_from_rig=move @ problem.world_from_rig,
+        rig_from_camera=problem.rig_from_camera,
+        cameras=tuple(cameras),
+        points_in_world=apply(move, problem.points_in_world),
     )
-    on_wrist = problem.kind == "wrists"
-    mounts = np.array([False, *[on_wrist] * (len(cameras) - 1)])
-    imaged = adjust_images(scene, problem.pictures, Freedom(tuple(priors), mounts))
+    mounts = [False, *[problem.kind == "wrists"] * (len(cameras) - 1)]
     unmove = scale_translation(inverse(move), problem.scale)
-    ties = [
-        Tie(
-            np.arange(COUNT) + COUNT * k,
-            poses,
-            smooth_errors(poses),
-            (x, z @ unmove),
-            problem.kind == "carried",
-        )
-        for k, (poses, (x, z)) in enumerate(zip(problem.reported, problem.starts, strict=True))
-    ]
-    return tied(imaged, ties, problem.scale)
+    arms = [replace(arm, start=(arm.start[0], arm.start[1] @ unmove)) for arm in problem.arms]
+    freedom = Freedom.of(cameras, priors, len(problem.observations.rig), mounts)
+    return adjust(scene, problem.observations, freedom, arms, scale=problem.scale)
 
 
 WANTED = {
@@ -130,16 +120,27 @@ def test_the_frame_of_the_pictures_does_not_matter():
     assert np.allclose(np.sqrt(np.diag(of_other)), std, rtol=0.02)
 
 
-def test_pictures_alone_leave_one_similarity_open():
+def test_images_alone_leave_one_similarity_open():
     problem = cell_problem("wrists", "white", COUNT, seed=2, points=100)
-    priors = tuple(prior_of(camera, HELD) for camera in problem.cameras)
-    scene = Scene(problem.world_from_rig, problem.rig_from_camera, problem.cameras, problem.points_in_world)
-    freedom = Freedom(priors, np.array([False, True]))
-    found = adjust_images(scene, problem.pictures, freedom)
-    values = np.linalg.eigvalsh(found.covariance)
-    assert (values > 1e-6 * values[-1]).sum() <= len(values) - 7
-    unseen = similarities(found.scene, freedom)
-    assert np.linalg.matrix_rank(unseen) == 7
+    priors = [prior_of(camera, HELD) for camera in problem.cameras]
+    freedom = Freedom.of(problem.cameras, priors, len(problem.observations.rig), [False, True])
+    scene = Scene(
+        world_from_rig=problem.world_from_rig,
+        rig_from_camera=problem.rig_from_camera,
+        cameras=problem.cameras,
+        points_in_world=problem.points_in_world,
+    )
+    scene = at_start(scene, freedom)
+    images = ImageProblem.of(scene, problem.observations, freedom)
+    found = evidence(scene, images, noise_of(scene, view_of(scene, images), images))
+    unseen = np.linalg.qr(similarities(scene, freedom))[0]
+    assert unseen.shape[1] == 7
+    # Along it there is what keeps the world in place, alike in all directions, and nothing else.
+    along = unseen.T @ found.information @ unseen
+    held = along[0, 0]
+    assert np.allclose(along, held * np.eye(7), rtol=1e-6, atol=1e-6 * held)
+    values = np.linalg.eigvalsh(found.information - held * unseen @ unseen.T)
+    assert (values > 1e-9 * values[-1]).sum() == len(values) - 7
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ START_NOISE = (1e-3, np.radians(0.2))
 SIZES_SETTLED = 0.01
 """Relative change of the sizes of errors, of pixels and of the robot, from one round to the next that ends them."""
 STEP_SETTLED = 1e-4
-"""Squared standard deviations that the arms' unknowns move by in the last round."""
+"""Squared standard deviations that the arms' unknowns move by in a round, or a step, that ends them."""
 ROUNDS, STEPS = 12, 30
 LARGEST_ROTATION = 0.5
 """rad, and of the logarithm of scale, in one step."""
@@ -183,12 +183,13 @@ def adjust(
     arms: Sequence[ArmPoses],
     noise: tuple[float, float] | None = None,
     prior: RigInformation | None = None,
+    scale: float = 1.0,
 ) -> Adjusted:
-    """Adjust images and robots from a scene that is near, in about metres.
+    """Adjust images and robots from a scene that is near.
 
     Points that fewer than two images see are left out. `noise` (m, rad) is that of the gripper poses, at least; it is
     estimated with the rest, and all arms are taken to be equally exact. `prior` is what others than the images and the
-    robots know of the first rigs.
+    robots know of the first rigs. `scale` is about that of the scene (metres per unit).
     """
     problem = ImageProblem.of(scene, observations, freedom, prior)
     scene = at_start(replace(scene, points_in_world=scene.points_in_world[problem.points]), freedom)
@@ -206,7 +207,7 @@ def adjust(
         scene, view, damping = minimised(placed.scene, problem, pixels, robots, damping)
         pixels = noise_of(scene, view, problem, pixels)
         given = Given(evidence=evidence(scene, problem, pixels), arms=tuple(arms), noise=noise)
-        placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes)
+        placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
         equations, _ = _equations(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
@@ -218,7 +219,7 @@ def adjust(
 
 def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = None) -> Adjusted:
     """Evidence and arms together, averaged over the sizes of the robots' errors, from a place that is near."""
-    placed, log_sizes, _ = _most_likely(placed, given, log_sizes)
+    placed, log_sizes, _ = _most_likely(placed, given, log_sizes, 1e-12)
     equations, region = _equations(placed, given)
     log_sizes, information = most_likely(equations, log_sizes)
     found = posterior(equations, log_sizes, information, region)
@@ -234,9 +235,12 @@ def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = 
 
 
 def _most_likely(
-    placed: Placed, given: Given, log_sizes: Float[ndarray, " c"] | None
+    placed: Placed, given: Given, log_sizes: Float[ndarray, " c"] | None, settled: float
 ) -> tuple[Placed, Float[ndarray, " c"], float]:
-    """The arms' unknowns at the likeliest sizes of errors, and how far they moved in squared standard deviations."""
+    """The arms' unknowns at the likeliest sizes of errors, and how far they moved in squared standard deviations.
+
+    It ends with a step of less than `settled` of these.
+    """
     robots, total = _of_robots(given.arms), 0.0
     rotations = np.r_[SCALE, *(_columns(arm)[[3, 4, 5, 9, 10, 11]] for arm in range(len(given.arms)))]
     for _ in range(STEPS):
@@ -248,7 +252,7 @@ def _most_likely(
         placed = _moved(placed, step, given)
         moved = float(((solution.information_root.T @ step) ** 2).sum())
         total += moved
-        if moved < 1e-12:
+        if moved < settled:
             break
     assert log_sizes is not None
     return placed, log_sizes, total

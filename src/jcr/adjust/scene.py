@@ -4,6 +4,7 @@ A rig is what moves as one: the wrist of an arm at one instant with all cameras 
 alone is a rig an image. `world` has any origin and unit: images leave one similarity of it open.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -39,14 +40,9 @@ class NuisancePrior:
     moves from the image's top to its bottom in focal lengths, as a rolling shutter does it.
     """
 
-    directions: Float[ndarray, "2n e"]
-    """Of the logarithms of all n images, then of their shears."""
+    directions: Float[ndarray, "r e"]
+    """r = 2n: of the logarithms of all n images, then of their shears."""
     std: Float[ndarray, " e"]
-
-    @staticmethod
-    def none(images: int) -> "NuisancePrior":
-        """Every image is as its camera is."""
-        return NuisancePrior(np.zeros((2 * images, 0)), np.zeros(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +60,22 @@ class Freedom:
     nuisance: NuisancePrior
     start: tuple[Intrinsics, ...]
     """Of each camera, where its prior has its middle."""
+
+    @staticmethod
+    def of(
+        cameras: Sequence[Intrinsics],
+        priors: Sequence[IntrinsicsPrior],
+        images: int,
+        mounts: Sequence[bool] | Bool[ndarray, " c"] | None = None,
+    ) -> "Freedom":
+        """Cameras about where they are now, with every one of so many images as its camera is; no mount moves but those
+        of `mounts`."""
+        return Freedom(
+            intrinsics=tuple(priors),
+            mounts=np.zeros(len(cameras), bool) if mounts is None else np.asarray(mounts, bool),
+            nuisance=NuisancePrior(np.zeros((2 * images, 0)), np.zeros(0)),
+            start=tuple(cameras),
+        )
 
     @property
     def std(self) -> Float[ndarray, " l"]:

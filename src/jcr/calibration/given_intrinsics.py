@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
+from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.equation import Poses

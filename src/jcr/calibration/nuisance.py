@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.stats import f as f_distribution
 
-from jcr.calibration.bundle import Adjusted
 from jcr.adjust.elimination import Derivatives, with_points_held, without_points
+from jcr.calibration.bundle import Adjusted
 from jcr.camera import by_parameters, by_point, parameter_names, parameters, project
 from jcr.geometry import step_between
 from jcr.records import Intrinsics

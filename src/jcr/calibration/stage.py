@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
 from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.depth_check import depth_check
 from jcr.calibration.given_intrinsics import lens_doubt
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined

@@ -3,7 +3,7 @@
 Seen from the carried thing the camera moves as if the base had it in its hand: with the inverse gripper poses everything
 that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only the robot's
 errors are not those of inverse poses, so that the answer and its covariance are found once more with the errors where
-they are (ties.py).
+they are (adjust/robots.py).
 """
 
 from dataclasses import replace
@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from jcr.adjust.intrinsics_prior import prior_about
+from jcr.adjust.robots import ArmPoses, adjust
+from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import MIN_OBSERVATIONS, calibrate, of_images
 from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
-from jcr.cell.bundle import Freedom, Pictures, Scene, adjust_images
 from jcr.cell.found import CameraFound
-from jcr.cell.ties import Tie, tied
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, scale_translation
 from jcr.handeye.solve import judged, solve_hand_eye
@@ -88,24 +88,32 @@ def refined(
         return found
     lens = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
     each = np.arange(len(used))
-    imaged = adjust_images(
-        Scene(
-            rigs,
-            np.eye(4)[None],
-            (reconstruction.intrinsics,),
-            found.scale * own.points_in_recon.astype(float),
-        ),
-        Pictures(each, np.zeros_like(each), own.image, own.x_px, own.point),
-        Freedom((lens,), np.array([False])),
-    )
     systematic, _, _ = robot_errors(capture, options)
     among = (6 * rows[:, None] + np.arange(6)).ravel()
     noise = None
     if options.robot_noise is not None:
         noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
     start = found.gripper_from_camera, found.base_from_recon
-    tie = Tie(each, capture.base_from_gripper[rows], systematic[np.ix_(among, among)], start, exchanged=True)
-    answer = tied(imaged, [tie], 1.0, noise)
+    answer = adjust(
+        Scene(
+            world_from_rig=rigs,
+            rig_from_camera=np.eye(4)[None],
+            cameras=(reconstruction.intrinsics,),
+            points_in_world=found.scale * own.points_in_recon.astype(float),
+        ),
+        Observations(rig=each, camera=np.zeros_like(each), image=own.image, x_px=own.x_px, point=own.point),
+        Freedom.of((reconstruction.intrinsics,), (lens,), len(each)),
+        [
+            ArmPoses(
+                rigs=each,
+                base_from_gripper=capture.base_from_gripper[rows],
+                systematic=systematic[np.ix_(among, among)],
+                start=start,
+                exchanged=True,
+            )
+        ],
+        noise,
+    )
     more = np.zeros((7, 7)) if found.lens_shift is None else np.outer(found.lens_shift, found.lens_shift)
     robot = RobotNoise(
         *answer.noise, noise is None, noise, found.robot_noise.systematic, answer.systematic_left

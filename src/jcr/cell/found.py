@@ -12,7 +12,7 @@ from jcr.geometry import skew
 from jcr.records import Intrinsics, Mount
 
 if TYPE_CHECKING:
-    from jcr.cell.ties import Answer, Placed
+    from jcr.adjust.robots import Adjusted, Placed
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class CellFound:
 
     cameras: tuple[CameraFound, ...]
     arms: tuple[ArmFound, ...]
-    answer: "Answer | None"
+    answer: "Adjusted | None"
     """None where no camera could be placed."""
     of: "dict[str, Callable[[Placed], Float[ndarray, '4 4']]]" = field(default_factory=dict)
     """By camera that was placed: its parent_from_camera, wherever `answer` puts everything."""

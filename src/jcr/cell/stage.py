@@ -1,8 +1,8 @@
 """Further cameras of a cell, placed with the calibration of the capture's own: images first, then robots.
 
-Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together
-(bundle.py), and the arms' poses tie them to their bases (ties.py). The calibration of the capture's own camera stays as
-it was found: what is said here of others rests on the same images.
+Every image of another camera is localised in the reconstruction (localise.py); all images are adjusted together with
+the arms' poses (adjust/). The calibration of the capture's own camera stays as it was found: what is found here of
+others rests on the same images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,13 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.adjust.images import RigInformation, median_reprojection_px
 from jcr.adjust.intrinsics_prior import prior_about
+from jcr.adjust.robots import Adjusted, ArmPoses, Placed, adjust
+from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import MIN_OBSERVATIONS, of_images
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
-from jcr.cell.bundle import Freedom, Imaged, Pictures, Scene, adjust_images
 from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
 from jcr.cell.localise import (
     LEAST_SPREAD,
@@ -30,7 +32,6 @@ from jcr.cell.localise import (
     localised,
     spread,
 )
-from jcr.cell.ties import Answer, Placed, Tie, tied
 from jcr.geometry import inverse, motion_length, scale_translation, step_between
 from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
@@ -103,11 +104,7 @@ def place_cameras(
             placed.append(member)
     if not placed:
         return CellFound(tuple(failed), (), None)
-    imaged, medians = _adjusted(capture, reconstruction, hand_eye, known, placed, rigs)
-    noise = None
-    if options.robot_noise is not None:
-        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
-    answer = tied(imaged, rigs.ties(options), 1.0, noise)
+    answer, medians = _adjusted(capture, reconstruction, hand_eye, known, placed, rigs, options)
     of = {member.camera.name: _place_of(member, c) for c, member in enumerate(placed, start=1)}
     cameras = {
         member.camera.name: _found(member, c, answer, of[member.camera.name], medians, hand_eye)
@@ -316,19 +313,24 @@ class _Rigs:
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
         return _Member(seen.without(why), rig, None, len(self.arms))
 
-    def ties(self, options: CalibrateOptions) -> list[Tie]:
+    def arm_poses(self, options: CalibrateOptions) -> list[ArmPoses]:
         """The arms, the capture's own first."""
         systematic, _, _ = robot_errors(self._capture, options)
         own = (6 * self._rows[:, None] + np.arange(6)).ravel()
         hand_eye = self._hand_eye
-        first = Tie(
-            np.arange(len(self._rows)),
-            self._capture.base_from_gripper[self._rows],
-            systematic[np.ix_(own, own)],
-            (hand_eye.gripper_from_camera, hand_eye.base_from_recon),
+        first = ArmPoses(
+            rigs=np.arange(len(self._rows)),
+            base_from_gripper=self._capture.base_from_gripper[self._rows],
+            systematic=systematic[np.ix_(own, own)],
+            start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
         )
         others = [
-            Tie(rigs, gripper, smooth_errors(gripper), (found.gripper_from_camera, found.base_from_recon))
+            ArmPoses(
+                rigs=rigs,
+                base_from_gripper=gripper,
+                systematic=smooth_errors(gripper),
+                start=(found.gripper_from_camera, found.base_from_recon),
+            )
             for rigs, gripper, found in self._of_arms
         ]
         return [first, *others]
@@ -341,14 +343,15 @@ def _adjusted(
     known: Known,
     members: Sequence[_Member],
     rigs: _Rigs,
-) -> tuple[Imaged, dict[tuple[str, int], float]]:
+    options: CalibrateOptions,
+) -> tuple[Adjusted, dict[tuple[str, int], float]]:
     """All images adjusted together, and the median reprojection error (px) of each camera's by their number."""
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
-    held = None
+    prior = None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not believed here either.
     if hand_eye.refinement is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
-        held, own = _as_given(reconstruction, hand_eye), replace(own, **NOTHING)
+        prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
     rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
     picture, x_px, point = [own.image], [own.x_px], [own.point]
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
@@ -374,27 +377,35 @@ def _adjusted(
     ]
     first = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
     movable = np.array([False, *(member.rig_from_camera is not None for member in members)])
-    imaged = adjust_images(
+    noise = None
+    if options.robot_noise is not None:
+        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
+    cameras = (reconstruction.intrinsics, *lenses)
+    adjusted = adjust(
         Scene(
-            np.stack(rigs.poses),
-            np.stack([np.eye(4), *mounts]),
-            (reconstruction.intrinsics, *lenses),
-            np.concatenate(points),
+            world_from_rig=np.stack(rigs.poses),
+            rig_from_camera=np.stack([np.eye(4), *mounts]),
+            cameras=cameras,
+            points_in_world=np.concatenate(points),
         ),
-        Pictures(
-            np.array(rig),
-            np.array(camera),
-            np.concatenate(picture),
-            np.concatenate(x_px),
-            np.concatenate(point),
+        Observations(
+            rig=np.array(rig),
+            camera=np.array(camera),
+            image=np.concatenate(picture),
+            x_px=np.concatenate(x_px),
+            point=np.concatenate(point),
         ),
-        Freedom((first, *priors), movable),
-        held,
+        Freedom.of(cameras, (first, *priors), len(rig), movable),
+        rigs.arm_poses(options),
+        noise,
+        prior,
     )
-    return imaged, {key: float(imaged.reprojection_px[row]) for key, row in number.items()}
+    evidence = adjusted.given.evidence
+    medians = median_reprojection_px(evidence.view, evidence.problem)
+    return adjusted, {key: float(medians[row]) for key, row in number.items()}
 
 
-def _as_given(reconstruction: Reconstruction, hand_eye: HandEye) -> Float[ndarray, "r r"]:
+def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:
     """Information on the used images' poses, where other than features found in the images decided them."""
     rows = np.flatnonzero(hand_eye.inliers)
     spread_of = np.zeros((6 * len(rows), 6 * len(rows)))
@@ -402,7 +413,8 @@ def _as_given(reconstruction: Reconstruction, hand_eye: HandEye) -> Float[ndarra
         unit = np.tile(np.repeat([hand_eye.scale, 1.0], 3), len(rows))
         among = (6 * rows[:, None] + np.arange(6)).ravel()
         spread_of = unit[:, None] * evidence.covariance[np.ix_(among, among)] * unit
-    return np.linalg.inv(spread_of + EXACT**2 * np.eye(len(spread_of)))
+    information = np.linalg.inv(spread_of + EXACT**2 * np.eye(len(spread_of)))
+    return RigInformation(known.recon_from_camera, information, np.zeros(len(information)))
 
 
 def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4"]]:
@@ -420,7 +432,7 @@ def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4
 def _found(
     member: _Member,
     c: int,
-    answer: Answer,
+    answer: Adjusted,
     parent_from_camera: Callable[[Placed], Float[ndarray, "4 4"]],
     medians: dict[tuple[str, int], float],
     hand_eye: HandEye,
@@ -428,13 +440,7 @@ def _found(
     camera = member.camera
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
-    freedom = answer.imaged.freedom
-    lens, columns = freedom.lenses[c], freedom.lens_columns[c]
-    first = 12 * len(answer.placed.x) + 1
-    of_lens = answer.covariance[
-        first + columns.start : first + columns.stop, first + columns.start : first + columns.stop
-    ]
-    lens_std = np.sqrt(np.diag(lens.directions @ of_lens @ lens.directions.T))
+    lens_std = np.sqrt(np.diag(answer.intrinsics_covariance(c)))
     pictures = tuple(
         PictureFound(image, reason is None, count, medians.get((camera.name, k)), reason)
         for k, (image, count, reason) in enumerate(
@@ -463,7 +469,9 @@ def _found(
     return replace(found, converged=doubt is None, warnings=tuple(warnings))
 
 
-def _by_faults(answer: Answer, derivative: Float[ndarray, "6 p"], hand_eye: HandEye) -> Float[ndarray, "6 6"]:
+def _by_faults(
+    answer: Adjusted, derivative: Float[ndarray, "6 p"], hand_eye: HandEye
+) -> Float[ndarray, "6 6"]:
     """What the calibration of the capture's own camera counts beside its images and robot, carried over.
 
     Wrong intrinsics, a slip: what widens gripper_from_camera and scale there moves along with all that varies with them.

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.robots import ArmPoses
+from jcr.adjust.scene import Observations
 from jcr.camera import project
-from jcr.cell.bundle import Pictures
 from jcr.geometry import (
     apply,
     apply_similarity,
@@ -28,6 +29,7 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.equation import predict, residuals
 from jcr.handeye.known_scale import FREE, fit_known_scale
 from jcr.handeye.robots import Arm, Joints
+from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
 from jcr.simulate.observations import LENS
 from jcr.simulate.poses import random_hand_eye
@@ -62,7 +64,7 @@ class CellProblem:
     kind: Kind
     reported: tuple[Float[ndarray, "n 4 4"], ...]
     """base_from_gripper of each arm."""
-    pictures: Pictures
+    observations: Observations
     """Rigs are those of the first arm in order, then of the second, then fixed cameras."""
     world_from_rig: Float[ndarray, "m 4 4"]
     """In a frame and unit of their own, as a reconstruction has them."""
@@ -75,6 +77,21 @@ class CellProblem:
     """gripper_from_camera, and of a second one or arm; base_from_camera, base1_from_base2, gripper_from_object."""
     starts: tuple[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]], ...]
     """True X and base_from_world of each arm, where a search may start."""
+
+    @property
+    def arms(self) -> list[ArmPoses]:
+        """As an adjustment takes them, their errors smooth over the poses."""
+        count = len(self.reported[0])
+        return [
+            ArmPoses(
+                rigs=np.arange(count) + count * k,
+                base_from_gripper=poses,
+                systematic=smooth_errors(poses),
+                start=start,
+                exchanged=self.kind == "carried",
+            )
+            for k, (poses, start) in enumerate(zip(self.reported, self.starts, strict=True))
+        ]
 
 
 def cell_problem(
@@ -279,7 +296,13 @@ def _seen(
     return CellProblem(
         kind,
         tuple(reported),
-        Pictures(rig_of, camera_of, np.concatenate(picture), np.concatenate(x_px), np.concatenate(point)),
+        Observations(
+            rig=rig_of,
+            camera=camera_of,
+            image=np.concatenate(picture),
+            x_px=np.concatenate(x_px),
+            point=np.concatenate(point),
+        ),
         in_world(rigs),
         np.stack([transform(mount[:3, :3], mount[:3, 3] / scale) for mount in mounts]),
         apply_similarity(world_from_true, 1.0, x_in_true) / scale,
