@@ -88,6 +88,8 @@ class Adjusted:
     """Of steps as `moved` takes them."""
     budget: Budget
     """Of the first arm's X and scale, by what they come from."""
+    most_likely: Placed
+    """Before the averaging, where `equations` and the evidence are."""
     log_sizes: Float[ndarray, " c"]
     """Of the robots' errors, most likely (components.py)."""
     equations: Equations
@@ -208,7 +210,7 @@ def adjust(
         pixels = noise_of(scene, view, problem, pixels)
         given = Given(evidence=evidence(scene, problem, pixels), arms=tuple(arms), noise=noise)
         placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
-        equations, _ = _equations(placed, given)
+        equations, _ = equations_of(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
         change = max(change, float(np.abs(np.log(pixels.sigma_px / before[0].sigma_px)).max()))
@@ -220,7 +222,7 @@ def adjust(
 def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = None) -> Adjusted:
     """Evidence and arms together, averaged over the sizes of the robots' errors, from a place that is near."""
     placed, log_sizes, _ = _most_likely(placed, given, log_sizes, 1e-12)
-    equations, region = _equations(placed, given)
+    equations, region = equations_of(placed, given)
     log_sizes, information = most_likely(equations, log_sizes)
     found = posterior(equations, log_sizes, information, region)
     more = _by_features(found.covariance, given)
@@ -228,6 +230,7 @@ def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = 
         placed=_moved(placed, found.step, given),
         covariance=found.covariance + more,
         budget=replace(found.budget, intrinsics=found.budget.intrinsics + more[:7, :7]),
+        most_likely=placed,
         log_sizes=log_sizes,
         equations=equations,
         given=given,
@@ -244,7 +247,7 @@ def _most_likely(
     robots, total = _of_robots(given.arms), 0.0
     rotations = np.r_[SCALE, *(_columns(arm)[[3, 4, 5, 9, 10, 11]] for arm in range(len(given.arms)))]
     for _ in range(STEPS):
-        equations, _ = _equations(placed, given)
+        equations, _ = equations_of(placed, given)
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
         solution = solve(equations, log_sizes)
         step = np.r_[solution.step[:robots], np.zeros(len(given.free))]
@@ -310,7 +313,7 @@ def _prior(arms: Sequence[ArmPoses]) -> Float[ndarray, "u u"]:
     return prior
 
 
-def _equations(placed: Placed, given: Given) -> tuple[Equations, Region]:
+def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     """Residuals of the reported gripper poses, linear in all unknowns; what the images show of the rigs is in them."""
     images, by_arm, free = given.evidence, given.by_arm, given.free
     residual, jacobian, by_rig, systematic = _of_poses(placed, given.arms)

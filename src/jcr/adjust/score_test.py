@@ -1,0 +1,229 @@
+"""What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
+
+The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length and a
+shear for each image by itself. A hypothesis is a few combinations of these columns. How much freeing them would lower the
+cost, at one Gauss-Newton step, over the dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil. Soc.
+44, 1948), here beside F, for the robot pose noise was estimated from few residuals. The same step shows how large they are
+and how far X would move; the adjustment with them free (`freed`) is what they come to.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.stats import f as f_distribution
+
+from jcr.adjust.images import ImageEvidence, evidence
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.robots import Adjusted, equations_of
+from jcr.adjust.scene import Freedom, NuisancePrior
+from jcr.camera import parameter_names
+from jcr.handeye.components import POSES, solve
+from jcr.records import Intrinsics
+
+WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
+"""Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
+WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL = 1.0, 0.3, 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alternatives:
+    """The equations of every column that may be freed; what was adjusted is eliminated.
+
+    The columns are the parameters of the wrist camera in `units`, the logarithms of the images' focal lengths over the
+    camera's, and their shears in focal lengths.
+    """
+
+    hessian: Float[ndarray, "e e"]
+    right: Float[ndarray, " e"]
+    x_by_column: Float[ndarray, "6 e"]
+    """How far X moves with each column."""
+    images: int
+    dispersion: float
+    """Variance of what pulls at a parameter, over what the weights say."""
+    names: tuple[str, ...]
+    """Of the camera's parameters."""
+    units: Float[ndarray, " q"]
+    """What each of them counts in: focal lengths in themselves, the centre in widths."""
+    distance: Float[ndarray, " m"]
+    """Median depth of the points of each image (m)."""
+
+    @property
+    def columns(self) -> int:
+        """That may be freed."""
+        return len(self.right)
+
+    @property
+    def freedom(self) -> int:
+        """Of the robot's residuals, by which its noise was estimated: fewer than the images have by far."""
+        return max(6 * self.images - POSES, 1)
+
+    def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
+        """Combinations: these parameters of the camera."""
+        return np.eye(self.columns)[:, [self.names.index(name) for name in names]]
+
+    def common_focal(self) -> Float[ndarray, "e 1"]:
+        """Combination: both focal lengths by one factor."""
+        return self.of_camera(("fx", "fy")).sum(1, keepdims=True)
+
+    def focal_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Combinations: the logarithm of each image's focal length moves by its share."""
+        return self._of_images(0, shares)
+
+    def shear_of_images(self, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        """Combinations: x of each image moves by its share of the focal length over its height."""
+        return self._of_images(1, shares)
+
+    def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
+        out = np.zeros((self.columns, shares.shape[1]))
+        first = len(self.names) + block * self.images
+        out[first : first + self.images] = shares
+        return out
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What freeing some combinations would do."""
+
+    log_p: float
+    """Of a gain like this or larger where there is nothing."""
+    covariance: Float[ndarray, "p p"]
+    """Of the combinations."""
+    shift: Float[ndarray, "6"]
+    """The step of X that comes with it, gripper axes."""
+
+
+def alternatives(adjusted: Adjusted) -> Alternatives:
+    """The columns and equations about an adjustment of a wrist camera, a rig an image."""
+    given = adjusted.given
+    problem, camera = given.evidence.problem, given.evidence.scene.cameras[0]
+    names, units, m = parameter_names(camera), units_of(camera), len(problem.observations.rig)
+    freedom, own = problem.freedom, problem.freedom.intrinsics[0]
+    weak = np.r_[weak_of(camera), [WEAK_FOCAL] * m, [WEAK_SHEAR] * m]
+    all_free = Freedom(
+        intrinsics=(
+            IntrinsicsPrior(
+                np.column_stack([own.directions, np.diag(units)]), np.r_[own.std, weak[: len(names)]]
+            ),
+        ),
+        mounts=freedom.mounts,
+        nuisance=NuisancePrior(np.eye(2 * m), weak[len(names) :]),
+        start=freedom.start,
+    )
+    scene = given.evidence.scene
+    steps = scene.camera_steps[freedom.intrinsics_columns[0]]
+    steps = np.concatenate([steps, np.zeros(len(names)), scene.nuisances(freedom).ravel()])
+    wider = evidence(
+        replace(scene, camera_steps=steps), replace(problem, freedom=all_free), given.evidence.noise
+    )
+    placed = replace(adjusted.most_likely, scene=wider.scene)
+    equations, _ = equations_of(placed, replace(given, evidence=wider))
+    solution = solve(equations, adjusted.log_sizes)
+    hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
+    right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
+    # What was adjusted: X, scale, base_from_world, and the camera as far as it was free.
+    base = POSES + len(own.std)
+    size = 1 / np.sqrt(hessian.diagonal())
+    kept, rest = slice(0, base), slice(base, None)
+    scaled = size[kept, None] * hessian[kept, kept] * size[kept]
+    by_column = size[kept, None] * np.linalg.solve(scaled, size[kept, None] * hessian[kept, rest])
+    depth, image = wider.view.depth, problem.observations.image
+    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(m)])
+    return Alternatives(
+        hessian=hessian[rest, rest] - hessian[rest, kept] @ by_column,
+        right=right[rest] - by_column.T @ right[kept],
+        x_by_column=-by_column[:6],
+        images=m,
+        dispersion=_dispersion(given.evidence),
+        names=names,
+        units=units,
+        distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
+    )
+
+
+def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
+    """What its parameters count in: focal lengths in themselves, the centre in widths."""
+    distortion = [1.0] * (len(parameter_names(camera)) - 4)
+    return np.array([camera.fx, camera.fy, camera.width, camera.width, *distortion])
+
+
+def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
+    """Standard deviations of its parameters, in their units, that only keep finite what the images cannot see."""
+    return np.array([WEAK.get(name, WEAK_DISTORTION) for name in parameter_names(camera)])
+
+
+def freed(freedom: Freedom, combinations: Float[ndarray, "e p"], camera: Intrinsics) -> Freedom:
+    """A wrist camera's freedom with combinations of the columns of `Alternatives` free too.
+
+    Each combination is of the camera's parameters, in the units of `camera`, or of its images', not of both.
+    """
+    q = len(parameter_names(camera))
+    of_camera, of_images = combinations[:q], combinations[q:]
+    is_of_camera = np.abs(of_camera).sum(0) > 0
+    m = len(of_images) // 2
+    own = freedom.intrinsics[0]
+    of_camera, of_images = of_camera[:, is_of_camera], of_images[:, ~is_of_camera]
+    weak = np.repeat([WEAK_FOCAL, WEAK_SHEAR], m)
+    return replace(
+        freedom,
+        intrinsics=(
+            IntrinsicsPrior(
+                np.column_stack([own.directions, units_of(camera)[:, None] * of_camera]),
+                np.r_[own.std, _std(of_camera, weak_of(camera))],
+            ),
+        ),
+        nuisance=NuisancePrior(of_images, _std(of_images, weak)),
+    )
+
+
+def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
+    """Of combinations, where each of what they combine has one."""
+    return 1 / np.sqrt(((combinations / of_each[:, None]) ** 2).sum(0))
+
+
+def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
+    """An orthonormal basis of what the combinations free; some may say the same."""
+    u, size, _ = np.linalg.svd(combinations, full_matrices=False)
+    return u[:, size > 1e-9 * size.max(initial=1e-300)]
+
+
+def tested(
+    equations: Alternatives, free: Float[ndarray, "e p"], beside: Float[ndarray, "e q"] | None = None
+) -> Tested:
+    """The test of freeing the combinations `free`, with those of `beside` free under both hypotheses."""
+    beside = np.zeros((equations.columns, 0)) if beside is None else beside
+    q, both = beside.shape[1], np.concatenate([beside, free], axis=1)
+    fewer, more = spanned(beside), spanned(both)
+    without, gain_without, _ = _step(equations, fewer)
+    step, gain, covariance = _step(equations, more)
+    spread, p = equations.dispersion, max(more.shape[1] - fewer.shape[1], 1)
+    to_value = np.linalg.pinv(both)[q:] @ more
+    return Tested(
+        float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
+        spread * to_value @ covariance @ to_value.T,
+        equations.x_by_column @ (more @ step - fewer @ without),
+    )
+
+
+def _step(
+    equations: Alternatives, free: Float[ndarray, "e r"]
+) -> tuple[Float[ndarray, " r"], float, Float[ndarray, "r r"]]:
+    """How far these combinations go where they are free, what it gains, and the covariance."""
+    covariance = np.linalg.inv(free.T @ equations.hessian @ free)
+    right = free.T @ equations.right
+    step = covariance @ right
+    return step, float(right @ step), covariance
+
+
+def _dispersion(images: ImageEvidence) -> float:
+    """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
+    Liang and Zeger, Biometrika 73, 1986)."""
+    problem, view = images.problem, images.view
+    weight = images.noise.weights(view.residual_px, view.depth, problem.layout.camera)
+    pull = weight[:, None] * view.residual_px
+    taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
+    share = max(1 - taken / (2 * len(weight)), 0.1)
+    scale = 2 * weight.sum() * share
+    clustered = sum(float((np.bincount(problem.layout.cell, along) ** 2).sum()) for along in pull.T)
+    return max(float((pull**2).sum()), clustered) / scale
