@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Literal
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.words import shortfall
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
@@ -27,6 +26,7 @@ from jcr.extras import extra
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
+from jcr.records.words import sentence
 from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 
 STATE = "batch.json"
@@ -135,7 +135,9 @@ def run_one(task: Task) -> Row:
             content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
         if row.status != "done":
-            row = replace(row, reason=reason or content.doubt or shortfall(content) or "")
+            row = replace(
+                row, reason=reason or content.doubt or (sentence(content.short) if content.short else "")
+            )
         write_text(
             task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
         )

@@ -7,13 +7,12 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.words import angles_in_words
+from jcr.calibration.robot_errors import angle_finding, robot_errors
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
@@ -23,6 +22,7 @@ from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs, Reconstruction
+from jcr.records.words import remedy, sentence, unobservable
 
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
@@ -89,7 +89,7 @@ def check(
         )
     if isinstance(capture, Capture):
         _, _, unused = robot_errors(capture, CalibrateOptions())
-        remarks += [] if unused is None else [unused]
+        remarks += [] if unused is None else [sentence(unused)]
     held, quick = None, False
     if isinstance(capture, PosePairs):
         held = _held_against(gripper, capture, robot_noise)
@@ -105,12 +105,13 @@ def check(
     hand_eye, ratio = (None, None) if held is None else (held.hand_eye, held.ratio)
     faults = [] if held is None else [*held.faults]
     if ratio is not None:
-        remarks += angles_in_words(*ratio)
+        angles = angle_finding(*ratio)
+        remarks += [] if angles is None else [sentence(angles)]
     trusted = hand_eye is not None and hand_eye.converged
     x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
     seen = observability(gripper, x) if hand_eye is None or quick else hand_eye.observability
     if hand_eye is None:
-        faults += [f"{name}; {cure}" for name, cure in zip(seen.unobservable, seen.advice, strict=False)]
+        faults += [f"{unobservable(one)}; {remedy(one)}" for one in seen.findings]
     noise = robot_noise or ASSUMED_NOISE
     if hand_eye is not None and trusted and robot_noise is None:
         noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
@@ -154,7 +155,7 @@ def _registered(
         if size_px is not None:
             return None, []
         board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return None, [str(error)] if board is None else [str(error), board]
+        return None, [str(error)] if board is None else [str(error), sentence(board)]
     return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise), [
         *found.warnings,
         *found.notes,
@@ -169,7 +170,7 @@ def _held_against(
     camera = found.recon_from_camera
     hand_eye, ratio = solve_hand_eye(used, camera, robot_noise=robot_noise), None
     reading = better_reading(used, camera)
-    faults = [] if reading is None else [explained(reading)]
+    faults = [] if reading is None else [sentence(convention_finding(reading))]
     faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
     if hand_eye.converged and hand_eye.inliers.sum() >= 3:
         ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])

@@ -15,7 +15,6 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file, 
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.stage import is_one
-from jcr.calibration.words import shortfall
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
@@ -27,6 +26,7 @@ from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
 from jcr.reconstruct.board_in_view import proposed
 from jcr.records import Capture, CellCamera, PosePairs
+from jcr.records.words import sentence
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
 from jcr.run_folder import MOVING, RunFolder, State, held, state_of
@@ -228,9 +228,9 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
     content = calibration_file(
         capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
     )
-    if not options.reconstruct.board and (not content.converged or shortfall(content) is not None):
+    if not options.reconstruct.board and (not content.converged or content.short is not None):
         board = proposed([read_image(capture.folder / name) for name in capture.images])
-        content = content.model_copy(update={"warnings": [*content.warnings, *filter(None, [board])]})
+        content = content if board is None else content.with_findings(board)
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
 
@@ -358,7 +358,7 @@ def _deepened(
 def _with_board(error: NothingFoundError, capture: Capture) -> NothingFoundError:
     """The error with the --board that would help, where the images show a board."""
     proposal = proposed([read_image(capture.folder / name) for name in capture.images])
-    return error if proposal is None else NothingFoundError(f"{error}; {proposal}", error.attempts)
+    return error if proposal is None else NothingFoundError(f"{error}; {sentence(proposal)}", error.attempts)
 
 
 def _fail(

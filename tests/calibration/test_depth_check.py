@@ -19,13 +19,18 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Reconstruction, ScaleEvidence, Tracks
 from jcr.represent.measured_depth import with_measured_depth
 
 LENS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
 """Too long by 3 %; sigma 2 mm at 0.7 m."""
 X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
+
+
+def with_depth(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> HandEye:
+    found = depth_check(capture, reconstruction, hand_eye)
+    return replace(hand_eye, scale_evidence=ScaleEvidence(depth=found))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +79,9 @@ def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple
     noise = np.hypot(check.noise_m, check.noise_per_m * depth**2)
     assert noise == pytest.approx(NOISE_PER_M * depth**2, rel=0.35)
     assert (check.std_m(depth) > noise).all()
-    content = calibration_file(capture, reconstruction, replace(hand_eye, depth_check=check), {}, "0")
+    content = calibration_file(
+        capture, reconstruction, replace(hand_eye, scale_evidence=ScaleEvidence(depth=check)), {}, "0"
+    )
     said = f"depth camera: its lengths are {check.off_percent:.2g} ± {check.std_percent:.1g} % too long "
     assert said in summary(content)
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
@@ -83,7 +90,7 @@ def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple
 
 def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured: tuple):
     capture, reconstruction, hand_eye, true = measured
-    hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    hand_eye = with_depth(capture, reconstruction, hand_eye)
     found, notes = with_measured_depth(capture, reconstruction, hand_eye)
     assert not notes and (found.reason == np.where(found.confidence > 0, MATCHED, 0)).all()
     there = found.confidence > 0
@@ -101,7 +108,7 @@ def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured
 
 def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(measured: tuple):
     capture, reconstruction, hand_eye, true = measured
-    hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+    hand_eye = with_depth(capture, reconstruction, hand_eye)
     # A sheet that depth cameras see through: half of the matched depth lies 10 cm nearer; filled planes elsewhere.
     nearer = true.copy()
     nearer[:, :, : WIDTH // 2] -= 0.1
@@ -131,7 +138,9 @@ def test_depth_of_another_unit_is_named_and_left_out(measured: tuple):
     check = depth_check(capture, reconstruction, hand_eye)
     assert check is not None
     found, notes = with_measured_depth(
-        capture, reconstruction, replace(hand_eye, depth_check=replace(check, off_percent=900.0))
+        capture,
+        reconstruction,
+        replace(hand_eye, scale_evidence=ScaleEvidence(depth=replace(check, off_percent=900.0))),
     )
     assert found is reconstruction and "+900 % off by the robot" in notes[0]
     _, notes = with_measured_depth(capture, reconstruction, hand_eye)

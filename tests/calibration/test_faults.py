@@ -10,8 +10,9 @@ from benchmarks.attack import calibrated, outcome, reconstructed
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import SCALE_FROM_ROBOT
 from jcr.geometry import retract, step_between
+from jcr.records import Kind
+from jcr.records.words import sentence
 from jcr.simulate.faults import LENS, Faults, faulty_capture
 
 pytestmark = pytest.mark.slow
@@ -103,8 +104,9 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     unknown = calibrate(capture, reconstruction)
     assert unknown.converged and not unknown.warnings
     file = calibration_file(capture, reconstruction, unknown, {}, "")
-    assert SCALE_FROM_ROBOT in file.notes
+    (alone,) = (sentence(one) for one in file.findings if one.kind is Kind.SCALE_FROM_ROBOT)
+    assert alone in file.notes
     # Simulated observations are metric as the scene is; the robot's positions are not.
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.2 % larger than given" in metric.warnings[0]
-    assert SCALE_FROM_ROBOT not in calibration_file(capture, reconstruction, metric, {}, "").notes
+    assert alone not in calibration_file(capture, reconstruction, metric, {}, "").notes

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +9,21 @@ from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.requirement import GRASPING, advised, within_95
 from jcr.calibration.stage import calibrate_poses
-from jcr.calibration.words import shortfall, summary
+from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between, transform
-from jcr.records import HandEye, PosePairs
+from jcr.records import Finding, HandEye, Kind, PosePairs
+from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
 from jcr.simulate.problem import hand_eye_problem
 
+DISAGREE = Finding(
+    kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
+)
 NOISE = (5e-4, np.radians(0.1))
 
 
@@ -73,8 +76,9 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     assert required is not None and not required.is_met and required.more_images
     assert len(hand_eye.next_poses) == max(2, required.more_images)
     content, html = page(given, hand_eye)
-    say = shortfall(content)
-    assert say is not None and f"add {required.more_images} image" in say
+    assert content.short is not None and content.verdict == "accepted with warnings"
+    say = sentence(content.short)
+    assert f"add {required.more_images} image" in say
     assert "within what is needed" in summary(content)
     assert 'class="verdict fair"' in html and 'class="verdict good"' not in html
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
@@ -99,18 +103,17 @@ def test_what_no_number_of_images_reaches_is_not_promised():
     given, _ = pairs(12, 12)
     content, html = page(given, calibrate_poses(given, CalibrateOptions(require=(0.01, 0.001))))
     assert content.requirement is not None and content.requirement.more_images is None
-    assert (
-        "a dozen more images would not be enough" in (shortfall(content) or "")
-        and "would not be enough" in html
-    )
+    assert content.short is not None and content.short.mend == "none"
+    assert "a dozen more images would not be enough" in sentence(content.short)
+    assert "would not be enough" in html
     met = page(given, calibrate_poses(given))
-    assert shortfall(met[0]) is None and 'class="verdict good"' in met[1]
+    assert met[0].short is None and 'class="verdict good"' in met[1]
 
 
 def test_an_answer_that_is_rejected_is_red_whatever_was_asked():
     given, _ = pairs(12, 12)
     met = calibrate_poses(given, CalibrateOptions(require=(1000.0, 100.0)))
-    content, html = page(given, replace(met, converged=False, warnings=("the images disagree",)))
+    content, html = page(given, met.with_findings(DISAGREE))
     assert content.requirement is not None and content.requirement.is_met
     assert 'class="verdict bad"' in html and "the images disagree" in html
 

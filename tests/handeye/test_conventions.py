@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.stage import calibrate_poses
 from jcr.geometry import inverse, transform
-from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.next_poses import next_poses
 from jcr.records import PosePairs
+from jcr.records.words import sentence
 from jcr.simulate.problem import hand_eye_problem
 
 
@@ -67,7 +68,7 @@ def test_each_mistake_is_named(mistake: str):
     )
     found = better_reading(write(problem.base_from_gripper), problem.recon_from_camera)
     assert found is not None
-    assert re.search(words, explained(found))
+    assert re.search(words, sentence(convention_finding(found)))
     # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
     assert found[0].misfit < 1.0 and found[0].translation_mm < 0.5
     assert found[1].misfit > 10.0

@@ -104,7 +104,7 @@ def test_wrong_poses_are_named_and_no_others(count, wrong, kind):
             gripper[bad] = mirror @ gripper[bad] @ mirror
         solved = jcr.solve_hand_eye(gripper, problem.recon_from_camera)
         assert sorted(np.flatnonzero(~solved.inliers)) == sorted(bad)
-        assert [reason is not None for reason in solved.reasons] == list(~solved.inliers)
+        assert [reason is not None for reason in solved.images.reasons] == list(~solved.inliers)
         assert solved.converged
         # Fewer images know less, but the wrong ones must not pull.
         both = solved.covariance + clean.covariance
@@ -166,7 +166,7 @@ def test_an_image_that_is_given_twice_is_one():
     once, doubled = jcr.solve_hand_eye(gripper, camera), jcr.solve_hand_eye(gripper[twice], camera[twice])
     assert (doubled.covariance == once.covariance).all()
     assert (doubled.gripper_from_camera == once.gripper_from_camera).all()
-    assert (doubled.translation_residual_m == once.translation_residual_m[twice]).all()
+    assert (doubled.images.translation_residual_m == once.images.translation_residual_m[twice]).all()
 
 
 @pytest.mark.slow

@@ -20,9 +20,12 @@ from jcr.records import (
     MATCHED,
     PRIOR,
     Capture,
+    Estimate,
     HandEye,
-    Observability,
+    ImageResiduals,
+    PaperResiduals,
     Reconstruction,
+    RobotExamined,
     RobotNoise,
     Tracks,
 )
@@ -105,18 +108,19 @@ def known_reconstruction(
         backend="truth",
     )
     hand_eye = HandEye(
-        gripper_from_camera=truth.gripper_from_camera,
-        scale=SCALE,
-        base_from_recon=base_from_recon,
-        covariance=1e-10 * np.eye(7),
-        inliers=np.ones(views, bool),
-        translation_residual_m=np.zeros(views),
-        rotation_residual_rad=np.zeros(views),
-        observability=Observability(True, (), ()),
-        robot_noise=RobotNoise(0.0, 0.0, False),
-        residual_translation=0.0,
-        residual_rotation=0.0,
-        converged=True,
+        estimate=Estimate(
+            gripper_from_camera=truth.gripper_from_camera,
+            scale=SCALE,
+            base_from_recon=base_from_recon,
+            covariance=1e-10 * np.eye(7),
+        ),
+        images=ImageResiduals(
+            inliers=np.ones(views, bool),
+            translation_residual_m=np.zeros(views),
+            rotation_residual_rad=np.zeros(views),
+        ),
+        residuals=PaperResiduals(0.0, 0.0),
+        robot=RobotExamined(RobotNoise(0.0, 0.0, False)),
     )
     return reconstruction, hand_eye
 

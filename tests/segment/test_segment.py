@@ -19,11 +19,14 @@ from jcr.records import (
     MATCHED,
     PRIOR,
     Capture,
+    Estimate,
     HandEye,
+    ImageResiduals,
     Intrinsics,
-    Observability,
+    PaperResiduals,
     PointCloud,
     Reconstruction,
+    RobotExamined,
     RobotNoise,
     Tracks,
 )
@@ -378,18 +381,17 @@ def test_label_images_that_cannot_be_used_are_named(
 def hand_eye() -> HandEye:
     none = np.zeros(2)
     return HandEye(
-        np.eye(4),
-        1.0,
-        np.eye(4),
-        np.zeros((7, 7)),
-        np.ones(2, bool),
-        none,
-        none,
-        Observability(True, (), ()),
-        RobotNoise(0.0, 0.0, False),
-        0.0,
-        0.0,
-        True,
+        estimate=Estimate(
+            gripper_from_camera=np.eye(4),
+            scale=1.0,
+            base_from_recon=np.eye(4),
+            covariance=np.zeros((7, 7)),
+        ),
+        images=ImageResiduals(
+            inliers=np.ones(2, bool), translation_residual_m=none, rotation_residual_rad=none
+        ),
+        residuals=PaperResiduals(0.0, 0.0),
+        robot=RobotExamined(RobotNoise(0.0, 0.0, False)),
     )
 
 

@@ -4,14 +4,24 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    model_validator,
+)
 
-from jcr.calibration.words import SCALE_FROM_ROBOT
+from jcr.calibration.requirement import not_exact_enough
+from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -22,14 +32,22 @@ from jcr.records import (
     Attempt,
     Capture,
     DepthCheck,
+    Finding,
     HandEye,
     ImageVerdict,
     Intrinsics,
+    Kind,
     Mount,
     PosePairs,
     Reconstruction,
     Requirement,
+    Severity,
+    Verdict,
+    strongest_first,
+    verdict_of,
 )
+from jcr.records.findings import RANK
+from jcr.records.words import remedy, sentence, text
 from jcr.rounding import significant
 
 FORMAT = "jcr.calibration/1"
@@ -57,6 +75,23 @@ def _order(names: list[str]) -> list[str]:
     return names
 
 
+def _with_words(finding: Finding) -> dict[str, Any]:
+    return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
+
+
+def _without_words(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    # What was changed is a value of Python's, where a strict tuple is no list.
+    return {
+        name: tuple(part) if isinstance(part, list) else part
+        for name, part in value.items()
+        if name not in ("text", "remedy")
+    }
+
+
+FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(_with_words)]
+"""With its text and remedy, which are for people and made again when it is read."""
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 Spread = Annotated[float, Field(ge=0)]
@@ -92,6 +127,8 @@ class UncertaintyBudget(_Part):
     robot_systematic: Share
     intrinsics: Share
     images: Share
+    faults: Share | None = None
+    """What findings add; null in files of earlier versions."""
 
 
 class Uncertainty(_Part):
@@ -211,8 +248,12 @@ class CalibrationFile(_Part):
     observability: Observed
     robot_noise: Noise | None
     intrinsics: Lens | None
+    findings: list[FindingJson] = []
+    """Strongest first."""
+    verdict: Verdict | None = None
+    """That of the worst finding; null as long as a file of an earlier version is read."""
     warnings: list[str]
-    """What speaks against it first, where it is rejected; then what the user must act on."""
+    """Findings in words: what rejects first; then what the user must act on."""
     timings_s: dict[str, float]
     version: str
     next_poses: list[Proposal] = []
@@ -225,7 +266,7 @@ class CalibrationFile(_Part):
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
-    """What the stages did of their own accord, and nobody need act on."""
+    """What the stages did of their own accord, and findings in words that nobody need act on."""
     mount: Mount = "gripper"
     """base: the camera is fixed and watches what the gripper carries; gripper_from_camera and base_from_recon are then
     null, and uncertainty is that of base_from_camera, along axes of the base."""
@@ -249,6 +290,10 @@ class CalibrationFile(_Part):
             raise ValueError(f"converged without a {name_found}")
         if not self.converged and not self.warnings:
             raise ValueError("not converged, and no warning says why")
+        if self.verdict is not None and (
+            self.verdict != verdict_of(self.findings) or self.converged is (self.verdict == "rejected")
+        ):
+            raise ValueError("converged, verdict and findings contradict one another")
         return self
 
     @property
@@ -258,18 +303,46 @@ class CalibrationFile(_Part):
 
     @property
     def doubt(self) -> str | None:
-        """Why the calibration is rejected; None when it is."""
-        return None if self.converged else self.warnings[0]
+        """Why the calibration is rejected, in words; None when it is not."""
+        return None if self.converged else sentence(self.findings[0])
+
+    @property
+    def short(self) -> Finding | None:
+        """That it is not as exact as is required; None where it is."""
+        return next((one for one in self.findings if one.kind is Kind.NOT_EXACT_ENOUGH), None)
 
     @property
     def remarks(self) -> list[str]:
-        """What else the user must act on."""
-        return self.warnings[0 if self.converged else 1 :]
+        """What else the user must act on, in words."""
+        others = self.findings if self.converged else self.findings[1:]
+        return [
+            sentence(one)
+            for one in others
+            if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
+        ]
+
+    def with_findings(self, *findings: Finding) -> "CalibrationFile":
+        """The same with more findings, and what is derived of them."""
+        together = strongest_first((*self.findings, *findings))
+        return self.model_copy(update=_derived(together, self.notes))
 
     @property
     def images_used(self) -> int:
         """How many images the calibration rests on."""
         return sum(image.used for image in self.images)
+
+
+def _derived(findings: Sequence[Finding], notes: Sequence[str]) -> dict[str, Any]:
+    """Findings as the fields of a file that hold them."""
+    said = {severity: [sentence(one) for one in findings if one.severity == severity] for severity in RANK}
+    more = [note for note in said["informs"] if note not in notes]
+    return {
+        "findings": list(findings),
+        "verdict": verdict_of(findings),
+        "converged": not said["rejects"],
+        "warnings": [*said["rejects"], *said["warns"]],
+        "notes": [*notes, *more],
+    }
 
 
 def calibration_file(
@@ -282,9 +355,8 @@ def calibration_file(
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     std = np.sqrt(np.diag(hand_eye.covariance))
-    held_out, check = hand_eye.held_out, hand_eye.scale_check
-    offsets, ratio = hand_eye.joint_offsets, hand_eye.angle_ratio
-    told = reconstruction.warnings if isinstance(reconstruction, Reconstruction) else ()
+    held_out, check = hand_eye.held_out, hand_eye.scale_evidence.network
+    offsets, ratio = hand_eye.robot.joint_offsets, hand_eye.robot.angle_ratio
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     mount = capture.mount if isinstance(capture, Capture) else "gripper"
     camera, recon = hand_eye.gripper_from_camera.tolist(), hand_eye.base_from_recon.tolist()
@@ -295,13 +367,12 @@ def calibration_file(
         base_from_camera=camera if mount == "base" else None,
         gripper_from_object=recon if mount == "base" else None,
         scale=hand_eye.scale,
-        converged=hand_eye.converged,
         backend=reconstruction.backend,
         images=[
             Image(**vars(verdict), reprojection_px=pixels)
             for verdict, pixels in image_verdicts(capture, reconstruction, hand_eye)
         ],
-        residuals=Residuals(translation=hand_eye.residual_translation, rotation=hand_eye.residual_rotation),
+        residuals=Residuals(**vars(hand_eye.residuals)),
         uncertainty=Uncertainty(
             translation_std_mm=(1e3 * std[:3]).tolist(),
             rotation_std_deg=np.degrees(std[3:6]).tolist(),
@@ -322,9 +393,8 @@ def calibration_file(
             rotation_deg=float(np.degrees(hand_eye.robot_noise.rotation)),
             estimated=hand_eye.robot_noise.estimated,
         ),
-        intrinsics=_lens(hand_eye.intrinsics, hand_eye.intrinsics_covariance),
-        warnings=[*hand_eye.warnings, *told],
-        notes=[*reconstruction.notes, *([SCALE_FROM_ROBOT] if hand_eye.scale_from_robot_alone else [])],
+        intrinsics=_lens(hand_eye.intrinsics, hand_eye.estimate.intrinsics_covariance),
+        **_derived(hand_eye.findings, reconstruction.notes),
         timings_s=timings_s,
         version=version,
         next_poses=[
@@ -340,7 +410,7 @@ def calibration_file(
             systematic_deg=float(np.degrees(hand_eye.robot_noise.systematic)),
             translation_mm=1e3 * hand_eye.robot_noise.systematic_left[0],
             rotation_deg=float(np.degrees(hand_eye.robot_noise.systematic_left[1])),
-            p=hand_eye.systematic_p,
+            p=hand_eye.robot.systematic_p,
             joints=None
             if offsets is None
             else [
@@ -351,7 +421,7 @@ def calibration_file(
             ],
         ),
         angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
-        depth_check=hand_eye.depth_check,
+        depth_check=hand_eye.scale_evidence.depth,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
     )
@@ -371,7 +441,6 @@ def failed_file(
         gripper_from_camera=None,
         scale=None,
         base_from_recon=None,
-        converged=False,
         backend=backend,
         images=[
             Image(
@@ -391,10 +460,16 @@ def failed_file(
         ),
         robot_noise=None,
         intrinsics=_lens(capture.intrinsics),
-        warnings=[reason],
+        **_derived([_no_reconstruction(reason)], ()),
         timings_s=timings_s,
         version=version,
         attempts=list(attempts),
+    )
+
+
+def _no_reconstruction(reason: str) -> Finding:
+    return Finding(
+        kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details={"text": reason}
     )
 
 
@@ -403,6 +478,7 @@ def image_verdicts(
 ) -> list[tuple[ImageVerdict, float | None]]:
     """What became of every image of the capture, with its median reprojection error."""
     row_of = {int(row): k for k, row in enumerate(reconstruction.image_index)}
+    images = hand_eye.images
     verdicts = []
     for row, name in enumerate(capture.images):
         k = row_of.get(row)
@@ -413,12 +489,12 @@ def image_verdicts(
             continue
         verdict = ImageVerdict(
             name,
-            bool(hand_eye.inliers[k]),
-            hand_eye.reasons[k],
-            1e3 * float(hand_eye.translation_residual_m[k]),
-            float(np.degrees(hand_eye.rotation_residual_rad[k])),
+            bool(images.inliers[k]),
+            images.reasons[k],
+            1e3 * float(images.translation_residual_m[k]),
+            float(np.degrees(images.rotation_residual_rad[k])),
         )
-        pixels = None if hand_eye.reprojection_px is None else float(hand_eye.reprojection_px[k])
+        pixels = None if images.reprojection_px is None else float(images.reprojection_px[k])
         verdicts.append((verdict, None if pixels is None or np.isnan(pixels) else pixels))
     return verdicts
 
@@ -426,14 +502,7 @@ def image_verdicts(
 def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
     if (parts := hand_eye.budget) is None:
         return None
-    shift = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
-    by_intrinsics = parts.intrinsics + np.outer(shift, shift)
-    return UncertaintyBudget(
-        robot_random=_share(parts.robot_random),
-        robot_systematic=_share(parts.robot_systematic),
-        intrinsics=_share(by_intrinsics),
-        images=_share(parts.images),
-    )
+    return UncertaintyBudget(**{name: _share(part) for name, part in vars(parts).items()})
 
 
 def _share(covariance: Float[ndarray, "7 7"]) -> Share:
@@ -557,9 +626,26 @@ def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
         )
     try:
         # As JSON again: there, and not among Python's values, a list may stand for a record of numbers.
-        return CalibrationFile.model_validate_json(json.dumps(content), strict=True)
+        found = CalibrationFile.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         raise InputError(f"{file}: {first_fault(error)}; run the calibration again") from None
+    return _of_earlier_version(found) if found.verdict is None else found
+
+
+def _of_earlier_version(found: CalibrationFile) -> CalibrationFile:
+    """With its warnings, of which nothing but their words is known, as findings."""
+    first: Severity = "warns" if found.converged else "rejects"
+    findings = [
+        Finding(
+            kind=Kind.EARLIER_VERSION, severity="warns" if k else first, details={"text": said, "remedy": ""}
+        )
+        for k, said in enumerate(found.warnings)
+    ]
+    if found.converged and found.requirement is not None:
+        budget = None if found.uncertainty is None else found.uncertainty.budget
+        short = not_exact_enough(found.requirement, budget is not None and not more_images_help(budget))
+        findings += [] if short is None else [short]
+    return found.model_copy(update=_derived(strongest_first(findings), found.notes))
 
 
 def _lens(intrinsics: Intrinsics | None, covariance: Float[ndarray, "q q"] | None = None) -> Lens | None:

@@ -6,6 +6,7 @@ one with the least p is named, with its value and what it would do to the answer
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,8 +16,7 @@ from jcr.calibration.bundle import Adjusted
 from jcr.calibration.nuisance import SHEAR, Nuisance, Tested, nuisance, nuisance_columns, spanned, tested
 from jcr.camera import parameter_names, parameters, with_parameters
 from jcr.geometry import step_between
-from jcr.records import Intrinsics, Tracks
-from jcr.rounding import significant
+from jcr.records import Finding, Intrinsics, Kind, Tracks
 
 LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
@@ -26,8 +26,6 @@ OF_FIRST_STEP = 0.2
 """Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
 AT_ONCE = 2
 """Faults named of one capture."""
-CAMERA_FAULT = "p = "
-"""In the words of every fault, and of no other warning."""
 MOST_POINTS, WELL_SEEN = 800, 3
 """Points that take part, first those in this many images: more tell a fault no better, and take time."""
 LEAST_SHEAR_PX = 3.0
@@ -44,28 +42,13 @@ FOCUS = {"distance", "scatter", "zoom"}
 NEARLY_ALL = 0.9
 """Of the squares of what the focal length differs by."""
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-SURE = 4.0
-"""Standard deviations from which a parameter of the intrinsics is named by itself."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something that is wrong, in words, and what it does."""
-
-    text: str
-    shift: Float[ndarray, "7"]
-    """By how much the answer moves once it is allowed for, in records.COVARIANCE_ORDER."""
-    of_lens: bool = False
-    """The same intrinsics would be right for all images."""
-    rejects: bool = False
-    """No one answer is right for all images."""
 
 
 @dataclass(frozen=True)
 class CameraFaults:
     """What is wrong with the camera, and the adjustment that allows for it."""
 
-    faults: tuple[Fault, ...]
+    faults: tuple[Finding, ...]
     adjusted: Adjusted
     """With what was found allowed for."""
     more_covariance: Float[ndarray, "6 6"]
@@ -123,7 +106,7 @@ def camera_faults(
         adjusted = readjust(tracks, used)
     given = adjusted.problem.intrinsics
     found: list[_Hypothesis] = []
-    named: list[Fault] = []
+    named: list[Finding] = []
     equations, total = nuisance(adjusted, used), np.zeros(nuisance_columns(used, m))
     if focus_varies:
         found.append(next(one for one in _hypotheses(equations, held) if one.kind == "scatter"))
@@ -158,8 +141,9 @@ def camera_faults(
             continue
         found.append(best)
         last = tested(equations, best.free, _all(found[:-1], equations, best.beside))
-        text = _in_words(best, total, last, alone.log_p, equations, given, adjusted.bundle.camera, images)
-        named.append(Fault(text, shift, of_lens=best.of_lens))
+        p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
+        size = _size(best, total, last, equations, given, adjusted.bundle.camera, images)
+        named.append(Finding(severity="warns", p=p, shift=tuple(shift.tolist()), **size))
     if not found:
         return CameraFaults((), adjusted, np.zeros((6, 6)))
     if tracks is not all_tracks and focus_varies:
@@ -291,56 +275,41 @@ def _hypotheses(equations: Nuisance, held: bool) -> list[_Hypothesis]:
     return found
 
 
-def _in_words(
+def _size(
     fault: _Hypothesis,
     total: Float[ndarray, " e"],
     last: Tested,
-    log_p: float,
     equations: Nuisance,
     given: Intrinsics,
     now: Intrinsics,
     images: Sequence[str],
-) -> str:
-    p = f"p = {np.exp(max(log_p + np.log(fault.places), -700)):.0e}"
+) -> dict[str, Any]:
+    """The fields of a finding that say what and how large the fault is."""
     value = np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    camera = given
-    if fault.kind == "distance":
-        log_distance = np.log(equations.distance)
-        span = float(np.ptp(log_distance))
-        percent, error = 100 * value[0] * span, 100 * std[0] * span
-        way = "grows" if percent > 0 else "shrinks"
-        return (
-            f"the focal length {way} by {abs(percent):.1f} ± {significant(error)} % from the nearest view to the "
-            f"farthest ({p}): lock the focus, or --focus varies"
-        )
-    if fault.kind == "scatter":
-        return (
-            f"the focal length differs between images by {100 * np.sqrt(value @ value / equations.images):.1f} % "
-            f"(rms, each ± {significant(100 * float(np.median(std)))} %; {p}): lock the focus and take the images "
-            "again, or --focus varies"
-        )
-    if fault.kind == "zoom":
-        return (
-            f"the focal length changes by {100 * value[0]:+.1f} ± {significant(100 * std[0])} % after "
-            f"{images[fault.after]} ({p}): the zoom or focus was moved; calibrate the images before or after it, or "
-            "--focus varies"
-        )
-    if fault.kind == "shear":
-        px = value[0] * camera.fx
-        return (
-            f"the images are sheared by {abs(px):.1f} ± {significant(std[0] * camera.fx)} px from top to bottom ({p}), "
-            "as by the rolling shutter of a moving camera: take the images at rest"
-        )
-    if fault.kind == "shear of each":
-        px = camera.fx * float(np.sqrt(np.mean(value**2)))
-        return (
-            f"each image is sheared by itself, {px:.1f} px from top to bottom (rms, {p}), as by the rolling shutter "
-            "of a moving camera: take the images at rest"
-        )
-    units = dict(zip(equations.names, equations.units, strict=True))
-    names = _freed(fault.kind, equations)
-    return _lens_in_words({name: std[k] * units[name] for k, name in enumerate(names)}, given, now, p)
+    if fault.of_lens:
+        units = dict(zip(equations.names, equations.units, strict=True))
+        names = _freed(fault.kind, equations)
+        details = _parameters({name: std[k] * units[name] for k, name in enumerate(names)}, given, now)
+        return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
+    kind, size, error = {
+        "distance": (Kind.FOCUS_BY_DISTANCE, value[0], std[0]),
+        "scatter": (Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), np.median(std)),
+        "zoom": (Kind.ZOOM, value[0], std[0]),
+        "shear": (Kind.ROLLING_SHUTTER, abs(value[0]), std[0]),
+        "shear of each": (Kind.ROLLING_SHUTTER_BY_IMAGE, np.sqrt(np.mean(value**2)), np.median(std)),
+    }[fault.kind]
+    unit = float(np.ptp(np.log(equations.distance))) if fault.kind == "distance" else 1.0
+    if fault.kind.startswith("shear"):
+        unit = given.fx
+    between = images[fault.after : fault.after + 2] if fault.kind == "zoom" else ()
+    return {
+        "kind": kind,
+        "mend": "images",
+        "value": unit * float(size),
+        "std": unit * float(error),
+        "images": tuple(between),
+    }
 
 
 def _freed(kind: str, equations: Nuisance) -> tuple[str, ...]:
@@ -348,38 +317,10 @@ def _freed(kind: str, equations: Nuisance) -> tuple[str, ...]:
     return tuple(name for name in (LENS if kind == "lens" else ASPECT) if name in equations.names)
 
 
-def _lens_in_words(error: dict[str, float], given: Intrinsics, now: Intrinsics, p: str) -> str:
-    """Each parameter that differs surely, as it is and as it was given."""
-    old: dict[str, float] = dict(zip(parameter_names(given), parameters(given), strict=True))
-    new: dict[str, float] = dict(zip(parameter_names(now), parameters(now), strict=True))
-    by = {name: new[name] - old[name] for name in error}
-    said = []
-    if {"fx", "fy"} <= by.keys() and _is_common(by, error, given):
-        sure = significant(error["fx"])
-        said.append(f"a focal length of {new['fx']:.1f} ± {sure} px where {given.fx:.1f} is given")
-    for pair, (what, px), digits in (
-        (("fx", "fy"), ("focal lengths of", " px"), 1),
-        (("cx", "cy"), ("a principal point of", " px"), 1),
-        (("k1", "k2"), ("a distortion k1, k2 of", ""), 3),
-        (("p1", "p2"), ("a distortion p1, p2 of", ""), 4),
-    ):
-        known = [name for name in pair if name in by]
-        if pair == ("fx", "fy") and said:
-            continue
-        if any(abs(by[name]) > SURE * error[name] for name in known):
-            found = ", ".join(f"{new[name]:.{digits}f}" for name in pair)
-            was = ", ".join(f"{old[name]:.{digits}f}" for name in pair)
-            most = significant(max(error[name] for name in known))
-            said.append(f"{what} ({found}) ± {most}{px} where ({was}) is given")
-    said = said or ["other intrinsics than those used, no one of them surely by itself"]
-    return (
-        f"the images show {' and '.join(said)} ({p}); calibrate the intrinsics again at this resolution, or give no "
-        "intrinsics (null) to have them estimated"
-    )
-
-
-def _is_common(by: dict[str, float], error: dict[str, float], given: Intrinsics) -> bool:
-    """Whether fx and fy are off by one factor, surely."""
-    x, y = by["fx"] / given.fx, by["fy"] / given.fy
-    sure = abs(by["fx"]) > SURE * error["fx"] and abs(by["fy"]) > SURE * error["fy"]
-    return bool(sure and abs(x - y) < max(0.2 * abs(x), 2e-3))
+def _parameters(std: dict[str, float], given: Intrinsics, now: Intrinsics) -> dict[str, float]:
+    """Parameters as they are and as they were given; standard deviations of those that were freed."""
+    found: dict[str, float] = {}
+    for name, old, new in zip(parameter_names(given), parameters(given), parameters(now), strict=True):
+        if name in LENS:
+            found |= {name: float(new), f"{name}_given": float(old)}
+    return found | {f"{name}_std": float(value) for name, value in std.items()}

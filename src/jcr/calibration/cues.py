@@ -8,7 +8,7 @@ from jcr.camera import project, unproject
 from jcr.errors import InputError
 from jcr.geometry import rotation_angle
 from jcr.handeye.fit import Poses
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 
 LENGTH_STD = 0.01
 """Relative: a pixel's breadth at either end of a length of a hundred pixels."""
@@ -72,8 +72,8 @@ def surface_at(
     return reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
 
 
-def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
-    """What to tell the user where the robot's motion excludes that the reconstruction is in metres.
+def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
+    """That the robot's motion excludes that the reconstruction is in metres; None where it does not.
 
     `free` is a calibration that was not given it; `metric_std` is how well the metre is known (relative one
     sigma).
@@ -84,8 +84,6 @@ def scale_contradiction(free: HandEye, metric_std: float) -> str | None:
     sigmas, share = CONTRADICTED
     if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
         return None
-    return (
-        f"by the robot's motion the board is {100 * abs(np.expm1(off)):.1f} ± {100 * std:.1f} % "
-        f"{'larger' if off > 0 else 'smaller'} than given; measure its squares, and check that the gripper poses "
-        "are in metres"
+    return Finding(
+        kind=Kind.BOARD_SIZE, severity="rejects", mend="poses", value=float(np.expm1(off)), std=std
     )

@@ -5,8 +5,6 @@ adjustment, focal length, principal point and two radial coefficients have an es
 few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -16,8 +14,7 @@ from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.equation import Poses
-from jcr.records import HandEye, Intrinsics, Tracks
-from jcr.rounding import significant
+from jcr.records import Finding, HandEye, Intrinsics, Kind, Tracks
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
@@ -30,15 +27,6 @@ right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 
-@dataclass(frozen=True)
-class LensDoubt:
-    """Why the given intrinsics cannot be those of the images, and what this does."""
-
-    text: str
-    shift: Float[ndarray, "7"]
-    """How far a calibration with the given ones is from that with those found; in records.COVARIANCE_ORDER."""
-
-
 def lens_doubt(
     hand_eye: HandEye,
     base_from_gripper: Poses,
@@ -48,7 +36,7 @@ def lens_doubt(
     noise: tuple[float, float] | None,
     systematic: Float[ndarray, "s s"],
     adjusted: Adjusted | None,
-) -> LensDoubt | None:
+) -> Finding | None:
     """What the used images say against the intrinsics that were held; None where they say nothing.
 
     `adjusted` is the adjustment with those intrinsics, where there is one: only when one Gauss-Newton step from
@@ -73,11 +61,12 @@ def lens_doubt(
         _shift(as_given.bundle.gripper_from_camera, as_given.scale, freed),
         key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
     )
-    return LensDoubt(
-        f"the images show {' and '.join(found)}; calibrate the intrinsics again at this resolution, "
-        f"or give no intrinsics "
-        "(null) to have them estimated",
-        shift,
+    return Finding(
+        kind=Kind.INTRINSICS,
+        severity="warns",
+        mend="intrinsics",
+        shift=tuple(shift.tolist()),
+        details=found,
     )
 
 
@@ -88,16 +77,16 @@ def _shift(gripper_from_camera: Float[ndarray, "4 4"], scale: float, freed: Adju
     )
 
 
-def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float) -> list[str]:
-    """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters, in words."""
+def _found_off(
+    adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float
+) -> dict[str, float]:
+    """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters (px)."""
     camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED))
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))
-    off = []
+    off: dict[str, float] = {}
     if abs(by[0]) > max(sure * std[0], share * OFF * held.fx):
-        off.append(
-            f"a focal length of {camera[0]:.0f} ± {significant(std[0])} px where {held.fx:.0f} is given"
-        )
+        off |= {"focal": float(camera[0]), "focal_std": float(std[0]), "focal_given": held.fx}
     used_radius = np.linalg.norm(unproject(held, tracks.x_px)[:, :2], axis=1)
     radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
     ray = np.stack([radius, 0 * radius, np.ones(9)], axis=1)
@@ -105,13 +94,11 @@ def _found_off(adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float
     bent_px = bends @ by[[K1, K2]]
     bent_std_px = np.sqrt(np.einsum("rk,kl,rl->r", bends, covariance[np.ix_([K1, K2], [K1, K2])], bends))
     most = int(np.abs(bent_px).argmax())
-    px, px_std = abs(bent_px[most]), bent_std_px[most]
+    px, px_std = float(abs(bent_px[most])), float(bent_std_px[most])
     if px > max(sure * px_std, share * OFF * held.fx * radius[most]):
-        off.append(f"a distortion up to {px:.1f} ± {significant(px_std)} px from the one used")
+        off |= {"bend": px, "bend_std": px_std}
     centre_std = std[[CX, CY]]
     if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * held.width)).any():
-        off.append(
-            f"a principal point of ({camera[CX]:.0f}, {camera[CY]:.0f}) ± {significant(centre_std.max())} px where "
-            f"({held.cx:.0f}, {held.cy:.0f}) is given"
-        )
+        off |= {"cx": float(camera[CX]), "cy": float(camera[CY]), "centre_std": float(centre_std.max())}
+        off |= {"cx_given": held.cx, "cy_given": held.cy}
     return off

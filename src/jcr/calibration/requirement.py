@@ -12,7 +12,7 @@ from jcr.geometry import skew
 from jcr.handeye.equation import ASSUMED_NOISE, PRIOR_STD, pose_information
 from jcr.handeye.next_poses import looked_at, next_poses
 from jcr.handeye.observability import excitation
-from jcr.records import HandEye, NextPose, Requirement
+from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -44,14 +44,36 @@ def advised(
         metres, radians = hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation
         at_least = max(metres, ASSUMED_NOISE[0]), max(radians, ASSUMED_NOISE[1])
         _, proposed = next_poses(used, PROPOSED, noise=at_least)
-        by_lens = np.sqrt(np.diag(_by_lens(hand_eye)))
+        by_lens = np.sqrt(np.diag(_by_intrinsics(hand_eye)))
         proposed = [replace(pose, expected_std=np.hypot(pose.expected_std, by_lens)) for pose in proposed]
-    return replace(
-        hand_eye,
-        excitation=excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None,
-        requirement=required,
-        next_poses=tuple(proposed),
+    seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
+    earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
+    hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
+    short = not_exact_enough(required, mostly_systematic(hand_eye.budget))
+    return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
+
+
+def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
+    """That a calibration is not as exact as is required; `systematic`: mostly by systematic errors of the robot."""
+    if required.is_met:
+        return None
+    mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
+    numbers = {name: float(value) for name, value in vars(required).items() if value is not None}
+    return Finding(
+        kind=Kind.NOT_EXACT_ENOUGH,
+        severity="warns",
+        mend=mend,
+        value=1e-3 * required.reached_mm,
+        details=numbers,
     )
+
+
+def mostly_systematic(budget: Budget | None) -> bool:
+    """Whether most of the uncertainty is systematic errors of the robot, which images of the same region leave."""
+    if budget is None:
+        return False
+    others = budget.robot_random, budget.intrinsics, budget.images, budget.faults
+    return bool(np.trace(budget.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
 def within_95(covariance: Float[ndarray, "3 3"]) -> float:
@@ -94,7 +116,7 @@ def _worthwhile(
     their size is hardly known, and more views tell it.
     """
     x, noise = hand_eye.gripper_from_camera, (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    stays = _by_lens(hand_eye)
+    stays = _by_intrinsics(hand_eye)
     systematic = None if hand_eye.budget is None else hand_eye.budget.robot_systematic
     if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
         stays = stays + systematic
@@ -122,6 +144,7 @@ def _worthwhile(
     return None, proposed[:PROPOSED]
 
 
-def _by_lens(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
-    shift = np.zeros(7) if hand_eye.lens_shift is None else hand_eye.lens_shift
-    return np.outer(shift, shift)
+def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
+    """What wrong intrinsics add to the covariance."""
+    shifts = [one.shift for one in hand_eye.findings if one.mend == "intrinsics" and one.shift is not None]
+    return sum((np.outer(shift, shift) for shift in shifts), np.zeros((7, 7)))

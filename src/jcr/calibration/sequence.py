@@ -17,10 +17,8 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.stats import f as f_distribution
 
-from jcr.calibration.camera_faults import Fault
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
-from jcr.records import HandEye
-from jcr.rounding import significant
+from jcr.records import Finding, HandEye, Kind
 
 LOG_P = float(np.log(1e-4))
 """Chance of any one alarm where there is nothing."""
@@ -54,7 +52,7 @@ def sequence_fault(
     systematic: Float[ndarray, "r r"],
     time_s: Float[ndarray, " m"] | None = None,
     still: bool = False,
-) -> Fault | None:
+) -> Finding | None:
     """What the order of the images says against one calibration of them; None where it says nothing.
 
     `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
@@ -99,41 +97,55 @@ def sequence_fault(
         _after(k, m) if kind == "slip" else np.arange(m) / m, best
     ):
         return None
-    p = f"p = {np.exp(max(log_p, -700)):.0e}"
-    if kind == "delay":
-        if not (np.abs(best.shift[:6]) > MATERIAL * std).any():
-            return None
-        value, error = float(best.value[0]), float(np.sqrt(best.covariance[0, 0]))
-        size = abs(value)
-        how = (
-            f"{1e3 * size:.0f} ± {significant(1e3 * error)} ms"
-            if time_s is not None
-            else f"{size:.3f} ± {significant(error)} of the time from one image to the next"
-        )
-        late = "late" if value > 0 else "early"
-        return Fault(
-            f"the gripper poses look as if read {how} too {late} ({p}): stop the arm at each image, or read "
-            "pose and image by the same clock",
-            best.shift,
-        )
-    metres, radians = np.linalg.norm(best.value[:3]), np.linalg.norm(best.value[3:])
-    size = f"{1e3 * metres:.1f} mm and {np.degrees(radians):.2f}°"
-    if not (np.abs(best.value) > MATERIAL * std).any():
+    if not (np.abs(best.shift[:6] if kind == "delay" else best.value) > MATERIAL * std).any():
         return None
+    p = float(np.exp(max(log_p, -700)))
+    if kind == "delay":
+        return _delay(best, p, "interval" if time_s is None else "s")
     if kind == "drift":
-        return Fault(
-            f"the camera seems to drift on the gripper by {size} from the first image to the last ({p}): tighten its "
-            "mount, let it warm up, and take the images again",
-            np.r_[best.value / 2, 0.0],
-        )
-    more, part = max(
-        (k, f"the {k} images up to {images[k - 1]}"), (m - k, f"the {m - k} images from {images[k]} on")
+        return _drift(best, p)
+    return _slip(best, p, k, images)
+
+
+def _drift(found: _Found, p: float) -> Finding:
+    metres, radians = np.linalg.norm(found.value.reshape(2, 3), axis=1).tolist()
+    return Finding(
+        kind=Kind.DRIFT,
+        severity="warns",
+        mend="mount",
+        value=metres,
+        p=p,
+        shift=(*(found.value / 2).tolist(), 0.0),
+        details={"rotation": radians},
     )
-    return Fault(
-        f"the camera seems to have moved on the gripper by {size} after {images[k - 1]} ({p}): calibrate "
-        f"{part} alone, and those of the other part only where the camera still sits as it did then",
-        np.r_[best.value, 0.0],
-        rejects=bool(metres > LARGE_SLIP[0] or radians > LARGE_SLIP[1]),
+
+
+def _delay(found: _Found, p: float, unit: str) -> Finding:
+    return Finding(
+        kind=Kind.DELAY,
+        severity="warns",
+        mend="poses",
+        value=float(found.value[0]),
+        std=float(np.sqrt(found.covariance[0, 0])),
+        p=p,
+        shift=tuple(found.shift.tolist()),
+        details={"unit": unit},
+    )
+
+
+def _slip(found: _Found, p: float, place: int, images: Sequence[str]) -> Finding:
+    """A slip between the image before the place and that at it."""
+    m, (metres, radians) = len(images), np.linalg.norm(found.value.reshape(2, 3), axis=1).tolist()
+    count, longer = max((place, "before"), (m - place, "after"))
+    return Finding(
+        kind=Kind.SLIP,
+        severity="rejects" if metres > LARGE_SLIP[0] or radians > LARGE_SLIP[1] else "warns",
+        mend="mount",
+        images=(images[place - 1], images[place]),
+        value=metres,
+        p=p,
+        shift=(*found.value.tolist(), 0.0),
+        details={"rotation": radians, "longer": longer, "count": float(count)},
     )
 
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
 from jcr.calibration.bundle import Adjusted, adjust, median_reprojection
-from jcr.calibration.camera_faults import CAMERA_FAULT, CameraFaults, Fault, camera_faults
+from jcr.calibration.camera_faults import CameraFaults, camera_faults
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.depth_check import depth_check
@@ -18,28 +18,35 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import of_poses, robot_errors, robot_examined
 from jcr.calibration.sequence import sequence_fault
-from jcr.calibration.words import scale_in_words
 from jcr.capture.checks import how_turned
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
 from jcr.handeye.arms import arm_named
-from jcr.handeye.conventions import better_reading, explained
+from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.fit import Cues, exceeds
 from jcr.handeye.residuals import paper_residuals
 from jcr.handeye.solve import SCALE_STD, judged, solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
 from jcr.least_squares import one_blas_thread
 from jcr.records import (
+    CAMERA,
     Capture,
+    Estimate,
+    Finding,
     HandEye,
     HeldOut,
+    ImageResiduals,
     Intrinsics,
+    Kind,
+    PaperResiduals,
     PosePairs,
     Reconstruction,
-    Refinement,
+    RobotExamined,
     RobotNoise,
     ScaleCheck,
+    ScaleEvidence,
     Tracks,
+    verdict_of,
 )
 
 FAR_SCALE = float(np.log(1.2))
@@ -78,18 +85,20 @@ def calibrate(
         posed_arm,
     )
     if unused is not None:
-        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, unused))
+        hand_eye = hand_eye.with_findings(unused)
     hand_eye = _in_sequence(hand_eye, capture, reconstruction, systematic)
     if (turned := how_turned(capture)) is not None:
-        hand_eye = replace(hand_eye, warnings=(*hand_eye.warnings, turned))
+        hand_eye = hand_eye.with_findings(turned)
     # A unit that somebody vouches for was used for the scale, and is no check of it.
     if reconstruction.is_metric and reconstruction.metric_std is None:
         hand_eye = _scale_checked(hand_eye)
     if hand_eye.converged:
-        hand_eye = replace(hand_eye, depth_check=depth_check(capture, reconstruction, hand_eye))
+        depth = depth_check(capture, reconstruction, hand_eye)
+        hand_eye = replace(hand_eye, scale_evidence=replace(hand_eye.scale_evidence, depth=depth))
     known = options.known_height is not None or options.known_length is not None
-    alone = reconstruction.metric_std is None and hand_eye.depth_check is None and not known
-    hand_eye = replace(hand_eye, scale_from_robot_alone=alone)
+    if reconstruction.metric_std is None and hand_eye.scale_evidence.depth is None and not known:
+        hand_eye = hand_eye.with_findings(Finding(kind=Kind.SCALE_FROM_ROBOT, severity="informs"))
+    hand_eye = hand_eye.with_findings(*(_of_reconstruction(text) for text in reconstruction.warnings))
     gripper = capture.base_from_gripper[reconstruction.image_index]
     return advised(hand_eye, gripper, options, reconstruction.metric_std)
 
@@ -124,9 +133,9 @@ def _calibrated(
         camera_covariance=camera_covariance,
         systematic=systematic,
     )
-    hand_eye = replace(hand_eye, intrinsics=reconstruction.intrinsics)
+    hand_eye = replace(hand_eye, estimate=replace(hand_eye.estimate, intrinsics=reconstruction.intrinsics))
     if contradiction is not None:
-        return replace(hand_eye, converged=False, warnings=(contradiction, *hand_eye.warnings))
+        return hand_eye.with_findings(contradiction, first=True)
     used = hand_eye.inliers
     tracks = _some_of_many(of_images(reconstruction.tracks, used))
     adjustable = (
@@ -155,7 +164,7 @@ def _calibrated(
         refined = judged(_refined(hand_eye, adjusted, gripper, camera, reconstruction))
         if not tracks.from_pointmaps or _better(refined.held_out, hand_eye.held_out):
             hand_eye = refined
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Finding, ...] = ()
     if adjustable and not tracks.from_pointmaps and hand_eye.observability.observable:
         found = _camera_faults(
             hand_eye, capture, reconstruction, tracks, noise, adjusted, options, systematic
@@ -164,9 +173,10 @@ def _calibrated(
             faults = found.faults
         if found is not None and options.focus == "varies" and hand_eye.converged:
             hand_eye = _refined(hand_eye, found.adjusted, gripper, camera, reconstruction)
-            hand_eye.covariance[:6, :6] += found.more_covariance
-            hand_eye = judged(hand_eye)
-    lens_fault = next((fault.text for fault in faults if fault.of_lens), None)
+            more = np.zeros((7, 7))
+            more[:6, :6] = found.more_covariance
+            hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(more)))
+    lens_fault = next((fault for fault in faults if fault.kind is Kind.INTRINSICS), None)
     if faults and (lens_fault is None or capture.intrinsics is None):
         return _with_faults(hand_eye, faults)
     if (
@@ -191,7 +201,7 @@ def _calibrated(
     ):
         return hand_eye
     # Where the lens is wrong, bundle adjustment bends the robot's poses to it: the fit to camera poses bends least.
-    kept = hand_eye if hand_eye.refinement is None else hand_eye.refinement.before
+    kept = hand_eye.before or hand_eye
     doubt = lens_doubt(
         kept,
         gripper[used],
@@ -204,26 +214,24 @@ def _calibrated(
     )
     if doubt is None:
         return _with_faults(hand_eye, faults)
-    others = [fault for fault in faults if not fault.of_lens]
-    return _with_faults(kept, [*others, Fault(lens_fault or doubt.text, doubt.shift, of_lens=True)])
+    others = [fault for fault in faults if fault.kind is not Kind.INTRINSICS]
+    named = doubt if lens_fault is None else replace(lens_fault, shift=doubt.shift)
+    return _with_faults(kept, [*others, named])
 
 
-def _with_faults(hand_eye: HandEye, faults: Sequence[Fault]) -> HandEye:
-    """With what the faults do counted as uncertainty, and named: first, where that is more than can be trusted."""
+def _with_faults(hand_eye: HandEye, faults: Sequence[Finding]) -> HandEye:
+    """With what the faults do counted as uncertainty; they reject where that is more than can be accepted."""
+    named = []
     for fault in faults:
-        by_lens = fault.shift if fault.of_lens else np.zeros(7)
-        if hand_eye.lens_shift is not None:
-            by_lens = np.hypot(by_lens, hand_eye.lens_shift)
-        covariance = hand_eye.covariance + np.outer(fault.shift, fault.shift)
-        lens_shift = by_lens if by_lens.any() else None
-        earlier, trusted = hand_eye.warnings, hand_eye.converged
-        hand_eye = judged(replace(hand_eye, covariance=covariance, lens_shift=lens_shift))
-        if trusted and hand_eye.converged and not fault.rejects:
-            hand_eye = replace(hand_eye, warnings=(*earlier, fault.text))
-        else:
-            # More images, the cure for a large covariance, do not mend a lens.
-            hand_eye = replace(hand_eye, converged=False, warnings=(fault.text, *earlier))
-    return hand_eye
+        accepted = hand_eye.converged and verdict_of([*named, fault]) != "rejected"
+        hand_eye = replace(
+            hand_eye, estimate=hand_eye.estimate.with_fault(np.outer(fault.shift, fault.shift))
+        )
+        # More images, the remedy for a large covariance, do not mend a lens: that finding is left out.
+        if not accepted or not judged(hand_eye).converged:
+            fault = replace(fault, severity="rejects")
+        named.append(fault)
+    return hand_eye.with_findings(*named, first=True)
 
 
 def _camera_faults(
@@ -275,7 +283,7 @@ def _in_sequence(
     hand_eye: HandEye, capture: Capture, reconstruction: Reconstruction, systematic: Float[ndarray, "r r"]
 ) -> HandEye:
     """With a slip, a drift or a delay that the order of the images shows, where no fault of the camera does."""
-    if hand_eye.lens_shift is not None or any(CAMERA_FAULT in text for text in hand_eye.warnings):
+    if any(finding.kind in CAMERA for finding in hand_eye.findings):
         return hand_eye
     rows, camera = reconstruction.image_index, reconstruction.recon_from_camera
     names = [capture.images[row] for row in rows]
@@ -300,11 +308,22 @@ def _scale_checked(hand_eye: HandEye) -> HandEye:
     # A network's length of 1 is `scale` metres by the robot.
     std_percent = 100 * float(np.sqrt(hand_eye.covariance[6, 6])) / hand_eye.scale
     check = ScaleCheck(100 * (1 / hand_eye.scale - 1), std_percent)
-    hand_eye = replace(hand_eye, scale_check=check)
+    hand_eye = replace(hand_eye, scale_evidence=ScaleEvidence(check))
     if abs(np.log(hand_eye.scale)) < max(FAR_SCALE, 3 * np.sqrt(hand_eye.covariance[6, 6])):
         return hand_eye
-    remark = f"{scale_in_words(check)}; check the unit of the gripper poses"
-    return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+    return hand_eye.with_findings(
+        Finding(
+            kind=Kind.NETWORK_SCALE,
+            severity="warns",
+            mend="poses",
+            value=check.off_percent / 100,
+            std=check.std_percent / 100,
+        )
+    )
+
+
+def _of_reconstruction(text: str) -> Finding:
+    return Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text})
 
 
 def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
@@ -335,17 +354,20 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
             gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
-            remark = "the scale is unobservable from these motions: it is taken as 1, from the marker's size"
-            return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
+            return hand_eye.with_findings(Finding(kind=Kind.SCALE_ASSUMED, severity="warns", mend="motion"))
     if not hand_eye.converged:
         return _investigated(hand_eye, gripper, camera)
     if pairs.is_metric and not is_one(hand_eye):
-        size = f"{100 * abs(1 / hand_eye.scale - 1):.1f} % too {'large' if hand_eye.scale < 1 else 'small'}"
-        remark = (
-            f"the scale is {hand_eye.scale:.4f} where a marker of known size gives 1: its size was given {size}, or "
-            "the camera's focal length is off"
+        return hand_eye.with_findings(
+            Finding(
+                kind=Kind.BOARD_SIZE,
+                severity="warns",
+                mend="intrinsics",
+                value=hand_eye.scale - 1,
+                std=hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6])),
+                details={"marker": 1.0},
+            )
         )
-        return replace(hand_eye, warnings=(*hand_eye.warnings, remark))
     return hand_eye
 
 
@@ -387,8 +409,8 @@ def _investigated(
         return hand_eye
     if not hand_eye.observability.observable:
         # Of motions that show too little, another reading may fit by chance: what is missing comes first.
-        return replace(hand_eye, warnings=(*hand_eye.warnings, explained(found)))
-    return replace(hand_eye, warnings=(explained(found), *hand_eye.warnings))
+        return hand_eye.with_findings(convention_finding(found, "warns"))
+    return hand_eye.with_findings(convention_finding(found), first=True)
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
@@ -426,31 +448,35 @@ def _refined(
     reprojection = np.full(len(used), np.nan)
     reprojection[used] = median_reprojection(adjusted)
     delta_t, delta_r = paper_residuals(gripper, camera, x, adjusted.scale, used)
-    moved = step_between(hand_eye.gripper_from_camera, x)
-    refinement = Refinement(hand_eye, float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])))
+    noise = RobotNoise(
+        *adjusted.noise,
+        exceeds(adjusted.noise, adjusted.given_noise),
+        adjusted.given_noise,
+        adjusted.systematic,
+        adjusted.systematic_left,
+    )
     return replace(
         hand_eye,
-        gripper_from_camera=x,
-        scale=adjusted.scale,
-        base_from_recon=adjusted.base_from_recon,
-        covariance=adjusted.covariance,
-        translation_residual_m=metres,
-        rotation_residual_rad=radians,
-        robot_noise=RobotNoise(
-            *adjusted.noise,
-            exceeds(adjusted.noise, adjusted.given_noise),
-            adjusted.given_noise,
-            adjusted.systematic,
-            adjusted.systematic_left,
+        estimate=Estimate(
+            gripper_from_camera=x,
+            scale=adjusted.scale,
+            base_from_recon=adjusted.base_from_recon,
+            covariance=adjusted.covariance,
+            budget=adjusted.budget,
+            intrinsics=adjusted.bundle.camera,
+            intrinsics_covariance=adjusted.intrinsics_covariance,
         ),
-        budget=adjusted.budget,
-        residual_translation=delta_t,
-        residual_rotation=delta_r,
-        intrinsics=adjusted.bundle.camera,
-        intrinsics_covariance=adjusted.intrinsics_covariance,
+        images=ImageResiduals(
+            inliers=used,
+            translation_residual_m=metres,
+            rotation_residual_rad=radians,
+            reasons=hand_eye.images.reasons,
+            reprojection_px=reprojection,
+        ),
+        residuals=PaperResiduals(delta_t, delta_r),
+        robot=RobotExamined(noise),
         held_out=_held_out(adjusted),
-        reprojection_px=reprojection,
-        refinement=refinement,
+        before=hand_eye,
     )
 
 

@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.records import Attempt, DepthCheck, HeldOut, Requirement, ScaleCheck
+from jcr.records import Attempt, DepthCheck, HeldOut
+from jcr.records.words import network_scale, reached_in_words
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
@@ -15,18 +16,6 @@ if TYPE_CHECKING:
         UncertaintyBudget,
     )
 
-CLEAR = 0.01
-"""Chance of residuals by random errors alone, below which systematic ones are spoken of."""
-SURE = 2.5
-"""Standard deviations from which a joint's offset, or a ratio of angles, is named."""
-NOTABLE_RATIO = 0.003
-NOTABLE_ERRORS = 0.03, 0.003
-"""mm, degrees; real arms err by more, and of less nobody need hear."""
-SHORT = "not as exact as needed"
-SCALE_FROM_ROBOT = (
-    "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no image shows it, and ± "
-    "does not include it; the size of a board or --known-length would show it"
-)
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
 
@@ -80,94 +69,16 @@ def found(content: "CalibrationFile") -> list[str]:
         lines.append(f"  {scale_in_words(content.scale_check)}")
     if content.depth_check is not None:
         lines.append(depth_in_words(content.depth_check))
-    lines += robot_in_words(content)
     if (held_out := content.held_out) is not None:
         lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
 
 
-def reached_in_words(required: Requirement) -> str:
-    """What 95 % of the errors stay below, and whether that is what was asked."""
-    where = f" {significant(required.distance_mm, 3)} mm ahead of the camera" if required.distance_mm else ""
-    asked = "asked for" if required.asked else "needed to grasp"
-    return (
-        f"95 % of errors are below {significant(required.reached_mm)} mm{where} and "
-        f"{significant(required.reached_deg)}°; {needed(required)} are {asked}"
-    )
-
-
-def needed(required: Requirement) -> str:
-    """The numbers that must be reached."""
-    return f"{required.translation_mm:g} mm and {required.rotation_deg:g}°"
-
-
-def shortfall(content: "CalibrationFile") -> str | None:
-    """That the calibration is not as exact as is required, and what would help; None where it is."""
-    if (required := content.requirement) is None or required.is_met:
-        return None
-    if required.more_images is not None:
-        more = (
-            f"add {required.more_images} image{'s' * (required.more_images > 1)} at the poses of next_poses"
-        )
-    elif (
-        content.uncertainty is not None
-        and content.uncertainty.budget is not None
-        and not more_images_help(content.uncertainty.budget)
-    ):
-        more = "most of it comes from systematic robot errors: name the arm (--robot) or add its joint angles"
-    else:
-        more = "a dozen more images would not be enough; move closer to the scene, or use a better camera or robot"
-    return f"{SHORT}: {reached_in_words(required)}; {more}"
-
-
-def angles_in_words(ratio: float, std: float) -> list[str]:
-    """What camera angles over gripper angles say, where they are clearly not 1; which X it is does not matter."""
-    if abs(ratio - 1) <= max(SURE * std, NOTABLE_RATIO):
-        return []
-    more = "more" if ratio > 1 else "less"
-    return [
-        f"the camera rotates {100 * abs(ratio - 1):.2f} ± {100 * std:.2f} % {more} than the "
-        f"gripper: the focal length or "
-        "the robot's joints are off"
-    ]
-
-
-def robot_in_words(content: "CalibrationFile") -> list[str]:
-    """What the poses tell of the robot itself, where they tell it clearly."""
-    lines = []
-    errors = content.robot_errors
-    notable = errors is not None and (
-        errors.translation_mm > NOTABLE_ERRORS[0] or errors.rotation_deg > NOTABLE_ERRORS[1]
-    )
-    if errors is not None and notable and errors.p is not None and errors.p < CLEAR:
-        chance = f"p = {errors.p:.1g}" if errors.p > 1e-6 else "p < 1e-6"
-        off = [
-            (k, joint)
-            for k, joint in enumerate(errors.joints or [], start=1)
-            if abs(joint.offset_deg) > SURE * joint.std_deg
-        ]
-        if off:
-            named = _joined([f"{k}" for k, _ in off])
-            sizes = _joined([f"{joint.offset_deg:+.2f} ± {joint.std_deg:.2f}°" for _, joint in off])
-            lines.append(f"robot: joint{'s' * (len(off) > 1)} {named} seem off by {sizes} ({chance})")
-        else:
-            lines.append(
-                f"robot: neighbouring poses have similar errors, {errors.translation_mm:.2g} mm and "
-                f"{errors.rotation_deg:.2g}° per axis ({chance}): joint offsets or link errors"
-            )
-    if (angles := content.angle_ratio) is not None:
-        lines += angles_in_words(angles.ratio, angles.std)
-    return lines
-
-
-def _joined(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
 def more_images_help(budget: "UncertaintyBudget") -> bool:
     """Whether more images of the same region shrink the uncertainty, which is then mostly not systematic."""
-    others = [budget.robot_random, budget.intrinsics, budget.images]
-    return budget.robot_systematic.translation_mm**2 < sum(share.translation_mm**2 for share in others)
+    others = [budget.robot_random, budget.intrinsics, budget.images, budget.faults]
+    squares = sum(share.translation_mm**2 for share in others if share is not None)
+    return budget.robot_systematic.translation_mm**2 < squares
 
 
 def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
@@ -178,6 +89,8 @@ def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
         "intrinsics": budget.intrinsics,
         "images": budget.images,
     }
+    if budget.faults is not None:
+        named["faults found"] = budget.faults
     ranked = sorted(named.items(), key=lambda item: -item[1].translation_mm)
     least_mm, least_deg = (
         NOTHING * max(getattr(share, unit) for share in named.values())
@@ -242,12 +155,6 @@ def depth_in_words(check: DepthCheck) -> str:
     return f"depth camera: its lengths {size}; noise {noise} (1 σ); the map uses corrected depth"
 
 
-def scale_in_words(check: "ScaleCheck | NetworkScale") -> str:
+def scale_in_words(check: "NetworkScale") -> str:
     """How far a network's own scale is from the robot's, and how sure that is."""
-    off, std = check.off_percent, check.std_percent
-    if abs(off) < 2 * std:
-        return f"the network's own metre agrees with the robot's ({off:+.2g} ± {std:.2g} %)"
-    if off > 100:
-        return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
-    direction = "long" if off > 0 else "short"
-    return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} compared with the robot's"
+    return network_scale(check.off_percent, check.std_percent)

@@ -16,7 +16,7 @@ from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
-from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel, coefficients_of
+from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
 
 NAMED = 10
 """Images that a message names; of more it says how many."""
@@ -175,14 +175,15 @@ def _common_orientation(folder: Path, images: Sequence[str]) -> int:
     return first
 
 
-def how_turned(capture: Capture) -> str | None:
+def how_turned(capture: Capture) -> Finding | None:
     """What a user must know of a capture whose images are rotated to be shown."""
     if capture.orientation == 1:
         return None
-    return (
-        f"EXIF orientation {capture.orientation}: the images are {TURNED[capture.orientation]}, as viewers show them, "
-        "and gripper_from_camera and the intrinsics are of the camera that would see them so; for a driver that gives "
-        "the sensor's own images remove the tag (exiftool -Orientation= FILES) and calibrate again"
+    return Finding(
+        kind=Kind.IMAGES_ROTATED,
+        severity="warns",
+        value=float(capture.orientation),
+        details={"rotated": TURNED[capture.orientation]},
     )
 
 

@@ -17,6 +17,7 @@ from jcr.errors import InputError
 from jcr.geometry import inverse
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
+from jcr.records.words import sentence
 
 BAGS = (".bag", ".mcap", ".db3")
 
@@ -97,8 +98,9 @@ def read_source(
             require_frames(len(found.base_from_gripper), str(path), 0)
             return found
         require_frames(len(found), str(path), at_least)
-        remarks = [remark for remark in (how_turned(found), how_scaled(found)) if remark is not None]
-        return replace(found, notes=(*found.notes, *remarks))
+        turned = how_turned(found)
+        remarks = (None if turned is None else sentence(turned), how_scaled(found))
+        return replace(found, notes=(*found.notes, *filter(None, remarks)))
     if into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
     return _extracted(path, options, Path(into), reader, progress or silent)

@@ -88,7 +88,7 @@ def found_alone(
         row = own.images.index(verdict.image)
         points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
         pictures.append(PictureFound(verdict.image, verdict.used, points, pixels, verdict.reason))
-    std = found.intrinsics_covariance
+    std = found.estimate.intrinsics_covariance
     return CameraFound(
         camera.name,
         camera.mount,

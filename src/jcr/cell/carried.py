@@ -25,7 +25,7 @@ from jcr.geometry import inverse, scale_translation
 from jcr.handeye.solve import judged, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction, RobotNoise
+from jcr.records import Capture, CellCamera, Estimate, Finding, HandEye, Kind, Reconstruction, RobotNoise
 
 
 def exchanged(capture: Capture) -> Capture:
@@ -84,7 +84,7 @@ def refined(
     rows = reconstruction.image_index[used]
     rigs = scale_translation(reconstruction.recon_from_camera[used], found.scale)
     own = of_images(reconstruction.tracks, found.inliers)
-    if found.refinement is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
+    if found.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         return found
     lens = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
     each = np.arange(len(used))
@@ -114,21 +114,23 @@ def refined(
         ],
         noise,
     )
-    more = np.zeros((7, 7)) if found.lens_shift is None else np.outer(found.lens_shift, found.lens_shift)
+    more = np.zeros((7, 7)) if found.budget is None else found.budget.faults
     robot = RobotNoise(
         *answer.noise, noise is None, noise, found.robot_noise.systematic, answer.systematic_left
     )
     return judged(
         replace(
             found,
-            gripper_from_camera=answer.placed.x[0],
-            scale=found.scale * answer.placed.scale,
-            base_from_recon=answer.placed.z[0],
-            covariance=answer.covariance[:7, :7] + more,
-            robot_noise=robot,
-            intrinsics=answer.placed.scene.cameras[0],
-            budget=None,
-            next_poses=(),
+            estimate=Estimate(
+                gripper_from_camera=answer.placed.x[0],
+                scale=found.scale * answer.placed.scale,
+                base_from_recon=answer.placed.z[0],
+                covariance=answer.covariance[:7, :7] + more,
+                intrinsics=answer.placed.scene.cameras[0],
+                intrinsics_covariance=found.estimate.intrinsics_covariance,
+            ),
+            robot=replace(found.robot, noise=robot),
+            plan=replace(found.plan, next_poses=()),
         )
     )
 
@@ -139,8 +141,7 @@ def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye)
     on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
     if not on_gripper.converged:
         return found
-    why = (
-        f"the images fit a camera that the gripper carries, not a fixed one: write mount gripper for "
-        f"{capture.camera_name}"
+    why = Finding(
+        kind=Kind.WRONG_MOUNT, severity="rejects", mend="mount", details={"camera": capture.camera_name}
     )
-    return replace(found, warnings=(why, *found.warnings))
+    return found.with_findings(why, first=True)

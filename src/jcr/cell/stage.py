@@ -307,7 +307,7 @@ class _Rigs:
         rig = np.full(len(seen.shared), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
-        why = {int(seen.rows[k]): str(found.reasons[k]) for k in np.flatnonzero(~found.inliers)}
+        why = {int(seen.rows[k]): str(found.images.reasons[k]) for k in np.flatnonzero(~found.inliers)}
         self.poses += list(places[used])
         self.arms.append(arm)
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
@@ -350,7 +350,7 @@ def _adjusted(
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     prior = None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not believed here either.
-    if hand_eye.refinement is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
+    if hand_eye.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
     rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
     picture, x_px, point = [own.image], [own.x_px], [own.point]

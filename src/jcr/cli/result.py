@@ -15,8 +15,9 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
 
     Returns exit status 0, or raises NotTrustedError, also of one that is less exact than the user requires.
     """
-    from jcr.calibration.words import shortfall, summary
+    from jcr.calibration.words import summary
     from jcr.cell.cameras_json import in_words
+    from jcr.records.words import sentence
     from jcr.results import RunResult
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
@@ -35,7 +36,8 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     for camera in () if cameras is None else cameras.cameras:
         if camera.doubt is not None:
             raise NotTrustedError(f"camera {camera.name} is rejected: {camera.doubt}")
-    if (short := shortfall(content)) is not None:
+    if content.short is not None:
+        short = sentence(content.short)
         if content.requirement is not None and content.requirement.asked:
             raise NotTrustedError(short)
         sys.stderr.write(f"warning: {short}\n")

@@ -465,4 +465,13 @@ def _budget(
     variance = np.diag(random + systematic + intrinsics + images)
     whole = np.sqrt(np.diag(covariance)[:POSES] / variance)
     share = np.outer(whole, whole)
-    return Budget(*((share * part)[:7, :7] for part in (random, systematic, intrinsics, images)))
+    random, systematic, intrinsics, images = (
+        (share * part)[:7, :7] for part in (random, systematic, intrinsics, images)
+    )
+    return Budget(
+        robot_random=random,
+        robot_systematic=systematic,
+        intrinsics=intrinsics,
+        images=images,
+        faults=np.zeros((7, 7)),
+    )

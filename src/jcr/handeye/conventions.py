@@ -19,6 +19,7 @@ from jcr.handeye.fit import Poses
 from jcr.handeye.robust import least_trimmed
 from jcr.handeye.solve import solve_hand_eye
 from jcr.least_squares import minimise
+from jcr.records import Finding, Kind, Severity
 
 SOLVED = 24
 """At most this many readings are solved in full, the most congruent ones."""
@@ -109,16 +110,21 @@ def better_reading(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[
     return None
 
 
-def explained(found: tuple[Reading, Reading]) -> str:
-    """The finding in one sentence."""
+def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rejects") -> Finding:
+    """That the poses fit when read so, and what reads them so."""
     best, given = (
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
     )
-    name = found[0].name
-    cures = (cure for words, cure in OPTIONS.items() if name.startswith(words))
-    remedy = next(cures, "correct them at their source")
-    return f"the poses fit when read as {name}: {best}, instead of {given}; {remedy}"
+    options = (option for words, option in OPTIONS.items() if found[0].name.startswith(words))
+    remedy = next(options, "correct them at their source")
+    return Finding(
+        kind=Kind.POSE_CONVENTION,
+        severity=severity,
+        mend="poses",
+        value=1e-3 * found[0].translation_mm,
+        details={"reading": found[0].name, "fits": best, "given": given, "remedy": remedy},
+    )
 
 
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:

@@ -1,10 +1,12 @@
-"""Which parts of the calibration the motions can see, in words, with the remedy.
+"""Which parts of the calibration the motions can see.
 
 The excitation of a direction of (translation, rotation, scale) is by how many metres, root mean square over
 the images, one metre along it moves the reported gripper positions, after base_from_recon has followed as
 well as it can; rotations count at geometry.ARM, scale by the spread of the camera centres. It is about 0.4
 for general motion, and the sine of the deviation for a nearly degenerate one.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,7 +15,7 @@ from numpy import ndarray
 from jcr.geometry import ARM, transform
 from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, residuals
 from jcr.handeye.fit import Cues, Poses
-from jcr.records import Excitation, Observability
+from jcr.records import Excitation, Finding, Kind, Observability
 
 MIN_SPREAD = 0.1
 """Metres; camera centres closer together than this say little of scale."""
@@ -56,87 +58,68 @@ def observability(
     recon_from_camera: Poses | None = None,
     cues: Cues | None = None,
 ) -> Observability:
-    """The unseen directions named, one remedy each; camera poses, if given, tell an orbit from a fixed tool."""
+    """A finding for each unseen direction; camera poses, if given, tell an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
-        return Observability(
-            False,
-            ("translation along, and rotation about, the one axis that two images share",),
-            ("add one image or more, rotated by 20° or more about another axis",),
-        )
+        return Observability((_unseen("two images"),))
     found = excitation(base_from_gripper, gripper_from_camera, cues)
     # Few images excite less by chance alone: three general ones as little as twenty at three degrees.
     few = min(1.0, (n - 2) / 4)
     unseen = found.value < WEAK * few
     if not unseen.any():
-        return Observability(True, (), ())
-    grade = "" if found.value[0] < EXACT * few else "nearly unseen: "
-    names, advice = _explain(base_from_gripper, recon_from_camera, found, unseen)
-    return Observability(False, tuple(grade + name for name in names), advice)
+        return Observability()
+    findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
+    if found.value[0] >= EXACT * few:
+        findings = [replace(one, details={**one.details, "nearly": 1.0}) for one in findings]
+    return Observability(tuple(replace(one, value=float(found.value[0])) for one in findings))
 
 
-Words = tuple[tuple[str, ...], tuple[str, ...]]
-"""Names of what is unseen, and remedies."""
+def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
+    """A direction that motions like this (words.py lists them) do not show; an axis, or point, of a frame."""
+    where = {} if at is None else dict(zip("xyz", at.tolist(), strict=True)) | {"frame": frame}
+    return Finding(
+        kind=Kind.UNOBSERVABLE, severity="rejects", mend="motion", details={"motion": motion, **where}
+    )
 
 
-def _explain(
+def _explained(
     base_from_gripper: Poses,
     recon_from_camera: Poses | None,
     found: Excitation,
     unseen: Bool[ndarray, "7"],
-) -> Words:
+) -> list[Finding]:
     # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():
-        return ("translation of the camera in x, y and z: the gripper never rotates (pure translation)",), (
-            "tilt the wrist by 20° or more, about two different axes, in at least three images",
-        )
+        return [_unseen("no rotation")]
     loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
     if still.any():
-        axis = _axis_words(u[:, 0], "base")
-        cure = f"tilt the wrist by 20° or more away from {axis} in two images"
         if unseen.sum() == 1 and not loses_scale:
-            return (f"translation along {axis}: all rotations are about it (planar or SCARA motion)",), (
-                f"{cure}, or give the camera's known height along it",
-            )
-        names = (
-            f"translation along {axis}: all rotations are about it (one fixed axis)",
-            "scale: the camera moves on circles about one axis only",
-            f"rotation of the camera about {axis}",
-        )
-        return names[: max(int(unseen.sum()), 2)], (cure, "move the gripper sideways and in height as well")
+            return [_unseen("planar", u[:, 0], "base")]
+        parts = ("translation", "scale", "rotation")[: max(int(unseen.sum()), 2)]
+        return [_unseen(f"one axis, {part}", u[:, 0], "base") for part in parts]
     if loses_scale:
-        return _lost_scale(base_from_gripper, recon_from_camera)
+        return [_lost_scale(base_from_gripper, recon_from_camera)]
     weakest = found.direction[0]
     what, axis = max(
         (("translation", weakest[:3]), ("rotation", weakest[3:6])), key=lambda part: np.linalg.norm(part[1])
     )
-    return (f"{what} of the camera along {_axis_words(axis / np.linalg.norm(axis), 'gripper')}",), (
-        "rotate the wrist more, about perpendicular axes, in three or more images",
-    )
+    return [_unseen(f"weak {what}", axis / np.linalg.norm(axis), "gripper")]
 
 
-def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Words:
-    """Scale is lost when a point fixed to the gripper stays where it is: which point, and what moves it."""
-    tool = ", ".join(f"{1e3 * x:.0f}" for x in still_point(base_from_gripper)[0])
-    nearer = "take two or more images 20 % nearer to or farther from the point you look at"
+def _lost_scale(base_from_gripper: Poses, recon_from_camera: Poses | None) -> Finding:
+    """Scale is lost when a point fixed to the gripper stays where it is: which point it is."""
+    tool = still_point(base_from_gripper)[0]
     if recon_from_camera is None:
-        return (f"scale: all views rotate about the one point ({tool}) mm in the gripper frame",), (nearer,)
+        return _unseen("one point", tool, "gripper")
     # Which point it is, the cameras know better than X, whose offset trades against the lost scale.
     in_camera, moves, spread = still_point(recon_from_camera)
     if moves > 0.5 * spread:
-        return ("scale: the camera only rotates about its own centre",), (
-            "move the camera sideways by 10 cm or more between images",
-        )
+        return _unseen("own centre")
     if in_camera[2] > np.cos(np.radians(8)) * np.linalg.norm(in_camera):
-        return (
-            "scale and the translation along the optical axis: all views rotate about one point on it "
-            "(look-at orbit at a constant radius)",
-        ), (nearer,)
-    return (f"scale: all views rotate about one tool point fixed at ({tool}) mm in the gripper frame",), (
-        "move that point too: take two or more images with it 10 cm away from where it was",
-    )
+        return _unseen("look-at")
+    return _unseen("tool point", tool, "gripper")
 
 
 def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
@@ -146,10 +129,3 @@ def still_point(a_from_b: Poses) -> tuple[Float[ndarray, "3"], float, float]:
     point = np.linalg.lstsq(rows, -right, rcond=1e-9)[0]
     n = len(a_from_b)
     return point, float(np.linalg.norm(rows @ point + right)) / n**0.5, float(np.linalg.norm(right)) / n**0.5
-
-
-def _axis_words(axis: Float[ndarray, "3"], frame: str) -> str:
-    k = int(np.abs(axis).argmax())
-    if abs(axis[k]) > np.cos(np.radians(10)):
-        return f"the {frame}'s {'xyz'[k]} axis"
-    return f"the axis ({', '.join(f'{x:.2f}' for x in axis)}) of the {frame}"

@@ -1,5 +1,6 @@
 """From poses to a judged hand-eye calibration: robust fit, uncertainty, observability, leave-one-out error."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,18 @@ from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.robust import robust_fit
 from jcr.handeye.systematic import systematic_errors
 from jcr.least_squares import one_blas_thread
-from jcr.records import HandEye, HeldOut, RobotNoise
+from jcr.records import (
+    Estimate,
+    Finding,
+    HandEye,
+    HeldOut,
+    ImageResiduals,
+    Kind,
+    PaperResiduals,
+    RobotExamined,
+    RobotNoise,
+    strongest_first,
+)
 
 MAX_NOISE = (0.02, np.radians(3.0))
 """m, rad: worse than the worst servo arm; poses and images then do not belong together."""
@@ -28,6 +40,8 @@ SCALE_STD = 0.002
 """Relative; of a printed marker's size."""
 FEW = 5
 """Images, below which a wrong one cannot be outvoted and the robot pose noise is hardly known."""
+WELL_ABOVE = 2e-3
+"""m: of a smaller leave-one-out error nothing is said."""
 SURPRISE = 1.5
 """Times the robot noise that was given; more is worth saying."""
 
@@ -103,95 +117,123 @@ def solve_hand_eye(
     )
     used = used_sorted[back]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
-    held_out = _held_out(fit, used_sorted)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
-    hand_eye = HandEye(
-        gripper_from_camera=fit.gripper_from_camera,
-        scale=fit.scale,
-        base_from_recon=fit.base_from_recon,
-        covariance=fit.covariance,
-        inliers=used,
-        translation_residual_m=np.linalg.norm(fit.translation_residual, axis=1)[back],
-        rotation_residual_rad=np.linalg.norm(fit.rotation_residual, axis=1)[back],
-        observability=seen,
-        robot_noise=RobotNoise(
-            *fit.noise, fit.noise_estimated, robot_noise, fit.systematic, fit.systematic_left
-        ),
-        residual_translation=delta_t,
-        residual_rotation=delta_r,
-        converged=False,
-        held_out=held_out,
-        budget=fit.budget,
+    noise = RobotNoise(*fit.noise, fit.noise_estimated, robot_noise, fit.systematic, fit.systematic_left)
+    metres, radians = (
+        np.linalg.norm(residual, axis=1)[back]
+        for residual in (fit.translation_residual, fit.rotation_residual)
     )
-    return judged(replace(hand_eye, reasons=_reasons(hand_eye)))
+    return judged(
+        HandEye(
+            estimate=Estimate(
+                gripper_from_camera=fit.gripper_from_camera,
+                scale=fit.scale,
+                base_from_recon=fit.base_from_recon,
+                covariance=fit.covariance,
+                budget=fit.budget,
+            ),
+            images=ImageResiduals(
+                inliers=used,
+                translation_residual_m=metres,
+                rotation_residual_rad=radians,
+                reasons=_reasons(used, metres, radians, noise),
+            ),
+            residuals=PaperResiduals(delta_t, delta_r),
+            robot=RobotExamined(noise),
+            held_out=_held_out(fit, used_sorted),
+            findings=seen.findings,
+        )
+    )
+
+
+JUDGED = frozenset(
+    {
+        Kind.FEW_AGREE,
+        Kind.POSES_CONTRADICT_IMAGES,
+        Kind.UNCERTAIN,
+        Kind.NOISE_ABOVE_GIVEN,
+        Kind.LEAVE_ONE_OUT,
+        Kind.FEW_IMAGES,
+    }
+)
+"""Kinds of findings that the numbers of a calibration decide by themselves."""
 
 
 def judged(hand_eye: HandEye) -> HandEye:
-    """The calibration with its verdict: `converged`, and a warning for each thing that speaks against it."""
-    doubts = list(_doubts(hand_eye))
-    remarks = list(_remarks(hand_eye))
-    return replace(hand_eye, converged=not doubts, warnings=(*doubts, *remarks))
+    """The calibration with findings of the kinds JUDGED as its numbers say now, after those of other kinds."""
+    others = [finding for finding in hand_eye.findings if finding.kind not in JUDGED]
+    findings = (*others, *_of_agreement(hand_eye), *_of_uncertainty(hand_eye), *_of_residuals(hand_eye))
+    return replace(hand_eye, findings=strongest_first(findings))
 
 
-def _doubts(hand_eye: HandEye):
-    """Reasons not to trust the answer, worst first, each with its remedy."""
-    for name, cure in zip(hand_eye.observability.unobservable, hand_eye.observability.advice, strict=False):
-        yield f"unobservable from these motions: {name}; {cure}"
+def _of_agreement(hand_eye: HandEye) -> Iterator[Finding]:
+    """Too few images, or none, that fit their gripper poses."""
     used, n = int(hand_eye.inliers.sum()), len(hand_eye.inliers)
-    noise = hand_eye.robot_noise
-    disagree = used < max(3, MIN_SHARE_USED * n) and n > 2
-    if disagree:
-        yield (
-            f"only {used} of {n} images agree on one calibration; check that images and poses are paired, "
-            "and the convention of the poses (jcr check)"
+    if used < max(3, MIN_SHARE_USED * n) and n > 2:
+        yield Finding(
+            kind=Kind.FEW_AGREE,
+            severity="rejects",
+            mend="reconstruction",
+            value=float(used),
+            details={"images": float(n)},
         )
-    metres, radians = noise.together
+    metres, radians = hand_eye.robot_noise.together
     if metres > MAX_NOISE[0] or radians > MAX_NOISE[1]:
-        yield (
-            f"gripper poses and images disagree by {1e3 * metres:.0f} mm and "
-            f"{np.degrees(radians):.1f}° per axis; check the pairing and the convention of the poses "
-            "(jcr check)"
+        yield Finding(
+            kind=Kind.POSES_CONTRADICT_IMAGES,
+            severity="rejects",
+            mend="reconstruction",
+            value=metres,
+            details={"rotation": radians},
         )
-    if hand_eye.observability.observable:
-        std = np.sqrt(np.diag(hand_eye.covariance))
-        for value, limit, text in (
-            (std[:3].max(), MAX_STD[0], f"the translation is known to ±{1e3 * std[:3].max():.0f} mm only"),
-            (
-                std[3:6].max(),
-                MAX_STD[1],
-                f"the rotation is known to ±{np.degrees(std[3:6].max()):.1f}° only",
-            ),
-            (std[6], MAX_STD[2], f"the scale is known to ±{100 * std[6]:.0f} % only"),
-        ):
-            if value > limit:
-                # Of few images half the uncertainty may be that the robot's noise is hardly known.
-                tell = ", or give the robot's repeatability (--robot-noise MM DEG)"
-                unknown = noise.given is None and used < FEW
-                yield f"{text}; add images, rotated by 20° or more about different axes{tell if unknown else ''}"
 
 
-def _remarks(hand_eye: HandEye):
-    """What a user should know of an answer that may still be trusted."""
+def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
+    """Each part of the answer that is too uncertain."""
+    if not hand_eye.observability.observable:
+        return
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    # Of few images half the uncertainty may be that the robot's noise is hardly known.
+    unknown = hand_eye.robot_noise.given is None and int(hand_eye.inliers.sum()) < FEW
+    parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
+    for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):
+        if value > limit:
+            yield Finding(
+                kind=Kind.UNCERTAIN,
+                severity="rejects",
+                mend="images",
+                value=float(value),
+                details={"part": part} | ({"noise_unknown": 1.0} if unknown else {}),
+            )
+
+
+def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
+    """What a user should know of an answer that may still be accepted."""
     noise = hand_eye.robot_noise
     metres, radians = _disagreement(hand_eye)
     if noise.given is not None and (
         metres > SURPRISE * noise.given[0] or radians > SURPRISE * noise.given[1]
     ):
-        yield (
-            f"gripper poses and images disagree by {1e3 * metres:.2g} mm and "
-            f"{np.degrees(radians):.2g}° per axis, more than the given robot noise "
-            f"({1e3 * noise.given[0]:.2g} mm, {np.degrees(noise.given[1]):.2g}°): the larger is used"
+        yield Finding(
+            kind=Kind.NOISE_ABOVE_GIVEN,
+            severity="warns",
+            value=metres,
+            details={"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]},
         )
-    held_out = hand_eye.held_out
-    if held_out is not None:
-        typical = 1e3 * np.sqrt(3) * hand_eye.robot_noise.together[0]
-        if held_out.translation_mm > max(3 * typical, 2.0):
-            yield (
-                f"the leave-one-out error ({held_out.translation_mm:.1f} mm) is well above the fit's residual "
-                f"({typical:.1f} mm): too few images for this motion; add some"
+    if (held_out := hand_eye.held_out) is not None:
+        missed, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+        if missed > max(3 * typical, WELL_ABOVE):
+            yield Finding(
+                kind=Kind.LEAVE_ONE_OUT,
+                severity="warns",
+                mend="images",
+                value=missed,
+                details={"residual": typical},
             )
     if len(hand_eye.inliers) < FEW:
-        yield f"with {len(hand_eye.inliers)} images a wrong one cannot be identified; take 8 or more"
+        yield Finding(
+            kind=Kind.FEW_IMAGES, severity="warns", mend="images", value=float(len(hand_eye.inliers))
+        )
 
 
 def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
@@ -201,24 +243,23 @@ def _disagreement(hand_eye: HandEye) -> tuple[float, float]:
     fitted = count / max(count - 13, 1)
     metres, radians = (
         float(np.sqrt(fitted * (residual[used] ** 2).mean() / 3))
-        for residual in (hand_eye.translation_residual_m, hand_eye.rotation_residual_rad)
+        for residual in (hand_eye.images.translation_residual_m, hand_eye.images.rotation_residual_rad)
     )
     return metres, radians
 
 
-def _reasons(hand_eye: HandEye) -> tuple[str | None, ...]:
-    metres, radians = hand_eye.robot_noise.together
-    typical_mm, typical_deg = 1e3 * metres, np.degrees(radians)
+def _reasons(
+    used: Bool[ndarray, " n"], metres: Float[ndarray, " n"], radians: Float[ndarray, " n"], noise: RobotNoise
+) -> tuple[str | None, ...]:
+    typical_m, typical_rad = noise.together
     return tuple(
         None
-        if used
+        if is_used
         else (
-            f"its gripper pose is {1e3 * metres:.1f} mm and {np.degrees(radians):.2f}° from where the other "
-            f"images put it (their noise: {typical_mm:.1f} mm, {typical_deg:.2f}°)"
+            f"its gripper pose is {1e3 * m:.1f} mm and {np.degrees(rad):.2f}° from where the other "
+            f"images put it (their noise: {1e3 * typical_m:.1f} mm, {np.degrees(typical_rad):.2f}°)"
         )
-        for used, metres, radians in zip(
-            hand_eye.inliers, hand_eye.translation_residual_m, hand_eye.rotation_residual_rad, strict=True
-        )
+        for is_used, m, rad in zip(used, metres, radians, strict=True)
     )
 
 

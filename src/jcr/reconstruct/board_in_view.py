@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from jcr.reconstruct.board import boards
+from jcr.records import Finding, Kind
 
 LOOKED_AT = 3
 """Images; a board that helps is in most of them."""
@@ -90,11 +91,8 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     return f"chessboard:{across}x{down}:SIDE"
 
 
-def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
-    """A sentence that proposes the board in view; None where there is none."""
-    if (spec := board_in_view(images)) is None:
+def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:
+    """That a board is in view, and the --board that would use it; None where there is none."""
+    if (board := board_in_view(images)) is None:
         return None
-    lengths = "SIDE of a square and MARKER" if "MARKER" in spec else "SIDE"
-    return (
-        f"a calibration board is in view: try --board {spec} with its {lengths} in metres (jcr docs markers)"
-    )
+    return Finding(kind=Kind.BOARD_IN_VIEW, severity="warns", mend="reconstruction", details={"board": board})

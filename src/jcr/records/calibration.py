@@ -1,12 +1,14 @@
 """Where the camera sits on the gripper, how well that is known, and what was found on the way."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.records.capture import Intrinsics
+from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdict_of
+from jcr.records.words import remedy, sentence, unobservable
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,23 @@ class ImageVerdict:
 class Observability:
     """Which directions of (translation, rotation, scale) the motions can see."""
 
-    observable: bool
-    unobservable: tuple[str, ...]
-    """In words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
-    advice: tuple[str, ...]
-    """One remedy per unobservable direction."""
+    findings: tuple[Finding, ...] = ()
+    """One of kind UNOBSERVABLE per direction that they cannot."""
+
+    @property
+    def observable(self) -> bool:
+        """Whether they see all."""
+        return not self.findings
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        """In words, e.g. "scale: every view rotates about one point fixed to the gripper"."""
+        return tuple(unobservable(finding) for finding in self.findings)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """One remedy per unobservable direction."""
+        return tuple(remedy(finding) for finding in self.findings)
 
 
 @dataclass(frozen=True)
@@ -88,7 +102,7 @@ class JointOffsets:
     """rad: of any joint, before its own poses are asked."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Budget:
     """What the covariance of a calibration comes from; in COVARIANCE_ORDER, and their sum is the covariance."""
 
@@ -98,6 +112,8 @@ class Budget:
     """What would go if they were known."""
     images: Float[ndarray, "7 7"]
     """Camera poses and features; and what is unobservable."""
+    faults: Float[ndarray, "7 7"]
+    """What findings and their uncertainty add."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +184,9 @@ class Requirement:
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
 
 
-@dataclass(frozen=True)
-class HandEye:
-    """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What was estimated, and how well it is known."""
 
     gripper_from_camera: Float[ndarray, "4 4"]
     scale: float
@@ -178,38 +194,51 @@ class HandEye:
     base_from_recon: Float[ndarray, "4 4"]
     """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
     covariance: Float[ndarray, "7 7"]
-    inliers: Bool[ndarray, " n"]
-    """Per pose given to the solver."""
-    translation_residual_m: Float[ndarray, " n"]
-    """Per pose: distance from where the fit puts the gripper."""
-    rotation_residual_rad: Float[ndarray, " n"]
-    observability: Observability
-    robot_noise: RobotNoise
-    residual_translation: float
-    """Mean δ_t in metres over consecutive used poses, as the paper defines it."""
-    residual_rotation: float
-    """Mean δ_R, Frobenius norm, likewise."""
-    converged: bool
-    warnings: tuple[str, ...] = ()
+    """In COVARIANCE_ORDER."""
+    budget: Budget | None = None
+    """Parts of the covariance; None where it was not divided."""
     intrinsics: Intrinsics | None = None
     """Refined by bundle adjustment; None when poses alone were given."""
     intrinsics_covariance: Float[ndarray, "q q"] | None = None
     """In the order of camera.parameters; None where they were not refined."""
-    held_out: HeldOut | None = None
+
+    def with_fault(self, covariance: Float[ndarray, "7 7"]) -> "Estimate":
+        """The same, as uncertain as a fault with this covariance makes it."""
+        budget = self.budget
+        if budget is not None:
+            budget = replace(budget, faults=budget.faults + covariance)
+        return replace(self, covariance=self.covariance + covariance, budget=budget)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageResiduals:
+    """What the calibration says of each pose that the solver was given."""
+
+    inliers: Bool[ndarray, " n"]
+    translation_residual_m: Float[ndarray, " n"]
+    """Distance from where the fit puts the gripper."""
+    rotation_residual_rad: Float[ndarray, " n"]
     reasons: tuple[str | None, ...] = ()
-    """Per pose: why it was rejected, None when used."""
+    """Why it was rejected, None when used."""
     reprojection_px: Float[ndarray, " n"] | None = None
-    """Per pose: median reprojection error after bundle adjustment; NaN where it took no part."""
-    scale_check: ScaleCheck | None = None
-    """None where the reconstruction's unit is not meant to be the metre."""
-    scale_from_robot_alone: bool = False
-    """Neither a known length nor a depth camera took part."""
-    lens_shift: Float[ndarray, "7"] | None = None
-    """How far the intrinsics that the images show, in place of the one given, would move the answer; in
-    COVARIANCE_ORDER,
-    and in the covariance. None where nothing speaks against the intrinsics."""
-    refinement: "Refinement | None" = None
-    """None where camera poses alone decided."""
+    """Median reprojection error after bundle adjustment; NaN where it took no part."""
+
+
+@dataclass(frozen=True)
+class PaperResiduals:
+    """Residuals of consecutive used poses, as the paper defines them."""
+
+    translation: float
+    """Mean δ_t (m)."""
+    rotation: float
+    """Mean δ_R, Frobenius norm."""
+
+
+@dataclass(frozen=True)
+class RobotExamined:
+    """What the residuals say of the robot itself."""
+
+    noise: RobotNoise
     systematic_p: float | None = None
     """Chance of residuals like these where the robot's errors are random alone."""
     joint_offsets: JointOffsets | None = None
@@ -217,26 +246,120 @@ class HandEye:
     angle_ratio: tuple[float, float] | None = None
     """Rotation angles between cameras over those between grippers, 1 whatever gripper_from_camera is, and its standard
     deviation."""
-    budget: Budget | None = None
-    """Of the covariance, without what `lens_shift` adds to it."""
+
+
+@dataclass(frozen=True)
+class ScaleEvidence:
+    """What else than the robot's positions says how long a metre is."""
+
+    network: ScaleCheck | None = None
+    """None where the reconstruction's unit is not meant to be the metre."""
+    depth: DepthCheck | None = None
+    """None without depth images, or where too few features have a depth."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How exact the calibration must be, and the poses that would make it so."""
+
     excitation: Excitation | None = None
-    """Of the used poses by themselves; None where the solver was asked and not the calibration stage."""
+    """Of the used poses by themselves."""
     next_poses: tuple[NextPose, ...] = ()
     """Those that would shrink the reported uncertainty most; `like` counts the used poses."""
-    depth_check: DepthCheck | None = None
-    """None without depth images, or where too few features have a depth."""
     requirement: Requirement | None = None
     """None where the solver was asked and not the calibration stage."""
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """What the images' features changed of the fit to camera poses alone."""
+@dataclass(frozen=True, kw_only=True)
+class HandEye:
+    """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
 
-    before: HandEye
-    moved_m: float
-    """Of the camera on the gripper."""
-    turned_rad: float
+    estimate: Estimate
+    images: ImageResiduals
+    residuals: PaperResiduals
+    robot: RobotExamined
+    held_out: HeldOut | None = None
+    scale_evidence: ScaleEvidence = ScaleEvidence()
+    plan: Plan = Plan()
+    findings: tuple[Finding, ...] = ()
+    """Strongest first; of the same severity causes before consequences."""
+    before: "HandEye | None" = None
+    """The fit to camera poses alone; None where that decided."""
+
+    def with_findings(self, *findings: Finding, first: bool = False) -> "HandEye":
+        """The same with more findings after those of the same severity, or before them."""
+        together = (*findings, *self.findings) if first else (*self.findings, *findings)
+        return replace(self, findings=strongest_first(together))
+
+    @property
+    def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
+        """Where the camera sits on the gripper."""
+        return self.estimate.gripper_from_camera
+
+    @property
+    def scale(self) -> float:
+        """Metres per unit of the reconstruction."""
+        return self.estimate.scale
+
+    @property
+    def base_from_recon(self) -> Float[ndarray, "4 4"]:
+        """Rigid; maps recon coordinates *already multiplied by scale* to the base frame."""
+        return self.estimate.base_from_recon
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"]:
+        """In COVARIANCE_ORDER."""
+        return self.estimate.covariance
+
+    @property
+    def budget(self) -> Budget | None:
+        """Parts of the covariance."""
+        return self.estimate.budget
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Refined by bundle adjustment; None when poses alone were given."""
+        return self.estimate.intrinsics
+
+    @property
+    def inliers(self) -> Bool[ndarray, " n"]:
+        """Per pose given to the solver: whether it is used."""
+        return self.images.inliers
+
+    @property
+    def robot_noise(self) -> RobotNoise:
+        """Of the gripper poses."""
+        return self.robot.noise
+
+    @property
+    def requirement(self) -> Requirement | None:
+        """How exact it must be, and is; None where the solver was asked and not the calibration stage."""
+        return self.plan.requirement
+
+    @property
+    def next_poses(self) -> tuple[NextPose, ...]:
+        """Gripper poses worth adding."""
+        return self.plan.next_poses
+
+    @property
+    def observability(self) -> Observability:
+        """Which directions the motions can see."""
+        return Observability(tuple(one for one in self.findings if one.kind is Kind.UNOBSERVABLE))
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of the worst finding."""
+        return verdict_of(self.findings)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is accepted."""
+        return self.verdict != "rejected"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each finding that rejects or warns."""
+        return tuple(sentence(finding) for finding in self.findings if finding.severity != "informs")
 
 
 @dataclass(frozen=True)

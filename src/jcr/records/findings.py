@@ -5,9 +5,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
-from jaxtyping import Float
-from numpy import ndarray
-
 Severity = Literal["rejects", "warns", "informs"]
 Mend = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
 """What would help: another reconstruction of the same images, other motions, more or other images, other intrinsics,
@@ -49,6 +46,7 @@ class Kind(StrEnum):
     BOARD_IN_VIEW = "board in view"
     RECONSTRUCTION = "reconstruction"
     NO_RECONSTRUCTION = "no reconstruction"
+    EARLIER_VERSION = "from a file of an earlier version"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +66,30 @@ class Finding:
     """One standard deviation of the value."""
     p: float | None = None
     """Chance of this or more where there is nothing to find."""
-    shift: Float[ndarray, "7"] | None = None
+    shift: tuple[float, ...] | None = None
     """How far the calibration would move if this were allowed for, in COVARIANCE_ORDER; its outer product is part of
     the covariance. None where it adds nothing."""
     details: Mapping[str, float | str] = field(default_factory=dict)
-    """Further numbers and names that the sentence needs."""
+    """Further numbers (m, rad, px, shares) and names that the sentence needs."""
 
 
+CAMERA = frozenset(
+    {
+        Kind.FOCUS_BY_DISTANCE,
+        Kind.FOCUS_BY_IMAGE,
+        Kind.ZOOM,
+        Kind.ROLLING_SHUTTER,
+        Kind.ROLLING_SHUTTER_BY_IMAGE,
+        Kind.INTRINSICS,
+    }
+)
+"""Kinds that say that the camera is not one with these intrinsics."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
+
+
+def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """What rejects, then what warns, then what informs; of the same severity in the order given, causes first."""
+    return tuple(sorted(findings, key=lambda finding: RANK[finding.severity]))
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:

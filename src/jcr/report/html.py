@@ -14,17 +14,15 @@ from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.words import (
-    SHORT,
     attempt_in_words,
     budget_in_words,
     missed,
     pixels,
-    reached_in_words,
-    shortfall,
 )
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics
+from jcr.records.words import SHORT, reached_in_words, remedy
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.features import features_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
@@ -198,12 +196,12 @@ def _links(sections: Sequence[str]) -> str:
 def _verdict(calibration: CalibrationFile) -> str:
     held_out, required = calibration.held_out, calibration.requirement
     miss = "" if held_out is None else missed(held_out)
-    short = shortfall(calibration)
+    short = calibration.short
     if calibration.doubt is not None:
         kind, headline = "bad", f"<b>Do not trust this calibration:</b> {escape(calibration.doubt)}."
     elif short is not None:
-        say = escape(short.removeprefix(f"{SHORT}: "))
-        kind, headline = "fair", f"<b>{SHORT.capitalize()}:</b> {say}."
+        say = "" if required is None else f"{reached_in_words(required)}; {remedy(short)}"
+        kind, headline = "fair", f"<b>{SHORT.capitalize()}:</b> {escape(say)}."
     else:
         within = "nothing speaks against it" if required is None else escape(reached_in_words(required))
         kind, headline = "good", f"<b>Trusted:</b> {within}."

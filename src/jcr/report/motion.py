@@ -39,7 +39,7 @@ def motion_section(result: RunResult | PosesResult) -> str:
             '<p class="soft">One standard deviation, axes of the gripper frame; scale '
             f"±{significant(uncertainty.scale_std_percent)}\u00a0%.</p>"
         )
-    found = result.hand_eye.excitation
+    found = result.hand_eye.plan.excitation
     bars = "" if found is None else excitation_bars(found)
     return filled("motion.html", says=says, bars=bars, spreads=spreads, next_poses=_next_poses(result))
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.words import missed
+from jcr.geometry import step_between
 from jcr.records import HandEye
 from jcr.report.markup import filled
 from jcr.report.pictures import shown_names
@@ -17,9 +18,9 @@ from jcr.rounding import significant
 
 def residuals_section(result: RunResult | PosesResult) -> str:
     """Residuals image by image and of the whole, before and after the images' features refined the fit."""
-    now, refinement = result.hand_eye, result.hand_eye.refinement
+    now, before = result.hand_eye, result.hand_eye.before
     rows, used = [], now.inliers
-    fits = [now] if refinement is None else [now, refinement.before]
+    fits = [now] if before is None else [now, before]
     longest_mm, longest_deg = (
         max(float(residual(fit)[used].max(initial=0.0)) for fit in fits) or 1.0
         for residual in (_residual_mm, _residual_deg)
@@ -33,12 +34,13 @@ def residuals_section(result: RunResult | PosesResult) -> str:
             f"<td>{position}</td><td>{orientation}</td></tr>"
         )
     heads, moved, tick = ["from camera poses"], "", ""
-    if refinement is not None:
+    if before is not None:
+        step = step_between(before.gripper_from_camera, now.gripper_from_camera)
         heads = ["from camera poses alone", "with the images' features"]
         moved = (
             "<p>Refining with the images' features moved the camera on the gripper by "
-            f"{significant(1e3 * refinement.moved_m)} mm and "
-            f"{significant(float(np.degrees(refinement.turned_rad)))}°.</p>"
+            f"{significant(1e3 * float(np.linalg.norm(step[:3])))} mm and "
+            f"{significant(float(np.degrees(np.linalg.norm(step[3:]))))}°.</p>"
         )
         tick = (
             " The upright tick is the same image by camera poses alone, before its features refined the fit."
@@ -55,11 +57,11 @@ def residuals_section(result: RunResult | PosesResult) -> str:
 
 
 def _residual_mm(fit: HandEye) -> Float[ndarray, " n"]:
-    return 1e3 * fit.translation_residual_m
+    return 1e3 * fit.images.translation_residual_m
 
 
 def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
-    return np.degrees(fit.rotation_residual_rad)
+    return np.degrees(fit.images.rotation_residual_rad)
 
 
 def _why_noise_is_larger(fit: HandEye) -> str:
@@ -90,8 +92,8 @@ def _whole(fits: Sequence[HandEye]) -> str:
     held_out = [missed(fit.held_out) if fit.held_out else "–" for fit in fits]
     rows = {
         "leave-one-out error": held_out,
-        "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residual_translation)} mm" for fit in fits],
-        "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residual_rotation) for fit in fits],
+        "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residuals.translation)} mm" for fit in fits],
+        "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residuals.rotation) for fit in fits],
     }
     return "".join(
         f"<tr><th>{name}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"

@@ -11,9 +11,9 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from viser.extras import ViserUrdf
 
-from jcr.calibration.words import reached_in_words, shortfall
 from jcr.geometry import apply
 from jcr.progress import Progress, silent
+from jcr.records.words import reached_in_words, sentence
 from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.represent.scene import Unknown
 from jcr.view.layers import (
@@ -82,9 +82,9 @@ class Viewer:
         calibration, held_out = self.run.calibration, self.run.calibration.held_out
         lines = []
         if not calibration.converged:
-            lines.append(f"**Do not trust this calibration:** {calibration.warnings[0]}")
-        elif (short := shortfall(calibration)) is not None:
-            lines.append(f"**{short}**")
+            lines.append(f"**Do not trust this calibration:** {calibration.doubt}")
+        elif (short := calibration.short) is not None:
+            lines.append(f"**{sentence(short)}**")
         elif calibration.requirement is not None:
             lines.append(f"**Trusted:** {reached_in_words(calibration.requirement)}")
         if calibration.converged and held_out is not None:

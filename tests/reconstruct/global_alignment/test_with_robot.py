@@ -155,7 +155,7 @@ def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: 
     )
     reconstruction = replace(made, predictions=network).reconstruction()
     found = calibrate(made.capture, reconstruction)
-    check = found.scale_check
+    check = found.scale_evidence.network
     assert abs(check.off_percent - off_percent) < 4 * check.std_percent * factor
     assert check.std_percent < 0.2 * factor
     content = calibration_file(made.capture, reconstruction, found, {}, "0")
@@ -165,7 +165,7 @@ def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: 
     assert ("too long" in scale_in_words(check)) == (factor == 1.05)
     assert ("times the robot's" in scale_in_words(check)) == (factor == 1000)
     unknown = calibrate(made.capture, replace(reconstruction, is_metric=False))
-    assert unknown.scale_check is None
+    assert unknown.scale_evidence.network is None
 
 
 def test_evidence_survives_the_file(tmp_path: Path):
