@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
-from jcr.calibration.bundle import adjust
+from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
+from jcr.handeye.equation import predict
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
@@ -103,8 +104,9 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     cameras, m = found.base_from_camera, len(found.base_from_camera)
     start = np.eye(4), 1.0, np.eye(4)
     free = prior_of(found.lens, ESTIMATED) if estimated else prior_of(found.lens, HELD)
-    sfm = adjust(cameras, start, cameras, found.lens, found.tracks, LOOSE, free)
-    lens = sfm.bundle.camera
+    sfm = adjust_wrist(cameras, start, cameras, found.lens, found.tracks, noise=LOOSE, prior=free)
+    lens, x = sfm.placed.scene.cameras[0], sfm.placed.x[0]
+    rigs = predict(x, sfm.placed.scale, sfm.placed.z[0], sfm.placed.scene.world_from_rig)
     capture = Capture(
         Path("."),
         tuple(f"{k:02d}.png" for k in range(m)),
@@ -114,7 +116,7 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     )
     return capture, Reconstruction(
         np.arange(m),
-        sfm.bundle.base_from_gripper @ sfm.bundle.gripper_from_camera,
+        rigs @ x,
         lens,
         lens,
         np.zeros((m, 1, 1, 3), np.float32),

@@ -12,8 +12,8 @@ from numpy import ndarray
 
 from benchmarks.figure import png
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
-from jcr.calibration.bundle import adjust
-from jcr.calibration.stage import of_images
+from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.calibration.case import of_images
 from jcr.files import write_bytes
 from jcr.geometry import scale_translation
 from jcr.handeye.solve import solve_hand_eye
@@ -101,14 +101,14 @@ def _solvers() -> dict[str, Solver]:
         start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
         used = start.inliers
         tracks = of_images(observed(problem, np.random.default_rng(seed), 300, 0.3), used)
-        adjusted = adjust(
+        adjusted = adjust_wrist(
             problem.base_from_gripper[used],
             (start.gripper_from_camera, start.scale, start.base_from_recon),
             problem.recon_from_camera[used],
             LENS,
             tracks,
         )
-        return adjusted.bundle.gripper_from_camera, adjusted.scale
+        return adjusted.placed.x[0], recon_frame(adjusted, tracks)[0]
 
     solvers: dict[str, Solver] = {
         "jcr, poses only": pose_only,
@@ -263,9 +263,9 @@ def _time() -> list[str]:
         ("jcr: closed form, outliers, uncertainty, observability, leave-one-out error", 15,
          lambda: solve_hand_eye(gripper, camera), 21),
         (f"jcr: bundle adjustment, {len(tracks.image)} observations", 15,
-         lambda: adjust(gripper, pose_fit, camera, LENS, tracks), 3),
+         lambda: adjust_wrist(gripper, pose_fit, camera, LENS, tracks), 3),
         (f"jcr: bundle adjustment, {len(large_tracks.image)} observations", 36,
-         lambda: adjust(large.base_from_gripper, large_fit, large.recon_from_camera, LENS, large_tracks), 1),
+         lambda: adjust_wrist(large.base_from_gripper, large_fit, large.recon_from_camera, LENS, large_tracks), 1),
         ("paper's grid search: closed form, all values at once", 15, lambda: grid_search(gripper, camera), 21),
         ("Andreff with scale: closed form", 15, lambda: andreff_with_scale(gripper, camera), 21),
         *(

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from benchmarks.peers import opencv
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
-from jcr.calibration.bundle import adjust
+from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
@@ -137,8 +137,11 @@ def _adjusted(
 ) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "6 6"], bool]:
     solved = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     start = solved.gripper_from_camera, solved.scale, solved.base_from_recon
-    found = adjust(problem.base_from_gripper, start, problem.recon_from_camera, given, tracks, None, free)
-    return found.bundle.gripper_from_camera, found.scale, found.covariance[:6, :6], True
+    found = adjust_wrist(
+        problem.base_from_gripper, start, problem.recon_from_camera, given, tracks, prior=free
+    )
+    scale, _ = recon_frame(found, tracks)
+    return found.placed.x[0], scale, found.covariance[:6, :6], True
 
 
 def _missed(

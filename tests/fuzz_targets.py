@@ -16,7 +16,7 @@ from jcr.calibration.calibration_json import (
     write_calibration,
 )
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.stage import calibrate_poses
+from jcr.calibration.poses import calibrate_poses
 from jcr.capture import capture_json
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.images import read_image

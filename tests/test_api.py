@@ -28,11 +28,11 @@ def test_the_api_is_listed_and_every_name_of_it_is_there():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "first", ["import jcr.calibration.bundle as b, jcr.handeye.solve as s", "import jcr; jcr.calibrate"]
+    "first", ["import jcr.adjust.wrist as b, jcr.handeye.solve as s", "import jcr; jcr.calibrate"]
 )
 def test_packages_and_functions_have_names_of_their_own(first: str):
     done = python(
-        f"{first}\nimport jcr.calibration.bundle as b, jcr.handeye.solve as s, jcr\n"
+        f"{first}\nimport jcr.adjust.wrist as b, jcr.handeye.solve as s, jcr\n"
         "assert jcr.calibrate is jcr.pipeline.calibrate and s.solve_hand_eye is jcr.solve_hand_eye and b.adjust"
     )
     assert done.returncode == 0, done.stderr

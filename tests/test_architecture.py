@@ -18,6 +18,7 @@ LAYERS = [
     {"geometry", "records", "files", "memory", "progress"},
     {"camera", "intrinsics_json", "least_squares"},
     {"handeye"},
+    {"adjust"},
     {"capture"},
     {"match"},
     {"reconstruct"},
@@ -42,10 +43,11 @@ BACK_ENDS = ["backends", "from_pairs", "colmap", "marker", "predictions"]
 SOLVERS = [
     "least_squares",
     *(f"handeye.{name}" for name in ("closed_form", "fit", "known_scale", "residuals", "robust", "solve")),
-    *(f"cell.{name}" for name in ("bundle", "carried", "localise", "stage", "ties")),
+    "adjust",
+    *(f"cell.{name}" for name in ("carried", "localise", "stage")),
     *(
         f"calibration.{name}"
-        for name in ("bundle", "cues", "drift", "elimination", "given_intrinsics", "stage")
+        for name in ("adjust", "case", "checks", "cues", "drift", "fit", "poses", "stage", "verdict")
     ),
     *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
 ]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import calibrate, missed_m
+from jcr.calibration.stage import calibrate
 from jcr.calibration.words import missed
 from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
@@ -143,7 +143,8 @@ class _Tried:
     @property
     def missed_m(self) -> float:
         """Error on images left out; infinite where there were too few to leave one out."""
-        return missed_m(None if self.hand_eye is None else self.hand_eye.held_out)
+        held_out = None if self.hand_eye is None else self.hand_eye.held_out
+        return float("inf") if held_out is None else held_out.length_m
 
     @property
     def is_enough(self) -> bool:

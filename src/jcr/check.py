@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.calibration.checks.robot import angle_finding
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_errors import angle_finding, robot_errors
+from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
 from jcr.errors import NotTrustedError
@@ -88,7 +89,7 @@ def check(
             "the positions may have been divided by 1000"
         )
     if isinstance(capture, Capture):
-        _, _, unused = robot_errors(capture, CalibrateOptions())
+        unused = robot_errors(capture, CalibrateOptions()).unused
         remarks += [] if unused is None else [sentence(unused)]
     held, quick = None, False
     if isinstance(capture, PosePairs):

@@ -13,8 +13,8 @@ from jcr import __version__
 from jcr.attempts import Choice, NothingFoundError, again, choose, deepened, timings_of
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.stage import calibrate_poses as calibrate_poses_stage
-from jcr.calibration.stage import is_one
+from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
+from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images, write_added
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras

@@ -136,7 +136,8 @@ def verify(
     if shared:
         places = [place for place in located if isinstance(place, Located)]
         used = reconstruction.image_index[_used(calibration, reconstruction)]
-        errors, _, unused = robot_errors(capture, options_then.calibrate, new)
+        robot = robot_errors(capture, options_then.calibrate, new)
+        errors, unused = robot.systematic, robot.unused
         systematic = of_poses(errors, np.r_[used, len(capture) + np.array(shared)])
         old = of_poses(errors, used)
         found = drift(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jcr.calibration import elimination
+from jcr.adjust import elimination
 from jcr.adjust.elimination import Derivatives, Sightings, with_points_held, without_points
 
 SHARED, OWN, IMAGES, POINTS = 4, 3, 5, 12

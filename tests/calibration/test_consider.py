@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 import jcr
-from jcr.calibration.consider import with_intrinsics_considered
 from jcr.adjust.intrinsics_prior import prior_of
+from jcr.calibration.consider import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import inverse, transform
 from jcr.handeye.fit import Cues

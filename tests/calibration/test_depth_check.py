@@ -9,7 +9,7 @@ import pytest
 
 from analytic_scene import FOCAL_PX, HEIGHT, WIDTH, cast_depth, looking_at_table
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
-from jcr.calibration.depth_check import depth_check
+from jcr.calibration.checks.depth_camera import depth_check
 from jcr.calibration.words import summary
 from jcr.camera import rays
 from jcr.capture.depth_images import read_depth

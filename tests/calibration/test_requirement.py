@@ -7,8 +7,8 @@ import pytest
 from jcr import pipeline
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.requirement import GRASPING, advised, within_95
-from jcr.calibration.stage import calibrate_poses
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli.output import Output

@@ -3,8 +3,9 @@
 import numpy as np
 
 from benchmarks.attack import reconstructed
-from jcr.calibration import stage
-from jcr.calibration.bundle import adjust
+from jcr.adjust.wrist import adjust_wrist
+from jcr.calibration import adjust as adjust_stage
+from jcr.calibration import case
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.records import Tracks
@@ -18,12 +19,12 @@ def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypat
     most = len(found.tracks.image) // 3
     used: list[Tracks] = []
 
-    def watched(*arguments):
+    def watched(*arguments, **options):
         used.append(arguments[4])
-        return adjust(*arguments)
+        return adjust_wrist(*arguments, **options)
 
-    monkeypatch.setattr(stage, "MOST_OBSERVATIONS", most)
-    monkeypatch.setattr(stage, "adjust", watched)
+    monkeypatch.setattr(case, "MOST_OBSERVATIONS", most)
+    monkeypatch.setattr(adjust_stage, "adjust_wrist", watched)
     hand_eye, again = (calibrate(capture, reconstruction) for _ in range(2))
     tracks, given = used[0], found.tracks
     assert hand_eye.inliers.all()

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.stage import calibrate_poses
+from jcr.calibration.poses import calibrate_poses
 from jcr.geometry import inverse, transform
 from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.next_poses import next_poses

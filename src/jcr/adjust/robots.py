@@ -204,11 +204,12 @@ def adjust(
     white = np.tile(np.repeat(noise or START_NOISE, 3) ** 2.0, sum(len(arm.rigs) for arm in arms))
     robots = _rig_information(placed, arms, np.diag(white))
     pixels, damping, log_sizes = noise_of(scene, view_of(scene, problem), problem), 1e-4, None
+    given = Given(evidence=evidence(scene, problem, pixels), arms=tuple(arms), noise=noise)
     for _ in range(ROUNDS):
         before = pixels, log_sizes
         scene, view, damping = minimised(placed.scene, problem, pixels, robots, damping)
         pixels = noise_of(scene, view, problem, pixels)
-        given = Given(evidence=evidence(scene, problem, pixels), arms=tuple(arms), noise=noise)
+        given = replace(given, evidence=evidence(scene, problem, pixels))
         placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
         equations, _ = equations_of(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))

@@ -1,10 +1,10 @@
 """What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
 
-The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length and a
-shear for each image by itself. A hypothesis is a few combinations of these columns. How much freeing them would lower the
-cost, at one Gauss-Newton step, over the dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil. Soc.
-44, 1948), here beside F, for the robot pose noise was estimated from few residuals. The same step shows how large they are
-and how far X would move; the adjustment with them free (`freed`) is what they come to.
+The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length and
+a shear for each image by itself. A hypothesis is a few combinations of these columns. How much freeing them would lower
+the cost, at one Gauss-Newton step, over the dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil.
+Soc. 44, 1948), here beside F, for the robot pose noise was estimated from few residuals. The same step shows how large
+they are and how far X would move; the adjustment with them free (`freed`) is what they come to.
 """
 
 from dataclasses import dataclass, replace
@@ -15,10 +15,10 @@ from numpy import ndarray
 from scipy.stats import f as f_distribution
 
 from jcr.adjust.images import ImageEvidence, evidence
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior, off_by
 from jcr.adjust.robots import Adjusted, equations_of
 from jcr.adjust.scene import Freedom, NuisancePrior
-from jcr.camera import parameter_names
+from jcr.camera import parameter_names, parameters
 from jcr.handeye.components import POSES, solve
 from jcr.records import Intrinsics
 
@@ -94,17 +94,20 @@ class Tested:
     """The step of X that comes with it, gripper axes."""
 
 
-def alternatives(adjusted: Adjusted) -> Alternatives:
-    """The columns and equations about an adjustment of a wrist camera, a rig an image."""
+def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
+    """The columns and equations about an adjustment of a wrist camera, a rig an image.
+
+    `prior` is what was known of the intrinsics; what was freed beyond it is among the columns.
+    """
     given = adjusted.given
     problem, camera = given.evidence.problem, given.evidence.scene.cameras[0]
     names, units, m = parameter_names(camera), units_of(camera), len(problem.observations.rig)
-    freedom, own = problem.freedom, problem.freedom.intrinsics[0]
+    freedom, own = problem.freedom, len(prior.std)
     weak = np.r_[weak_of(camera), [WEAK_FOCAL] * m, [WEAK_SHEAR] * m]
     all_free = Freedom(
         intrinsics=(
             IntrinsicsPrior(
-                np.column_stack([own.directions, np.diag(units)]), np.r_[own.std, weak[: len(names)]]
+                np.column_stack([prior.directions, np.diag(units)]), np.r_[prior.std, weak[: len(names)]]
             ),
         ),
         mounts=freedom.mounts,
@@ -112,8 +115,9 @@ def alternatives(adjusted: Adjusted) -> Alternatives:
         start=freedom.start,
     )
     scene = given.evidence.scene
-    steps = scene.camera_steps[freedom.intrinsics_columns[0]]
-    steps = np.concatenate([steps, np.zeros(len(names)), scene.nuisances(freedom).ravel()])
+    steps = np.r_[
+        scene.camera_steps[:own], beyond_prior(adjusted, prior) / units, scene.nuisances(freedom).ravel()
+    ]
     wider = evidence(
         replace(scene, camera_steps=steps), replace(problem, freedom=all_free), given.evidence.noise
     )
@@ -123,7 +127,7 @@ def alternatives(adjusted: Adjusted) -> Alternatives:
     hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
     right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
     # What was adjusted: X, scale, base_from_world, and the camera as far as it was free.
-    base = POSES + len(own.std)
+    base = POSES + own
     size = 1 / np.sqrt(hessian.diagonal())
     kept, rest = slice(0, base), slice(base, None)
     scaled = size[kept, None] * hessian[kept, kept] * size[kept]
@@ -142,6 +146,37 @@ def alternatives(adjusted: Adjusted) -> Alternatives:
     )
 
 
+def freed_intrinsics(
+    adjusted: Adjusted, prior: IntrinsicsPrior
+) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
+    """The parameters of a wrist camera one Gauss-Newton step on, with another prior about where they started, and their
+    covariance."""
+    given, start = adjusted.given, adjusted.given.evidence.problem.freedom.start[0]
+    problem, scene = given.evidence.problem, given.evidence.scene
+    freedom = replace(problem.freedom, intrinsics=(prior,))
+    off = parameters(scene.cameras[0]) - parameters(start)
+    steps = scene.camera_steps[problem.freedom.nuisance_columns]
+    wider = evidence(
+        replace(scene, camera_steps=np.r_[np.linalg.pinv(prior.directions) @ off, steps]),
+        replace(problem, freedom=freedom),
+        given.evidence.noise,
+    )
+    equations, _ = equations_of(adjusted.most_likely, replace(given, evidence=wider))
+    solution = solve(equations, adjusted.log_sizes)
+    own = slice(POSES, POSES + len(prior.std))
+    covariance = solution.covariance[own, own] + off_by(prior, start)
+    found = parameters(scene.cameras[0]) + prior.directions @ solution.step[own]
+    return found, prior.directions @ covariance @ prior.directions.T
+
+
+def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior) -> Float[ndarray, " q"]:
+    """How far the parameters of a wrist camera went by what was freed beside its prior, from where they started."""
+    evidence_of, own = adjusted.given.evidence, len(prior.std)
+    freedom = evidence_of.problem.freedom
+    steps = evidence_of.scene.camera_steps[freedom.intrinsics_columns[0]]
+    return freedom.intrinsics[0].directions[:, own:] @ steps[own:]
+
+
 def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
     """What its parameters count in: focal lengths in themselves, the centre in widths."""
     distortion = [1.0] * (len(parameter_names(camera)) - 4)
@@ -153,18 +188,28 @@ def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
     return np.array([WEAK.get(name, WEAK_DISTORTION) for name in parameter_names(camera)])
 
 
+def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
+    """The combinations of columns of `Alternatives` that give every image a focal length of its own."""
+    q = len(parameter_names(camera))
+    out = np.zeros((q + 2 * images, images))
+    out[:2, 0] = 1.0
+    out[q : q + images, 1:] = differences(images)
+    return out
+
+
+def differences(count: int) -> Float[ndarray, "n d"]:
+    """An orthonormal basis of what differs between so many, whose sum is 0."""
+    return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
+
+
 def freed(freedom: Freedom, combinations: Float[ndarray, "e p"], camera: Intrinsics) -> Freedom:
     """A wrist camera's freedom with combinations of the columns of `Alternatives` free too.
 
-    Each combination is of the camera's parameters, in the units of `camera`, or of its images', not of both.
+    Parameters of the camera, in the units of `camera`, and of its images are freed each by themselves.
     """
-    q = len(parameter_names(camera))
-    of_camera, of_images = combinations[:q], combinations[q:]
-    is_of_camera = np.abs(of_camera).sum(0) > 0
-    m = len(of_images) // 2
-    own = freedom.intrinsics[0]
-    of_camera, of_images = of_camera[:, is_of_camera], of_images[:, ~is_of_camera]
-    weak = np.repeat([WEAK_FOCAL, WEAK_SHEAR], m)
+    q, own = len(parameter_names(camera)), freedom.intrinsics[0]
+    of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
+    weak = np.repeat([WEAK_FOCAL, WEAK_SHEAR], len(of_images) // 2)
     return replace(
         freedom,
         intrinsics=(

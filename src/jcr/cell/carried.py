@@ -11,21 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.adjust.intrinsics_prior import prior_about
-from jcr.adjust.robots import ArmPoses, adjust
-from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.calibration.adjust import adjust_case, estimate_of, robot_noise_of
+from jcr.calibration.case import MIN_OBSERVATIONS, Case
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import MIN_OBSERVATIONS, calibrate, of_images
+from jcr.calibration.stage import calibrate
 from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
 from jcr.cell.found import CameraFound
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, scale_translation
+from jcr.geometry import inverse
 from jcr.handeye.solve import judged, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
-from jcr.records import Capture, CellCamera, Estimate, Finding, HandEye, Kind, Reconstruction, RobotNoise
+from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruction
 
 
 def exchanged(capture: Capture) -> Capture:
@@ -80,56 +79,24 @@ def refined(
     options = options or CalibrateOptions()
     if not found.converged:
         return _explained(capture, reconstruction, found)
-    used = np.flatnonzero(found.inliers)
-    rows = reconstruction.image_index[used]
-    rigs = scale_translation(reconstruction.recon_from_camera[used], found.scale)
-    own = of_images(reconstruction.tracks, found.inliers)
-    if found.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
+    robot = robot_errors(capture, options).of(reconstruction.image_index)
+    case = Case(
+        capture=capture,
+        reconstruction=reconstruction,
+        options=options,
+        robot=robot,
+        cues=None,
+        hand_eye=found,
+    )
+    if found.before is None or case.tracks.from_pointmaps or len(case.tracks.image) < MIN_OBSERVATIONS:
         return found
-    lens = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
-    each = np.arange(len(used))
-    systematic, _, _ = robot_errors(capture, options)
-    among = (6 * rows[:, None] + np.arange(6)).ravel()
-    noise = None
-    if options.robot_noise is not None:
-        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
-    start = found.gripper_from_camera, found.base_from_recon
-    answer = adjust(
-        Scene(
-            world_from_rig=rigs,
-            rig_from_camera=np.eye(4)[None],
-            cameras=(reconstruction.intrinsics,),
-            points_in_world=found.scale * own.points_in_recon.astype(float),
-        ),
-        Observations(rig=each, camera=np.zeros_like(each), image=own.image, x_px=own.x_px, point=own.point),
-        Freedom.of((reconstruction.intrinsics,), (lens,), len(each)),
-        [
-            ArmPoses(
-                rigs=each,
-                base_from_gripper=capture.base_from_gripper[rows],
-                systematic=systematic[np.ix_(among, among)],
-                start=start,
-                exchanged=True,
-            )
-        ],
-        noise,
-    )
-    more = np.zeros((7, 7)) if found.budget is None else found.budget.faults
-    robot = RobotNoise(
-        *answer.noise, noise is None, noise, found.robot_noise.systematic, answer.systematic_left
-    )
+    answer = adjust_case(case, exchanged=True)
+    faults = np.zeros((7, 7)) if found.budget is None else found.budget.faults
     return judged(
         replace(
             found,
-            estimate=Estimate(
-                gripper_from_camera=answer.placed.x[0],
-                scale=found.scale * answer.placed.scale,
-                base_from_recon=answer.placed.z[0],
-                covariance=answer.covariance[:7, :7] + more,
-                intrinsics=answer.placed.scene.cameras[0],
-                intrinsics_covariance=found.estimate.intrinsics_covariance,
-            ),
-            robot=replace(found.robot, noise=robot),
+            estimate=estimate_of(answer, case).with_fault(faults),
+            robot=replace(found.robot, noise=robot_noise_of(answer)),
             plan=replace(found.plan, next_poses=()),
         )
     )
@@ -144,4 +111,4 @@ def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye)
     why = Finding(
         kind=Kind.WRONG_MOUNT, severity="rejects", mend="mount", details={"camera": capture.camera_name}
     )
-    return found.with_findings(why, first=True)
+    return found.with_findings(why)

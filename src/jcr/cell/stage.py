@@ -16,9 +16,9 @@ from jcr.adjust.images import RigInformation, median_reprojection_px
 from jcr.adjust.intrinsics_prior import prior_about
 from jcr.adjust.robots import Adjusted, ArmPoses, Placed, adjust
 from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
-from jcr.calibration.stage import MIN_OBSERVATIONS, of_images
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
@@ -315,13 +315,12 @@ class _Rigs:
 
     def arm_poses(self, options: CalibrateOptions) -> list[ArmPoses]:
         """The arms, the capture's own first."""
-        systematic, _, _ = robot_errors(self._capture, options)
-        own = (6 * self._rows[:, None] + np.arange(6)).ravel()
+        robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
         first = ArmPoses(
             rigs=np.arange(len(self._rows)),
             base_from_gripper=self._capture.base_from_gripper[self._rows],
-            systematic=systematic[np.ix_(own, own)],
+            systematic=robot.systematic,
             start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
         )
         others = [
@@ -377,9 +376,6 @@ def _adjusted(
     ]
     first = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
     movable = np.array([False, *(member.rig_from_camera is not None for member in members)])
-    noise = None
-    if options.robot_noise is not None:
-        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
     cameras = (reconstruction.intrinsics, *lenses)
     adjusted = adjust(
         Scene(
@@ -397,7 +393,7 @@ def _adjusted(
         ),
         Freedom.of(cameras, (first, *priors), len(rig), movable),
         rigs.arm_poses(options),
-        noise,
+        options.robot_noise_m_rad,
         prior,
     )
     evidence = adjusted.given.evidence

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.geometry import ARM
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdict_of
 from jcr.records.words import remedy, sentence, unobservable
@@ -124,6 +125,11 @@ class HeldOut:
     rotation_deg: float
     reprojection_px: float | None
     how: str
+
+    @property
+    def length_m(self) -> float:
+        """Both errors as one length, by which calibrations can be compared."""
+        return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))
 
 
 COVARIANCE_ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "log_scale")
@@ -286,10 +292,9 @@ class HandEye:
     before: "HandEye | None" = None
     """The fit to camera poses alone; None where that decided."""
 
-    def with_findings(self, *findings: Finding, first: bool = False) -> "HandEye":
-        """The same with more findings after those of the same severity, or before them."""
-        together = (*findings, *self.findings) if first else (*self.findings, *findings)
-        return replace(self, findings=strongest_first(together))
+    def with_findings(self, *findings: Finding) -> "HandEye":
+        """The same with more findings, each in its place."""
+        return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:

@@ -84,12 +84,22 @@ CAMERA = frozenset(
     }
 )
 """Kinds that say that the camera is not one with these intrinsics."""
+CAUSES = CAMERA | {
+    Kind.BOARD_SIZE,
+    Kind.SLIP,
+    Kind.DRIFT,
+    Kind.DELAY,
+    Kind.POSE_CONVENTION,
+    Kind.WRONG_MOUNT,
+}
+"""Kinds that explain others: what is uncertain, or does not fit, is so because of them."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What rejects, then what warns, then what informs; of the same severity in the order given, causes first."""
-    return tuple(sorted(findings, key=lambda finding: RANK[finding.severity]))
+    """What rejects, then what warns, then what informs; of the same severity causes, then their consequences, each in
+    the order given."""
+    return tuple(sorted(findings, key=lambda finding: (RANK[finding.severity], finding.kind not in CAUSES)))
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:

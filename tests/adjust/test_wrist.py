@@ -1,4 +1,4 @@
-"""Hand-eye bundle adjustment on simulated observations with a known answer."""
+"""The adjustment of a wrist camera on simulated observations with a known answer."""
 
 from dataclasses import replace
 
@@ -7,17 +7,19 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
-from jcr.calibration.bundle import adjust, median_reprojection
+from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
+from jcr.adjust.robots import Adjusted
+from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.observations import LENS, observed
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
 
-def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options):
+def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options) -> Adjusted:
     start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    return adjust(
+    return adjust_wrist(
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),
         problem.recon_from_camera,
@@ -34,11 +36,12 @@ def test_camera_noise_is_beaten_by_the_images():
     start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     adjusted = solved(problem, tracks)
     before = error(problem, start.gripper_from_camera, start.scale)
-    after = error(problem, adjusted.bundle.gripper_from_camera, problem.scale)
+    after = error(problem, adjusted.placed.x[0], problem.scale)
     assert np.linalg.norm(after[:3]) < 0.3e-3
     assert np.degrees(np.linalg.norm(after[3:6])) < 0.03
     assert np.linalg.norm(after[:3]) < 0.3 * np.linalg.norm(before[:3])
-    assert np.nanmax(median_reprojection(adjusted)) < 0.6
+    evidence = adjusted.given.evidence
+    assert np.nanmax(median_reprojection_px(evidence.view, evidence.problem)) < 0.6
 
 
 def test_a_focal_length_off_by_five_percent_is_found():
@@ -46,9 +49,9 @@ def test_a_focal_length_off_by_five_percent_is_found():
     problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)), camera_noise=(5e-3, 0.01))
     tracks = observed(problem, rng, 600, 0.3)
     guess = Intrinsics(LENS.fx * 1.05, LENS.fy * 1.05, 319.5, 239.5, 640, 480)
-    adjusted = solved(problem, tracks, guess, free=prior_of(guess, ESTIMATED))
-    assert adjusted.bundle.camera.fx == pytest.approx(LENS.fx, rel=2e-3)
-    assert np.linalg.norm(error(problem, adjusted.bundle.gripper_from_camera, problem.scale)[:3]) < 1e-3
+    adjusted = solved(problem, tracks, guess, prior=prior_of(guess, ESTIMATED))
+    assert adjusted.placed.scene.cameras[0].fx == pytest.approx(LENS.fx, rel=2e-3)
+    assert np.linalg.norm(error(problem, adjusted.placed.x[0], problem.scale)[:3]) < 1e-3
 
 
 def test_wrong_matches_do_not_pull():
@@ -58,7 +61,7 @@ def test_wrong_matches_do_not_pull():
     wrong = rng.random(len(tracks.image)) < 0.1
     tracks.x_px[wrong] += rng.normal(size=(wrong.sum(), 2)) * 40
     adjusted = solved(problem, tracks)
-    assert np.linalg.norm(error(problem, adjusted.bundle.gripper_from_camera, problem.scale)[:3]) < 1e-3
+    assert np.linalg.norm(error(problem, adjusted.placed.x[0], problem.scale)[:3]) < 1e-3
 
 
 @pytest.mark.parametrize("views", [2, 3, 8])
@@ -74,7 +77,7 @@ def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
         rank[own] = np.arange(len(own))
     few = rank < views
     tracks = replace(tracks, image=tracks.image[few], x_px=tracks.x_px[few], point=tracks.point[few])
-    assert solved(problem, tracks).pixels.sigma_px == pytest.approx(0.3, rel=0.1)
+    assert solved(problem, tracks).given.evidence.noise.sigma_px[0] == pytest.approx(0.3, rel=0.1)
 
 
 @pytest.mark.slow
@@ -84,9 +87,10 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
     for seed in range(runs):
         rng = np.random.default_rng([4, seed])
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
-        adjusted = solved(problem, observed(problem, rng, 80, 0.3))
-        missed = error(problem, adjusted.bundle.gripper_from_camera, adjusted.scale)
-        inside += missed @ np.linalg.solve(adjusted.covariance, missed) < chi2.ppf(0.95, 7)
+        tracks = observed(problem, rng, 80, 0.3)
+        adjusted = solved(problem, tracks)
+        missed = error(problem, adjusted.placed.x[0], recon_frame(adjusted, tracks)[0])
+        inside += missed @ np.linalg.solve(adjusted.covariance[:7, :7], missed) < chi2.ppf(0.95, 7)
         # A part of a few random errors looks smooth.
         estimates.append(np.hypot(adjusted.noise, adjusted.systematic_left))
     assert inside / runs >= 0.88
@@ -98,11 +102,11 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, np.radians(0.03)))
     tracks = observed(problem, rng, 300, 0.3)
     off = with_parameters(LENS, parameters(LENS) + np.r_[3.0, 3.0, 4.0, 4.0, np.zeros(5)])
-    exact, usual = (solved(problem, tracks, off, free=prior_of(off, std)) for std in (np.zeros(9), MEASURED))
-    assert exact.bundle.camera == off
-    std = np.sqrt(np.diag(usual.intrinsics_covariance))
-    assert abs(usual.bundle.camera.fx - LENS.fx) < 3 * std[0] < abs(off.fx - LENS.fx) * 3
-    missed = [error(problem, found.bundle.gripper_from_camera, found.scale)[:6] for found in (exact, usual)]
+    exact, usual = (solved(problem, tracks, off, prior=prior_of(off, std)) for std in (np.zeros(9), MEASURED))
+    assert exact.placed.scene.cameras[0] == off
+    std = np.sqrt(np.diag(usual.intrinsics_covariance(0)))
+    assert abs(usual.placed.scene.cameras[0].fx - LENS.fx) < 3 * std[0] < abs(off.fx - LENS.fx) * 3
+    missed = [error(problem, found.placed.x[0], problem.scale)[:6] for found in (exact, usual)]
     sigmas = [
         np.abs(gap / np.sqrt(np.diag(found.covariance)[:6])).max()
         for gap, found in zip(missed, (exact, usual), strict=True)

@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, IntrinsicsPrior, prior_of
-from jcr.calibration.bundle import Adjusted, adjust, freed_intrinsics
+from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.adjust.robots import Adjusted
+from jcr.adjust.score_test import freed_intrinsics
+from jcr.calibration.adjust import adjust_case, estimate_of
+from jcr.calibration.case import Case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
-from jcr.handeye.equation import Poses
-from jcr.records import Finding, HandEye, Intrinsics, Kind, Tracks
+from jcr.records import Estimate, Finding, Intrinsics, Kind, Tracks
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
@@ -27,38 +29,26 @@ right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 
-def lens_doubt(
-    hand_eye: HandEye,
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    held: Intrinsics,
-    tracks: Tracks,
-    noise: tuple[float, float] | None,
-    systematic: Float[ndarray, "s s"],
-    adjusted: Adjusted | None,
-) -> Finding | None:
-    """What the used images say against the intrinsics that were held; None where they say nothing.
+def intrinsics_contradiction(case: Case) -> Finding | None:
+    """What the used images show against the intrinsics that were given; None where they show nothing.
 
-    `adjusted` is the adjustment with those intrinsics, where there is one: only when one Gauss-Newton step from
-    it, the intrinsics
-    freed, leaves some doubt are the intrinsics adjusted until they settle.
+    Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
+    intrinsics adjusted until they settle.
     """
-    if adjusted is not None and not _found_off(adjusted, held, tracks, SURE / 2, 0.5):
+    held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
+    assert case.adjusted is not None
+    if case.hand_eye.converged and not _found_off(case.adjusted, held, case.tracks, SURE / 2, 0.5):
         return None
-    start = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
-
-    def adjusted_with(free: IntrinsicsPrior) -> Adjusted:
-        return adjust(base_from_gripper, start, recon_from_camera, held, tracks, noise, free, systematic)
-
-    freed = adjusted_with(prior_of(held, ESTIMATED))
-    found = _found_off(freed, held, tracks, SURE, 1.0)
+    freed = adjust_case(case, prior=prior_of(held, ESTIMATED))
+    found = _found_off(freed, held, case.tracks, SURE, 1.0)
     if not found:
         return None
-    as_given = adjusted_with(prior_of(held, HELD))
+    with_found, as_given = (
+        estimate_of(one, case) for one in (freed, adjust_case(case, prior=prior_of(held, HELD)))
+    )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shift = max(
-        _shift(hand_eye.gripper_from_camera, hand_eye.scale, freed),
-        _shift(as_given.bundle.gripper_from_camera, as_given.scale, freed),
+        (_shift(start, with_found) for start in (fit.estimate, as_given)),
         key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
     )
     return Finding(
@@ -70,11 +60,10 @@ def lens_doubt(
     )
 
 
-def _shift(gripper_from_camera: Float[ndarray, "4 4"], scale: float, freed: Adjusted) -> Float[ndarray, "7"]:
-    """From a calibration to that with the intrinsics found; in records.COVARIANCE_ORDER."""
-    return np.append(
-        step_between(gripper_from_camera, freed.bundle.gripper_from_camera), np.log(freed.scale / scale)
-    )
+def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
+    """From one estimate to another, in records.COVARIANCE_ORDER."""
+    step = step_between(start.gripper_from_camera, end.gripper_from_camera)
+    return np.append(step, np.log(end.scale / start.scale))
 
 
 def _found_off(

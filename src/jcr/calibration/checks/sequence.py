@@ -17,6 +17,8 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.stats import f as f_distribution
 
+from jcr.calibration.case import Case
+from jcr.calibration.checks.checked import Checked
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind
 
@@ -42,6 +44,18 @@ class _Found:
     value: Float[ndarray, " p"]
     covariance: Float[ndarray, "p p"]
     shift: Float[ndarray, "7"]
+
+
+def check_sequence(case: Case) -> Checked:
+    """A slip, a drift or a delay that the order of the images shows."""
+    found = sequence_fault(
+        case.hand_eye,
+        case.base_from_gripper,
+        case.reconstruction.recon_from_camera,
+        case.names,
+        case.robot.systematic,
+    )
+    return Checked(() if found is None else (found,))
 
 
 def sequence_fault(

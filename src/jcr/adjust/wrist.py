@@ -1,0 +1,80 @@
+"""The adjustment of one wrist camera, a rig an image: what a capture's own camera needs of robots.py."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
+from jcr.adjust.robots import Adjusted, ArmPoses, adjust
+from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.adjust.score_test import freed
+from jcr.geometry import apply, fit_similarity, scale_translation
+from jcr.handeye.fit import Unknowns
+from jcr.handeye.systematic import smooth_errors
+from jcr.records import Intrinsics, Tracks
+
+
+def adjust_wrist(
+    base_from_gripper: Float[ndarray, "m 4 4"],
+    start: Unknowns,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    intrinsics: Intrinsics,
+    tracks: Tracks,
+    *,
+    noise: tuple[float, float] | None = None,
+    prior: IntrinsicsPrior | None = None,
+    systematic: Float[ndarray, "s s"] | None = None,
+    combinations: Float[ndarray, "e p"] | None = None,
+    exchanged: bool = False,
+) -> Adjusted:
+    """Images and robot adjusted from a pose fit's (gripper_from_camera, scale, base_from_recon).
+
+    `noise` is the robot's (m, rad), at least; it is estimated with the rest. `prior` is what is known of the
+    intrinsics; None: that they are exact. `systematic` is the covariance of the systematic errors of the gripper poses
+    at 1 rad; None: that of errors smooth over the poses. `combinations` of the columns of score_test.Alternatives are
+    free too. `exchanged`: the camera stands still, and the arm carries what it sees.
+    """
+    x, scale, z = start
+    each = np.arange(len(base_from_gripper))
+    prior = prior_of(intrinsics, HELD) if prior is None else prior
+    freedom = Freedom.of((intrinsics,), (prior,), len(each))
+    if combinations is not None:
+        freedom = freed(freedom, combinations, intrinsics)
+    arm = ArmPoses(
+        rigs=each,
+        base_from_gripper=base_from_gripper,
+        systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
+        start=(x, z),
+        exchanged=exchanged,
+    )
+    return adjust(
+        Scene(
+            world_from_rig=scale_translation(recon_from_camera, scale),
+            rig_from_camera=np.eye(4)[None],
+            cameras=(intrinsics,),
+            points_in_world=scale * tracks.points_in_recon.astype(float),
+        ),
+        Observations(
+            rig=each, camera=np.zeros_like(each), image=tracks.image, x_px=tracks.x_px, point=tracks.point
+        ),
+        freedom,
+        [arm],
+        noise,
+    )
+
+
+def recon_frame(adjusted: Adjusted, tracks: Tracks) -> tuple[float, Float[ndarray, "4 4"]]:
+    """Scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
+
+    Its points against the adjusted ones, weighed down where the two disagree.
+    """
+    placed, problem = adjusted.placed, adjusted.given.evidence.problem
+    points = apply(placed.z[0], placed.scale * placed.scene.points_in_world)
+    recon = tracks.points_in_recon[problem.points].astype(np.float64)
+    weight = np.ones(len(points))
+    base_from_recon, scale = fit_similarity(points, recon, weight)
+    for _ in range(5):
+        gap = np.linalg.norm(apply(base_from_recon, scale * recon) - points, axis=1)
+        weight = 1 / (1 + (gap / max(float(np.median(gap)), 1e-9)) ** 2)
+        base_from_recon, scale = fit_similarity(points, recon, weight)
+    return float(scale), base_from_recon

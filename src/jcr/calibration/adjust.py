@@ -1,0 +1,188 @@
+"""The second step of a calibration: images, points, intrinsics and robot adjusted together (adjust/).
+
+Where images add nothing to the poses, what the errors of given intrinsics would do is added to the fit instead.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.adjust.images import median_reprojection_px, view_of
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.robots import Adjusted
+from jcr.adjust.score_test import focal_lengths
+from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.calibration.case import Case
+from jcr.calibration.consider import with_intrinsics_considered
+from jcr.geometry import inverse, retract, scale_translation, step_between
+from jcr.handeye.equation import predict
+from jcr.handeye.fit import exceeds
+from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.solve import judged
+from jcr.records import (
+    Estimate,
+    HandEye,
+    HeldOut,
+    ImageResiduals,
+    PaperResiduals,
+    RobotExamined,
+    RobotNoise,
+)
+
+
+def adjusted(case: Case) -> Case:
+    """The case with its images adjusted, and the calibration made of that where it is the better one.
+
+    It replaces an accepted fit; on correspondences between pointmaps, whose errors neighbours share, only where its
+    leave-one-out error is smaller. An answer so wrong that points lie behind the cameras has no adjustment.
+    """
+    if not case.is_adjustable:
+        return _considered(case)
+    try:
+        varies = case.options.focus == "varies" and case.shows_camera
+        found = adjust_case(case, combinations=focal_of_each(case) if varies else None)
+    except np.linalg.LinAlgError:
+        return case
+    case = replace(case, adjusted=found)
+    if not case.hand_eye.converged:
+        return case
+    refined = judged(_refined(case, found))
+    if case.tracks.from_pointmaps and not _is_nearer(refined.held_out, case.hand_eye.held_out):
+        return case
+    return replace(case, hand_eye=refined)
+
+
+def adjust_case(
+    case: Case,
+    *,
+    prior: IntrinsicsPrior | None = None,
+    combinations: Float[ndarray, "e p"] | None = None,
+    exchanged: bool = False,
+) -> Adjusted:
+    """The used images and gripper poses of a case adjusted from its fit to poses.
+
+    `prior` takes the place of the case's; the rest is as adjust_wrist takes it.
+    """
+    fit = case.hand_eye.before or case.hand_eye
+    return adjust_wrist(
+        case.base_from_gripper[case.used],
+        (fit.gripper_from_camera, fit.scale, fit.base_from_recon),
+        case.recon_from_camera[case.used],
+        case.reconstruction.intrinsics,
+        case.tracks,
+        noise=case.options.robot_noise_m_rad,
+        prior=case.intrinsics_prior if prior is None else prior,
+        systematic=case.systematic,
+        combinations=combinations,
+        exchanged=exchanged,
+    )
+
+
+def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
+    """The combinations that give every used image a focal length of its own."""
+    return focal_lengths(case.reconstruction.intrinsics, len(case.used))
+
+
+def estimate_of(found: Adjusted, case: Case) -> Estimate:
+    """What an adjustment of a case came to, in the case's reconstruction."""
+    scale, base_from_recon = recon_frame(found, case.tracks)
+    return Estimate(
+        gripper_from_camera=found.placed.x[0],
+        scale=scale,
+        base_from_recon=base_from_recon,
+        covariance=found.covariance[:7, :7],
+        budget=found.budget,
+        intrinsics=found.placed.scene.cameras[0],
+        intrinsics_covariance=found.intrinsics_covariance(0),
+    )
+
+
+def robot_noise_of(found: Adjusted) -> RobotNoise:
+    """The errors of the gripper poses, as an adjustment found them."""
+    given = found.given.noise
+    return RobotNoise(
+        *found.noise, exceeds(found.noise, given), given, found.systematic, found.systematic_left
+    )
+
+
+def _considered(case: Case) -> Case:
+    """The case with what errors of its given intrinsics do to a fit to poses, which cannot estimate them."""
+    made_with_them = case.reconstruction.evidence is None and not case.tracks.from_pointmaps
+    if case.capture.intrinsics is None or not made_with_them or not case.hand_eye.converged:
+        return case
+    considered = with_intrinsics_considered(
+        case.hand_eye,
+        case.base_from_gripper[case.used],
+        case.recon_from_camera[case.used],
+        case.tracks,
+        case.reconstruction.intrinsics,
+        case.intrinsics_prior,
+        case.cues,
+        case.systematic,
+    )
+    return replace(case, hand_eye=judged(considered))
+
+
+def _is_nearer(one: HeldOut | None, other: HeldOut | None) -> bool:
+    """Whether the leave-one-out error is smaller; not, where there are too few images."""
+    return one is not None and other is not None and one.length_m < other.length_m
+
+
+def _refined(case: Case, found: Adjusted) -> HandEye:
+    """The calibration as an adjustment has it; not judged yet."""
+    before, used = case.hand_eye, case.used
+    estimate = estimate_of(found, case)
+    x = estimate.gripper_from_camera
+    gripper, camera = case.base_from_gripper, case.recon_from_camera
+    # Rejected poses are measured against where their cameras show them.
+    predicted = estimate.base_from_recon @ scale_translation(camera, estimate.scale) @ inverse(x)
+    predicted[used] = _adjusted_poses(found)
+    metres, radians = np.linalg.norm(step_between(gripper, predicted).reshape(-1, 2, 3), axis=2).T
+    reprojection = np.full(len(gripper), np.nan)
+    evidence = found.given.evidence
+    reprojection[used] = median_reprojection_px(evidence.view, evidence.problem)
+    return replace(
+        before,
+        estimate=estimate,
+        images=ImageResiduals(
+            inliers=before.inliers,
+            translation_residual_m=metres,
+            rotation_residual_rad=radians,
+            reasons=before.images.reasons,
+            reprojection_px=reprojection,
+        ),
+        residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
+        robot=RobotExamined(robot_noise_of(found)),
+        held_out=_leave_one_out(found),
+        before=before,
+    )
+
+
+def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
+    """base_from_gripper where images and robot together put it."""
+    placed = found.placed
+    return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig)
+
+
+def _leave_one_out(found: Adjusted) -> HeldOut | None:
+    """Each image's gripper pose predicted by an adjustment that does not use it."""
+    missed = found.leave_one_out()
+    m = len(missed)
+    if m < 4:
+        return None
+    metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
+    # The images as they would be with every gripper, and the rig on it, by as much beside its place.
+    placed, evidence = found.most_likely, found.given.evidence
+    x, z = placed.x[0], placed.z[0]
+    gripper = predict(x, placed.scale, z, placed.scene.world_from_rig)
+    in_metres = inverse(z) @ retract(gripper, -missed) @ x
+    rigs = scale_translation(in_metres, 1 / placed.scale)
+    moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
+    return HeldOut(
+        1e3 * float(metres),
+        float(np.degrees(radians)),
+        float(np.median(median_reprojection_px(moved, evidence.problem))),
+        "each image's gripper pose predicted by the others",
+    )

@@ -1,0 +1,335 @@
+"""Is it one camera in all images? A focus that moves, a zoom, a rolling shutter, intrinsics that are a little wrong.
+
+Each is a hypothesis of adjust/score_test.py, tested beside a focal length that is wrong by one factor in all images. The
+images are adjusted with the one of least p free, which shows its value and what it does to the calibration; then the
+next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.adjust.robots import Adjusted
+from jcr.adjust.score_test import (
+    Alternatives,
+    Tested,
+    alternatives,
+    beyond_prior,
+    differences,
+    spanned,
+    tested,
+)
+from jcr.calibration.adjust import adjust_case, estimate_of, focal_of_each
+from jcr.calibration.case import Case, of_points
+from jcr.calibration.checks.checked import Checked
+from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
+from jcr.camera import parameter_names, parameters
+from jcr.geometry import step_between
+from jcr.records import Finding, Intrinsics, Kind, Tracks
+
+LOG_P = float(np.log(1e-6))
+"""Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
+MATERIAL = 0.5
+"""Standard deviations that the answer would move by on an axis: what does less is nobody's worry."""
+OF_FIRST_STEP = 0.2
+"""Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
+AT_ONCE = 2
+"""Faults named of one capture."""
+MOST_POINTS, WELL_SEEN = 800, 3
+"""Points that take part, first those in this many images: more tell a fault no better, and take time."""
+LEAST_SHEAR_PX = 3.0
+"""From top to bottom; less of it than this is what a distortion model leaves over."""
+MIN_IMAGES = 5
+LEAST_PART = 2
+"""Images before and after a change."""
+ASPECT = ("fx", "p1", "p2")
+"""Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
+FOCUS = {"distance", "scatter", "zoom"}
+"""Of a focal length that differs between images, one is named."""
+NEARLY_ALL = 0.9
+"""Of the squares of what the focal length differs by."""
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def check_camera(case: Case) -> Checked:
+    """What the used images show against one camera with the intrinsics that they were reconstructed with.
+
+    With `focus` "varies" a focal length of each image is free already and is no finding.
+    """
+    faults = _faults(case)
+    if case.capture.intrinsics is None:
+        return Checked(faults)
+    of_intrinsics = next((one for one in faults if one.kind is Kind.INTRINSICS), None)
+    if faults and of_intrinsics is None:
+        return Checked(faults)
+    contradiction = intrinsics_contradiction(case)
+    if contradiction is None:
+        return Checked(faults)
+    if of_intrinsics is not None:
+        contradiction = replace(of_intrinsics, shift=contradiction.shift)
+    others = [one for one in faults if one.kind is not Kind.INTRINSICS]
+    # Where the intrinsics are wrong, bundle adjustment bends the robot's poses to them: the fit to camera poses bends
+    # least.
+    return Checked((*others, contradiction), case.hand_eye.before)
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    kind: str
+    free: Float[ndarray, "e p"]
+    """The combinations that it is about."""
+    beside: Float[ndarray, "e q"]
+    """What is free with it and shows nothing."""
+    places: int = 1
+    """That were searched."""
+    after: int = 0
+    """Image before a change."""
+
+    @property
+    def of_intrinsics(self) -> bool:
+        """The same intrinsics would be right for all images."""
+        return self.kind in ("intrinsics", "aspect")
+
+    @property
+    def both(self) -> Float[ndarray, "e r"]:
+        """All that it frees."""
+        return np.concatenate([self.beside, self.free], axis=1)
+
+
+@dataclass(frozen=True)
+class _State:
+    """The images adjusted with some hypotheses free."""
+
+    case: Case
+    """With the tracks that take part."""
+    found: tuple[_Hypothesis, ...]
+    adjusted: Adjusted
+
+    @staticmethod
+    def of(case: Case, found: tuple[_Hypothesis, ...]) -> "_State":
+        """Adjusted anew: with what was found wrong in it the robot pose noise was another one."""
+        combinations = np.concatenate([one.both for one in found], axis=1) if found else None
+        return _State(case, found, adjust_case(case, combinations=combinations))
+
+    @cached_property
+    def equations(self) -> Alternatives:
+        """Of what may be freed beside."""
+        return alternatives(self.adjusted, self.case.intrinsics_prior)
+
+    @property
+    def camera(self) -> Intrinsics:
+        """As adjusted."""
+        return self.adjusted.given.evidence.scene.cameras[0]
+
+    @property
+    def total(self) -> Float[ndarray, " e"]:
+        """How far the columns that may be freed are from where they start."""
+        evidence = self.adjusted.given.evidence
+        of_camera = beyond_prior(self.adjusted, self.case.intrinsics_prior) / self.equations.units
+        return np.r_[of_camera, evidence.scene.nuisances(evidence.problem.freedom).ravel()]
+
+    def shift_from(self, before: "_State") -> Float[ndarray, "7"]:
+        """How far the calibration is from what it was, in records.COVARIANCE_ORDER."""
+        then, now = (estimate_of(one.adjusted, one.case) for one in (before, self))
+        step = step_between(then.gripper_from_camera, now.gripper_from_camera)
+        return np.r_[step, np.log(now.scale / then.scale)]
+
+
+def _faults(case: Case) -> tuple[Finding, ...]:
+    """What speaks against one camera, at most AT_ONCE of it."""
+    if len(case.used) < MIN_IMAGES:
+        return ()
+    # A calibration that is rejected has no uncertainty beside which a fault could be small.
+    std = np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged
+    state = _begun(case)
+    named: list[Finding] = []
+    dismissed: list[_Hypothesis] = []
+    while len(named) < AT_ONCE:
+        best = _most_likely(state, dismissed)
+        if best is None:
+            break
+        alone = tested(state.equations, best.both, _all(state))
+        after = None
+        if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * std).any():
+            after = _with(state, best)
+        if after is None or not _is_material(after, state, std):
+            dismissed.append(best)
+            continue
+        named.append(_finding(after, state, alone))
+        state = after
+    return tuple(named)
+
+
+def _begun(case: Case) -> _State:
+    """The images as adjusted, of no more points than are needed."""
+    assert case.adjusted is not None
+    tracks = case.tracks
+    found: tuple[_Hypothesis, ...] = ()
+    if case.options.focus == "varies":
+        found = (_Hypothesis("scatter", focal_of_each(case), np.zeros((len(focal_of_each(case)), 0))),)
+    if len(np.unique(tracks.point)) <= MOST_POINTS:
+        return _State(case, found, case.adjusted)
+    return _State.of(case.with_tracks(_some(tracks)), found)
+
+
+def _with(state: _State, best: _Hypothesis) -> _State | None:
+    """Adjusted with one more hypothesis free, or with the simpler one that explains nearly the same; None where the
+    images then show nothing any more."""
+    try:
+        after = _State.of(state.case, (*state.found, best))
+        simple = _simpler(after) if best.kind == "scatter" else None
+        return after if simple is None else _State.of(state.case, (*state.found, simple))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _is_material(after: _State, before: _State, std: Float[ndarray, "6"]) -> bool:
+    """Whether what was freed is large enough to be a fault, and moves the calibration."""
+    m = after.equations.images
+    shear = after.total[-m:]
+    small = np.sqrt(np.mean(shear**2)) * after.camera.fx < LEAST_SHEAR_PX
+    if after.found[-1].kind.startswith("shear") and small:
+        return False
+    return bool((np.abs(after.shift_from(before)[:6]) > MATERIAL * std).any())
+
+
+def _finding(after: _State, before: _State, alone: Tested) -> Finding:
+    """The last hypothesis that was freed, as a finding."""
+    best, equations = after.found[-1], after.equations
+    last = tested(equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
+    p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
+    names = [after.case.names[row] for row in after.case.used]
+    given = after.case.reconstruction.intrinsics
+    size = _size(best, after.total, last, equations, given, after.camera, names)
+    return Finding(severity="warns", p=p, shift=tuple(after.shift_from(before).tolist()), **size)
+
+
+def _some(tracks: Tracks, seed: int = 0) -> Tracks:
+    """The observations of a random choice of the points that most images see."""
+    count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
+    order = np.random.default_rng(seed).permutation(len(count))
+    enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
+    chosen = np.zeros(len(count), bool)
+    chosen[enough[count[enough] >= 2][:MOST_POINTS]] = True
+    return of_points(tracks, chosen)
+
+
+def _all(state: _State) -> Float[ndarray, "e r"]:
+    """The combinations that are free already; of those that are the same, one."""
+    nothing = np.zeros((state.equations.columns, 1))
+    return spanned(np.concatenate([nothing, *(one.both for one in state.found)], axis=1))
+
+
+def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis | None:
+    """The hypothesis of least p, if that is little enough to be believed."""
+    before, result = _all(state), None
+    for candidate in _hypotheses(state):
+        if any(_alike(candidate, one) for one in (*state.found, *dismissed)):
+            continue
+        beside = np.concatenate([before, candidate.beside], axis=1)
+        log_p = tested(state.equations, candidate.free, beside).log_p + np.log(candidate.places)
+        if result is None or log_p < result[0]:
+            result = log_p, candidate
+    return None if result is None or result[0] > LOG_P else result[1]
+
+
+def _alike(one: _Hypothesis, other: _Hypothesis) -> bool:
+    return one.kind == other.kind or {one.kind, other.kind} <= FOCUS
+
+
+def _simpler(state: _State) -> _Hypothesis | None:
+    """A focal length that follows distance, or changed once, where that explains nearly all that it scatters."""
+    scatter, best = state.found[-1], None
+    focal = scatter.free @ _value(scatter, state.total)
+    for candidate in _hypotheses(state):
+        if candidate.kind not in FOCUS or candidate.kind == scatter.kind:
+            continue
+        along = candidate.free[:, 0]
+        explained = float((along @ focal) ** 2 / ((along @ along) * (focal @ focal)))
+        if best is None or explained > best[0]:
+            best = explained, candidate
+    return best[1] if best is not None and best[0] > NEARLY_ALL else None
+
+
+def _value(fault: _Hypothesis, total: Float[ndarray, " e"]) -> Float[ndarray, " p"]:
+    """Of the combinations that a hypothesis is about."""
+    return np.linalg.lstsq(fault.both, total, rcond=None)[0][fault.beside.shape[1] :]
+
+
+def _hypotheses(state: _State) -> list[_Hypothesis]:
+    equations = state.equations
+    m = equations.images
+    far = np.log(equations.distance)
+    far = far - far.mean()
+    steps = np.arange(LEAST_PART, m - LEAST_PART + 1)
+    common, nothing = equations.common_focal(), np.zeros((equations.columns, 0))
+    found = [
+        _Hypothesis("distance", equations.focal_of_images(far[:, None]), common),
+        _Hypothesis("scatter", equations.focal_of_images(differences(m)), common),
+        _Hypothesis("shear", equations.shear_of_images(np.ones((m, 1))), common),
+        _Hypothesis("shear of each", equations.shear_of_images(np.eye(m)), common),
+    ]
+    for k in steps:
+        after = (np.arange(m) >= k) - (m - k) / m
+        free = equations.focal_of_images(after[:, None])
+        found.append(_Hypothesis("zoom", free, common, len(steps), int(k) - 1))
+    # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
+    kind = "aspect" if state.case.capture.intrinsics is None else "intrinsics"
+    found.append(_Hypothesis(kind, equations.of_camera(_freed(kind, equations)), nothing))
+    return found
+
+
+def _size(
+    fault: _Hypothesis,
+    total: Float[ndarray, " e"],
+    last: Tested,
+    equations: Alternatives,
+    given: Intrinsics,
+    now: Intrinsics,
+    images: Sequence[str],
+) -> dict[str, Any]:
+    """The fields of a finding that say what and how large the fault is."""
+    value = _value(fault, total)
+    std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
+    if fault.of_intrinsics:
+        units = dict(zip(equations.names, equations.units, strict=True))
+        names = _freed(fault.kind, equations)
+        details = _parameters({name: std[k] * units[name] for k, name in enumerate(names)}, given, now)
+        return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
+    kind, size, error = {
+        "distance": (Kind.FOCUS_BY_DISTANCE, value[0], std[0]),
+        "scatter": (Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), np.median(std)),
+        "zoom": (Kind.ZOOM, value[0], std[0]),
+        "shear": (Kind.ROLLING_SHUTTER, abs(value[0]), std[0]),
+        "shear of each": (Kind.ROLLING_SHUTTER_BY_IMAGE, np.sqrt(np.mean(value**2)), np.median(std)),
+    }[fault.kind]
+    unit = float(np.ptp(np.log(equations.distance))) if fault.kind == "distance" else 1.0
+    if fault.kind.startswith("shear"):
+        unit = given.fx
+    between = images[fault.after : fault.after + 2] if fault.kind == "zoom" else ()
+    return {
+        "kind": kind,
+        "mend": "images",
+        "value": unit * float(size),
+        "std": unit * float(error),
+        "images": tuple(between),
+    }
+
+
+def _freed(kind: str, equations: Alternatives) -> tuple[str, ...]:
+    """Parameters of the intrinsics that a hypothesis frees, of those that the model has."""
+    return tuple(name for name in (LENS if kind == "intrinsics" else ASPECT) if name in equations.names)
+
+
+def _parameters(std: dict[str, float], given: Intrinsics, now: Intrinsics) -> dict[str, float]:
+    """Parameters as they are and as they were given; standard deviations of those that were freed."""
+    found: dict[str, float] = {}
+    for name, old, new in zip(parameter_names(given), parameters(given), parameters(now), strict=True):
+        if name in LENS:
+            found |= {name: float(new), f"{name}_given": float(old)}
+    return found | {f"{name}_std": float(value) for name, value in std.items()}

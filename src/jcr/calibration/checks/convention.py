@@ -1,0 +1,17 @@
+"""Do the poses of a rejected fit, read by another convention, fit the cameras?"""
+
+from jcr.calibration.case import Case
+from jcr.calibration.checks.checked import Checked
+from jcr.handeye.conventions import better_reading, convention_finding
+
+
+def check_convention(case: Case) -> Checked:
+    """The convention by which the gripper poses fit, where there is one.
+
+    Of motions that show too little another may fit by chance: what is missing comes first.
+    """
+    found = better_reading(case.base_from_gripper, case.recon_from_camera)
+    if found is None:
+        return Checked()
+    observable = case.hand_eye.observability.observable
+    return Checked((convention_finding(found, "rejects" if observable else "warns"),))

@@ -1,0 +1,81 @@
+"""The first step of a calibration: the fit to camera poses, with what is known of the scale beside them."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.calibration.case import Case
+from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import RobotErrors
+from jcr.errors import NotTrustedError
+from jcr.handeye.fit import Cues
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import Capture, Finding, HandEye, Reconstruction
+
+
+def fitted(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+) -> Case:
+    """The case of a capture and its reconstruction, fitted to camera poses.
+
+    `robot` is of the registered images' poses. Raises NotTrustedError with fewer than two registered images.
+    """
+    registered = len(reconstruction.image_index)
+    if registered < 2:
+        few = f"{registered} of {len(capture)} images registered; overlap the views more"
+        raise NotTrustedError("; ".join([few, *reconstruction.warnings, *reconstruction.notes]))
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    cues, contradiction = _measured(capture, reconstruction, options), None
+    if cues is None and (metric_std := reconstruction.metric_std) is not None:
+        free = _solved(gripper, reconstruction, options, robot, None)
+        contradiction = scale_contradiction(free, metric_std)
+        cues = Cues(scale=(1.0, metric_std))
+    hand_eye = _solved(gripper, reconstruction, options, robot, cues)
+    hand_eye = replace(hand_eye, estimate=replace(hand_eye.estimate, intrinsics=reconstruction.intrinsics))
+    return Case(
+        capture=capture,
+        reconstruction=reconstruction,
+        options=options,
+        robot=robot,
+        cues=cues,
+        hand_eye=hand_eye.with_findings(*_present(contradiction)),
+    )
+
+
+def _present(finding: Finding | None) -> tuple[Finding, ...]:
+    return () if finding is None else (finding,)
+
+
+def _solved(
+    gripper: Float[ndarray, "m 4 4"],
+    reconstruction: Reconstruction,
+    options: CalibrateOptions,
+    robot: RobotErrors,
+    cues: Cues | None,
+) -> HandEye:
+    evidence = reconstruction.evidence
+    return solve_hand_eye(
+        gripper,
+        reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera,
+        robot_noise=options.robot_noise_m_rad,
+        cues=cues,
+        camera_covariance=None if evidence is None else evidence.covariance,
+        systematic=robot.systematic,
+    )
+
+
+def _measured(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:
+    """What the user measured with a ruler."""
+    if options.known_height is None and options.known_length is None:
+        return None
+    gripper = capture.base_from_gripper[reconstruction.image_index]
+    scale = offset = None
+    if options.known_height is not None:
+        offset = height_cue(gripper, options.known_height / 1e3)
+    if options.known_length is not None:
+        image, *ends, length_mm = options.known_length
+        scale = length_cue(capture, reconstruction, image, np.array(ends).reshape(2, 2), length_mm / 1e3)
+    return Cues(scale, offset)

@@ -1,0 +1,73 @@
+"""The calibration of camera poses that somebody else found, without images."""
+
+import numpy as np
+
+from jcr.calibration.cues import height_cue
+from jcr.calibration.options import CalibrateOptions, check_options
+from jcr.calibration.requirement import advised
+from jcr.errors import InputError
+from jcr.handeye.arms import arm_named
+from jcr.handeye.conventions import better_reading, convention_finding
+from jcr.handeye.fit import Cues
+from jcr.handeye.solve import SCALE_STD, solve_hand_eye
+from jcr.handeye.systematic import systematic_errors
+from jcr.records import Finding, HandEye, Kind, PosePairs
+
+METRIC_STD = 0.005
+"""Relative; a printed marker has the size that its maker says to half a percent."""
+
+
+def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
+    """Hand-eye calibration from camera poses that were given, without images.
+
+    Where they are metric, the scale that is found tells whether the marker had the size that was given; motions
+    that do not show a scale are helped by taking it as 1.
+    """
+    check_options(options := options or CalibrateOptions())
+    hand_eye = _calibrated_poses(pairs, options)
+    is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
+    return advised(hand_eye, pairs.base_from_gripper, options, SCALE_STD if is_known else None)
+
+
+def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
+    gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, options.robot_noise_m_rad
+    if options.known_length is not None:
+        raise InputError("--known-length: there are no images in which it could be seen; leave it out")
+    offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
+    systematic = systematic_errors(gripper, None if options.robot is None else arm_named(options.robot))
+    cues = Cues(offset=offset)
+    free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
+    scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
+    hand_eye = free
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
+    if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
+        hand_eye = solve_hand_eye(
+            gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
+        )
+        if not free.observability.observable and scale == 1.0:
+            return hand_eye.with_findings(Finding(kind=Kind.SCALE_ASSUMED, severity="warns", mend="motion"))
+    if not hand_eye.converged:
+        found = better_reading(gripper, camera)
+        if found is None:
+            return hand_eye
+        # Of motions that show too little, another convention may fit by chance: what is missing comes first.
+        severity = "rejects" if hand_eye.observability.observable else "warns"
+        return hand_eye.with_findings(convention_finding(found, severity))
+    if pairs.is_metric and not is_one(hand_eye):
+        return hand_eye.with_findings(
+            Finding(
+                kind=Kind.BOARD_SIZE,
+                severity="warns",
+                mend="intrinsics",
+                value=hand_eye.scale - 1,
+                std=hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6])),
+                details={"marker": 1.0},
+            )
+        )
+    return hand_eye
+
+
+def is_one(hand_eye: HandEye) -> bool:
+    """Whether the scale is 1 within what is known of it."""
+    off = abs(float(np.log(hand_eye.scale)))
+    return off < max(3 * float(np.sqrt(hand_eye.covariance[6, 6])), METRIC_STD)

@@ -1,0 +1,37 @@
+"""What findings do to a calibration: their shifts count as uncertainty, and what is too uncertain is rejected."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jcr.calibration.case import Case
+from jcr.calibration.checks.checked import Checked
+from jcr.handeye.solve import judged
+from jcr.records import Finding, HandEye, verdict_of
+
+
+def with_checked(case: Case, checked: Checked) -> Case:
+    """The case after a check."""
+    hand_eye = checked.hand_eye or case.hand_eye
+    return replace(case, hand_eye=with_findings(hand_eye, checked.findings))
+
+
+def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
+    """A calibration with findings, and with their shifts in its covariance.
+
+    One whose shift makes the calibration too uncertain rejects it, and so does one that explains why it was rejected.
+    """
+    named: list[Finding] = []
+    for finding in findings:
+        if finding.shift is None:
+            named.append(finding)
+            continue
+        accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
+        hand_eye = replace(
+            hand_eye, estimate=hand_eye.estimate.with_fault(np.outer(finding.shift, finding.shift))
+        )
+        # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
+        if not accepted or not judged(hand_eye).converged:
+            finding = replace(finding, severity="rejects")
+        named.append(finding)
+    return hand_eye.with_findings(*named)
