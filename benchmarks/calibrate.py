@@ -7,10 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.figure import Figure
 from numpy import ndarray
 
-from benchmarks.figure import png
+from benchmarks.figure import blank, png
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.calibration.case import of_images
@@ -221,7 +220,7 @@ def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
 
 def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
     """PNG: median errors of the translation by robot pose noise, number of images and share of wrong gripper poses."""
-    figure = Figure(figsize=(14, 4.4), layout="constrained")
+    figure = blank(14, 4.4, "constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for name in _solvers():
         style = {"linewidth": 2.5} if name.startswith("jcr") else {"linewidth": 1, "linestyle": "--"}

@@ -3,15 +3,14 @@
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from benchmarks.figure import png
+from benchmarks.figure import blank, png
 from benchmarks.synthetic_pairs import pairs_of_capture
 from benchmarks.table1 import PUBLISHED, WEBCAM
 from jcr.calibration.stage import calibrate
@@ -25,6 +24,9 @@ from jcr.records import Capture, HandEye, Reconstruction
 from jcr.represent.cloud import point_cloud
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.truth import truth_points
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 IMAGES, SEED = 12, 0
 NEAR = 0.01
@@ -113,7 +115,7 @@ def _covered(cloud: Cloud, surface: Float[ndarray, "n 3"], labels: ndarray) -> t
 def _figure(picture: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
     """PNG: an image, and each dense cloud from above in its colours with COLMAP's points in red (paper, Fig. 8)."""
     sparse, *dense = clouds
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    figure = blank(12, 4.2, "constrained")
     first, *others = figure.subplots(1, 1 + len(dense))
     first.imshow(picture)
     first.set_title("one of the images", fontsize=9)
@@ -125,7 +127,7 @@ def _figure(picture: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
     return png(figure, 110)
 
 
-def _from_above(axis: Axes, cloud: Cloud) -> None:
+def _from_above(axis: "Axes", cloud: Cloud) -> None:
     """The highest points last, x upwards and y to the left, as the robot has it before itself."""
     drawn = np.random.default_rng(0).permutation(len(cloud.x_in_base))[:DRAWN]
     drawn = drawn[np.argsort(cloud.x_in_base[drawn, 2])]

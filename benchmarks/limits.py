@@ -10,10 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.figure import Figure
 from numpy import ndarray
 
-from benchmarks.figure import png
+from benchmarks.figure import blank, png
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -219,7 +218,7 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
     """PNG: a row for each thing that is made worse, an image for each level, framed by what came of it."""
     kinds = list(dict.fromkeys(v.trial.what for v in verdicts))
     across = max(sum(v.trial.what == kind for v in verdicts) for kind in kinds)
-    figure = Figure(figsize=(2.3 * across, 2.1 * len(kinds)))
+    figure = blank(2.3 * across, 2.1 * len(kinds))
     figure.set_layout_engine("constrained", h_pad=0.07)  # inches: a caption stays with the picture above it
     axes = figure.subplots(len(kinds), across, squeeze=False)
     for row, kind in zip(axes, kinds, strict=True):

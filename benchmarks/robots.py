@@ -10,9 +10,9 @@ from typing import get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
-from matplotlib.figure import Figure
 from numpy import ndarray
 
+from benchmarks.figure import blank
 from benchmarks.peers import opencv
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
 from jcr.adjust.wrist import adjust_wrist, recon_frame
@@ -224,7 +224,7 @@ def run(out: Path | None = None, long: bool = False) -> str:
 def _figure(rows: list[Row]) -> bytes:
     """A panel per number of images: share of accepted results beyond three sigma, by size of the errors."""
     counts = sorted({row.count for row in rows})
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    figure = blank(11, 3.4, "constrained")
     for k, count in enumerate(counts):
         axes = figure.add_subplot(1, len(counts), k + 1)
         for j, known in enumerate(KNOWN):

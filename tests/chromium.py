@@ -94,6 +94,10 @@ class Chromium:
         self.call("Page.navigate", url=url)
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self.events.append(self._receive())
+        self.draw()
+
+    def draw(self) -> None:
+        """Return once the page is drawn as it is now."""
         self.js("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def js(self, expression: str) -> Any:
@@ -108,8 +112,8 @@ class Chromium:
         return answer["result"].get("value")
 
     def picture(self, selector: str) -> np.ndarray:
-        """An element as it is seen (h,w,3), once it has drawn what it was last told."""
-        self.js("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        """An element as it is seen (h,w,3), once it is drawn; a page that is emulated on a phone scrolls elsewhere."""
+        self.draw()
         box = self.js(
             f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect(); return"
             " {x: b.x + scrollX, y: b.y + scrollY, width: b.width, height: b.height, scale: 1}; })()"
@@ -118,7 +122,9 @@ class Chromium:
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB"))
 
     def center(self, selector: str) -> tuple[float, float]:
+        """Of an element in the window (pixels), scrolled to and drawn there: mouse and finger reach it."""
         self.js(f"document.querySelector('{selector}').scrollIntoView({{block: 'center'}})")
+        self.draw()
         box = self.js(
             f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect();"
             " return [b.x + b.width / 2, b.y + b.height / 2]; })()"

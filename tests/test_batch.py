@@ -118,11 +118,16 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
     pytest.importorskip("ray", reason="the extra jcr-handeye[cluster] is not installed")
     from ray.cluster_utils import Cluster
 
-    def slow(task: Task) -> Row:
-        time.sleep(1.0)
+    first, removed = tmp_path / "0", tmp_path / "removed"
+
+    def unfinished(task: Task) -> Row:
+        """The first ends at once, the others when the node is gone on which some of them run."""
+        deadline = time.monotonic() + 60
+        while task.capture != first and not removed.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
         return Row(str(task.capture), str(task.out), "done", offset_std_mm=1.0)
 
-    monkeypatch.setattr(module, "run_one", slow)
+    monkeypatch.setattr(module, "run_one", unfinished)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
     try:
         nodes = [cluster.add_node(num_cpus=2)]
@@ -130,6 +135,7 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
         def kill(stage: str, fraction: float) -> None:
             if fraction > 0 and nodes:
                 cluster.remove_node(nodes.pop(), allow_graceful=False)
+                removed.touch()
 
         options = replace(COMPLETE, ray=cluster.address)
         greedy = replace(options, cpus_per_task=64)

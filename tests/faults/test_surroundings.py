@@ -6,7 +6,6 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from capture_writers import write_easy_handeye2
 from jcr.calibration.calibration_json import read_calibration
 from jcr.geometry import scale_translation
 from jcr.simulate.problem import hand_eye_problem
+from waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -97,10 +97,9 @@ def test_a_run_that_is_told_to_end_leaves_nothing_half_written_and_goes_on(
         "--no-dense",
         "--quiet",
     ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
-        while run.poll() is None and not (out / ".lock").exists():
-            time.sleep(0.01)
-        time.sleep(0.3)
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as run:
+        until(lambda: run.poll() is not None or any(tmp_path.glob("jcr-colmap-*/*")))
         run.send_signal(signal.SIGTERM)
         assert "Traceback" not in run.communicate(timeout=60)[1]
         assert run.returncode in (-signal.SIGTERM, 143, 130, 0)

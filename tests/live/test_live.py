@@ -18,7 +18,7 @@ from numpy import ndarray
 
 import jcr
 from jcr.capture.images import read_image
-from jcr.live import ur
+from jcr.live import line_server, ur
 from jcr.live.asks import Ask, pose_of_numbers
 from jcr.live.camera import Frame, opened
 from jcr.live.collect import CollectOptions, collect
@@ -29,6 +29,7 @@ from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
 from jcr.simulate.ur import SimulatedUr
 from places import ROOT
+from waiting import until
 
 RATE = 10
 CLIENT = ROOT / "examples" / "pose_client.py"
@@ -226,6 +227,14 @@ def test_others_need_the_token(tabletop: Path):
 
 def test_a_client_that_drips_or_floods_is_dropped_and_others_are_served(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("jcr.live.line_server.LINE_S", 0.4)
+    received = [bytearray()]
+
+    def watched(client: socket.socket, buffer: bytearray, patience_s: float) -> bytes:
+        received.append(buffer)
+        return line(client, buffer, patience_s)
+
+    line = line_server._line
+    monkeypatch.setattr(line_server, "_line", watched)
     with serving(Listen(port=0, timeout_s=20.0)) as (port, heard):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as dripping:
             begun = time.monotonic()
@@ -243,7 +252,7 @@ def test_a_client_that_drips_or_floods_is_dropped_and_others_are_served(monkeypa
         friend = Client(port)
         half = json.dumps({"base_from_gripper": [0.4, 0, 0.5, 0, np.pi, 0]})
         friend.socket.sendall(half[:20].encode())
-        time.sleep(0.1)
+        until(lambda: received[-1] == half[:20].encode())
         assert friend.ask(half[20:]) == {"accepted": True}
         friend.close()
     assert len(heard) == 1

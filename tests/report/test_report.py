@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -504,8 +503,8 @@ def test_in_a_browser(chromium: Chromium, file: Path):
     assert len(np.unique(drawn, axis=0)) > 200
 
     # Turned by the mouse, it shows something else; every layer and switch changes it too.
-    x, y = chromium.center("#scene")
     before = chromium.picture("#scene")
+    x, y = chromium.center("#scene")
     mouse = {"button": "left", "buttons": 1, "clickCount": 1}
     chromium.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
     for k in range(1, 5):
@@ -533,12 +532,11 @@ def test_in_a_browser(chromium: Chromium, file: Path):
     chromium.call("Browser.grantPermissions", permissions=["clipboardReadWrite"])
     copied = chromium.js(
         "(async () => { const out = []; for (const b of document.querySelectorAll('[data-copy]'))"
-        " { b.click(); await new Promise(done => setTimeout(done, 50)); out.push([b.dataset.copy,"
-        " await navigator.clipboard.readText(), b.textContent]); } return out; })()"
+        " { b.click(); while (b.textContent !== 'copied') await new Promise(requestAnimationFrame);"
+        " out.push([b.dataset.copy, await navigator.clipboard.readText()]); } return out; })()"
     )
     assert len(copied) == 9 + 2  # notations, and poses to add
-    for wanted, found, label in copied:
-        assert wanted == found and label == "copied"
+    assert all(offered == found for offered, found in copied)
     # An image opens large with its marks, and arrow keys lead to the next.
     chromium.js("document.querySelectorAll('.images .shot')[1].click()")
     assert chromium.js("document.getElementById('large').open")
@@ -556,9 +554,8 @@ def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.open(file.as_uri(), 400, phone=True)
     assert chromium.js("document.documentElement.scrollWidth") <= 400
     light = chromium.js("getComputedStyle(document.body).backgroundColor")
-    x, y = chromium.center("#scene")
-    time.sleep(0.1)  # the emulated finger is refused while the page still scrolls
     before = chromium.picture("#scene")
+    x, y = chromium.center("#scene")
     finger = [{"x": x, "y": y, "id": 0}]
     chromium.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=finger)
     for k in range(1, 6):

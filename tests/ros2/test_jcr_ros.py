@@ -20,6 +20,7 @@ import jcr
 from jcr.capture.images import read_image
 from jcr.live.rest import State
 from places import ROOT
+from waiting import until
 
 PACKAGE = ROOT / "ros2" / "jcr_ros"
 
@@ -58,13 +59,6 @@ class Played:
 def camera_info(**more: Any) -> SimpleNamespace:
     k = [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]
     return SimpleNamespace(width=640, height=480, k=k, d=[0.0] * 5, distortion_model="plumb_bob", **more)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from jcr.geometry import apply, inverse
 from jcr.simulate.truth import Truth, read_truth
 from jcr.view.gate import Gate
 from jcr.view.robot import read_joints, read_urdf, solve_joints
+from waiting import until
 
 if TYPE_CHECKING:
     from jcr.view.viewer import Viewer
@@ -323,9 +324,7 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
         chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         for kind in ("mousePressed", "mouseReleased"):
             chromium.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        while viewer.clicked.content == "not yet":
-            assert time.monotonic() < deadline, "the click does not arrive"
-            time.sleep(0.2)
+        until(lambda: viewer.clicked.content != "not yet")
         assert "occupancy" in viewer.clicked.content
 
         def red(picture: np.ndarray) -> int:
@@ -339,7 +338,6 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
         before = red(picture)
         while red(chromium.picture("canvas")) < before + 500:
             assert time.monotonic() < deadline, "the sphere does not rotate red"
-            time.sleep(1)
         bad = [
             event["params"]
             for event in chromium.events

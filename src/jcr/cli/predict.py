@@ -51,7 +51,7 @@ def main(arguments: Arguments) -> int:
     if arguments.out.suffix != ".npz":
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")
     capture = read_capture(arguments.capture)
-    asked = ReconstructOptions(arguments.backend, arguments.device, weights=arguments.weights)
+    asked = ReconstructOptions(arguments.backend, device=arguments.device, weights=arguments.weights)
     weights, licence = weights_of(asked)
     options = Dust3rOptions(weights, licence, device_of(asked), arguments.pairs)
     with progress_bars() as progress:

@@ -65,7 +65,7 @@ class Equations:
     """The linearised equations of the used poses; s = 6 times their number, p unknowns."""
 
     residual: Float[ndarray, " s"]
-    """Predicted minus reported: position (m, base axes) and rotation vector (rad, gripper axes) of each pose in turn."""
+    """Steps (geometry.retract) from the reported to the predicted poses in turn: m, then rad; both in base axes."""
     jacobian: Float[ndarray, "s p"]
     prior_information: Float[ndarray, "p p"]
     prior_gradient: Float[ndarray, " p"]

@@ -55,7 +55,7 @@ class PoseFit:
     translation_residual: Float[ndarray, "n 3"]
     """Predicted minus reported gripper position (m), base axes; of every pose, used or not."""
     rotation_residual: Float[ndarray, "n 3"]
-    """Rotation vector from reported to predicted gripper (rad), gripper axes."""
+    """Rotation vector from reported to predicted gripper (rad), base axes."""
     noise: tuple[float, float]
     """σ_t (m) and σ_r (rad) per axis of the random errors, given or estimated."""
     noise_estimated: bool
@@ -71,7 +71,7 @@ class PoseFit:
     budget: Budget | None
     """Its parts; None of a fit that is not averaged."""
     missed: Float[ndarray, "n 6"]
-    """By how much a fit without it misses each pose: translation (m, base axes), rotation (rad, gripper axes)."""
+    """By how much a fit without it misses each pose: translation (m), rotation (rad), both in base axes."""
     missed_covariance: Float[ndarray, "n 6 6"]
     """What to expect of that, the pose's own noise included."""
 

@@ -139,7 +139,7 @@ def _damped_step(
 def _error(
     arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
-    """Difference to the pose in base axes, rotations times records.ARM (m), and the Jacobian of the gripper."""
+    """Difference to the pose in base axes, rotations times geometry.ARM (m), and the Jacobian of the gripper."""
     now, jacobian = kinematic_jacobian(arm, joints)
     turn = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM

@@ -77,7 +77,7 @@ class ErrorSizes:
     joint_offset: float = 0.0
     """rad, of each joint."""
     link: float = 0.0
-    """m, of each translation of a link. Its rotations have this divided by records.ARM (0.3 m), a typical length
+    """m, of each translation of a link. Its rotations have this divided by geometry.ARM (0.3 m), a typical length
     of a link, in rad: 0.3 mm goes with 0.06°."""
     sag: float = 0.0
     """rad, of each joint with the arm stretched out."""

@@ -19,6 +19,7 @@ from jcr.reconstruct.global_alignment.pairs import read_pairs
 if TYPE_CHECKING:
     import torch
 
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions
     from jcr.reconstruct.dust3r.network import Dust3r
 
 pytestmark = pytest.mark.slow
@@ -232,6 +233,22 @@ def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear:
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="use --device cpu"):
             load_weights(pth, "cuda")
+
+
+@pytest.mark.parametrize(("device", "expected"), [("cpu", "cpu"), ("cuda", "cuda"), ("auto", "cuda")])
+def test_predict_runs_on_the_device_that_is_asked_for(
+    device: str, expected: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[str] = []
+
+    def predict(capture: object, options: "Dust3rOptions", progress: object) -> None:
+        used.append(options.device)
+        raise InputError("far enough")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("jcr.reconstruct.dust3r.dust3r.predict", predict)
+    assert dispatch(["predict", str(tabletop), str(tmp_path / "pairs.npz"), "--device", device]) == 2
+    assert used == [expected]
 
 
 def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
