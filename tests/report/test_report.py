@@ -25,6 +25,7 @@ from jcr.cell.cameras_json import cameras_file
 from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
+from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
 from jcr.records import Capture, CellCamera, Intrinsics, Reconstruction, Tracks
@@ -355,10 +356,10 @@ def test_unseen_direction_has_a_red_bar(run: RunResult):
 
 def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
     capture = run.capture
-    reason = "only 2 of 12 images share features; lay <textured> things on the table"
-    failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
+    fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
+    error = NotTrustedError(fault, remedy)
+    failed = failed_file(capture, "colmap", error, {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
-    fault, remedy = reason.split("; ")
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
     assert names == list(capture.images)

@@ -23,7 +23,7 @@ from pydantic import (
 from jcr.calibration.requirement import not_exact_enough
 from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
-from jcr.errors import InputError
+from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
@@ -430,7 +430,7 @@ def calibration_file(
 def failed_file(
     capture: Capture,
     backend: str,
-    reason: str,
+    error: NotTrustedError,
     timings_s: dict[str, float],
     version: str,
     attempts: Sequence[Attempt] = (),
@@ -456,21 +456,26 @@ def failed_file(
         uncertainty=None,
         held_out=None,
         observability=Observed(
-            observable=False, unobservable=["everything: no camera poses"], advice=[reason]
+            observable=False,
+            unobservable=["everything: no camera poses"],
+            advice=list(error.remedies) or [error.what],
         ),
         robot_noise=None,
         intrinsics=_lens(capture.intrinsics),
-        **_derived([_no_reconstruction(reason)], ()),
+        **_derived(_no_reconstruction(error), ()),
         timings_s=timings_s,
         version=version,
         attempts=list(attempts),
     )
 
 
-def _no_reconstruction(reason: str) -> Finding:
-    return Finding(
-        kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details={"text": reason}
-    )
+def _no_reconstruction(error: NotTrustedError) -> list[Finding]:
+    said = {"text": error.what, "remedy": "; ".join(error.remedies)}
+    also = [
+        Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": more}) for more in error.also
+    ]
+    failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=said)
+    return [failed, *also]
 
 
 def image_verdicts(

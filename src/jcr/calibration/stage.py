@@ -113,8 +113,11 @@ def _calibrated(
     evidence = reconstruction.evidence
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
     if len(camera) < 2:
-        few = f"{len(camera)} of {len(capture)} images registered; overlap the views more"
-        raise NotTrustedError("; ".join([few, *reconstruction.warnings, *reconstruction.notes]))
+        raise NotTrustedError(
+            f"{len(camera)} of {len(capture)} images registered",
+            "overlap the views more",
+            also=(*reconstruction.warnings, *reconstruction.notes),
+        )
     noise = _noise(options)
     cues = _cues(capture, reconstruction, options)
     camera_covariance = None if evidence is None else evidence.covariance
