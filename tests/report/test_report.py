@@ -372,7 +372,7 @@ def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
         covariance[:3, :3] = std**2 * np.outer(optical, optical)
-        told = worst_direction(replace(result.hand_eye, covariance=covariance))
+        told = worst_direction(replace(result.hand_eye.estimate, covariance=covariance))
         assert told == f"along the optical axis: {words}"
 
 

@@ -181,7 +181,7 @@ def _calibrated(
             hand_eye = judged(replace(hand_eye, estimate=hand_eye.estimate.with_fault(more)))
     lens_fault = next((fault for fault in faults if fault.kind is Kind.INTRINSICS), None)
     if faults and (lens_fault is None or capture.intrinsics is None):
-        return _with_faults(hand_eye, faults)
+        return with_faults(hand_eye, faults)
     if (
         adjusted is None
         and hand_eye.converged
@@ -216,13 +216,13 @@ def _calibrated(
         adjusted,
     )
     if doubt is None:
-        return _with_faults(hand_eye, faults)
+        return with_faults(hand_eye, faults)
     others = [fault for fault in faults if fault.kind is not Kind.INTRINSICS]
     named = doubt if lens_fault is None else replace(lens_fault, shift=doubt.shift)
-    return _with_faults(kept, [*others, named])
+    return with_faults(kept, [*others, named])
 
 
-def _with_faults(hand_eye: HandEye, faults: Sequence[Finding]) -> HandEye:
+def with_faults(hand_eye: HandEye, faults: Sequence[Finding]) -> HandEye:
     """With what the faults do counted as uncertainty; they reject where that is more than can be accepted."""
     named = []
     for fault in faults:
@@ -291,7 +291,7 @@ def _in_sequence(
     rows, camera = reconstruction.image_index, reconstruction.recon_from_camera
     names = [capture.images[row] for row in rows]
     fault = sequence_fault(hand_eye, capture.base_from_gripper[rows], camera, names, systematic)
-    return hand_eye if fault is None else _with_faults(hand_eye, [fault])
+    return hand_eye if fault is None else with_faults(hand_eye, [fault])
 
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
