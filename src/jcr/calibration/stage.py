@@ -227,9 +227,7 @@ def with_faults(hand_eye: HandEye, faults: Sequence[Finding]) -> HandEye:
     named = []
     for fault in faults:
         accepted = hand_eye.converged and verdict_of([*named, fault]) != "rejected"
-        hand_eye = replace(
-            hand_eye, estimate=hand_eye.estimate.with_fault(np.outer(fault.shift, fault.shift))
-        )
+        hand_eye = replace(hand_eye, estimate=hand_eye.estimate.with_fault(fault.covariance))
         # More images, the remedy for a large covariance, do not mend a lens: that finding is left out.
         if not accepted or not judged(hand_eye).converged:
             fault = replace(fault, severity="rejects")

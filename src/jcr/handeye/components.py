@@ -478,11 +478,12 @@ def _budget(
     systematic = systematic + _elsewhere(equations, free, log_sizes, region)[:POSES, :POSES]
     parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
-    random, systematic, intrinsics, images = (to_whole @ part @ to_whole.T for part in parts)
+    random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     return Budget(
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
-        images=images,
+        # What is unobservable is among it, and the rounding of its large numbers.
+        images=covariance[:7, :7] - random - systematic - intrinsics,
         faults=np.zeros((7, 7)),
     )
