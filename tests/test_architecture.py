@@ -14,8 +14,8 @@ SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"deflate", "errors"},
     {"extras"},
-    {"pages", "rounding"},
-    {"geometry", "records", "files", "memory", "progress"},
+    {"pages", "rounding", "geometry"},
+    {"records", "files", "memory", "progress"},
     {"camera", "intrinsics_json", "least_squares"},
     {"handeye"},
     {"adjust"},

@@ -37,8 +37,8 @@ class Choice:
 class NothingFoundError(NotTrustedError):
     """No back end that was tried came to a calibration."""
 
-    def __init__(self, message: str, attempts: tuple[Attempt, ...]) -> None:
-        super().__init__(message)
+    def __init__(self, failure: NotTrustedError, attempts: tuple[Attempt, ...]) -> None:
+        super().__init__(failure.what, *failure.remedies, also=failure.also)
         self.attempts = attempts
 
 
@@ -248,15 +248,17 @@ def _better(one: _Tried, other: _Tried) -> tuple[_Tried, tuple[Attempt, ...]]:
         nothing = f"{about} failed ({one.failure})"
         if other.hand_eye is None:
             # The licence of weights that were used belongs to this answer, too.
-            failure = NotTrustedError(f"{other.failure}; {nothing}")
+            why = other.failure
+            failure = why if isinstance(why, NotTrustedError) else NotTrustedError(str(why))
+            failure = failure.with_more(nothing)
             return replace(other, failure=failure), (one.attempt(), other.attempt())
         kept = other.noted(f"{nothing}; {other.told()} was used instead")
         return kept, (one.attempt(), other.attempt())
-    doubt = f"{about} is rejected ({one.hand_eye.warnings[0]})"
+    doubt = f"{about} is rejected ({one.hand_eye.doubt})"
     if other.hand_eye is None:
         kept = one.noted(f"{doubt}, and {other.name} failed ({other.failure})")
         return kept, (one.attempt(), other.attempt())
-    untrusted = f"rejected: {one.hand_eye.warnings[0]}"
+    untrusted = f"rejected: {one.hand_eye.doubt}"
     if other.hand_eye.converged:
         kept = other.noted(f"{doubt}; {other.told()} is accepted, and was used instead of {one.told()}")
         return kept, (one.attempt(untrusted), other.attempt())
@@ -271,8 +273,9 @@ def _choice(kept: _Tried, attempts: tuple[Attempt, ...]) -> Choice:
     """Raises InputError or NothingFoundError where there is nothing to keep."""
     if isinstance(kept.failure, InputError):
         raise kept.failure
-    if kept.failure is not None or kept.reconstruction is None or kept.hand_eye is None:
-        raise NothingFoundError(str(kept.failure), attempts)
+    if kept.failure is not None:
+        raise NothingFoundError(kept.failure, attempts)
+    assert kept.reconstruction is not None and kept.hand_eye is not None
     return Choice(kept.reconstruction, kept.hand_eye, attempts, timings_of(attempts))
 
 

@@ -1,5 +1,7 @@
 """The two things that can be wrong and are no bug: the user's input, and a rejected answer."""
 
+from collections.abc import Sequence
+
 
 def printable(text: str) -> str:
     """The text without what a terminal would obey: names in files may hold any character."""
@@ -14,4 +16,13 @@ class InputError(ValueError):
 
 
 class NotTrustedError(RuntimeError):
-    """The input is sound but the result is rejected; the message gives the reason and the remedy (exit status 3)."""
+    """The input is sound but the result is rejected: the reason, what would help, and what else is worth saying (exit
+    status 3)."""
+
+    def __init__(self, what: str, *remedies: str, also: Sequence[str] = ()) -> None:
+        super().__init__("; ".join((what, *remedies, *also)))
+        self.what, self.remedies, self.also = what, remedies, tuple(also)
+
+    def with_more(self, *also: str) -> "NotTrustedError":
+        """The same with more to say."""
+        return NotTrustedError(self.what, *self.remedies, also=(*self.also, *also))

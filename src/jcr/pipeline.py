@@ -25,7 +25,7 @@ from jcr.mapping import mapped, measured, require_map
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import with_cameras_of
 from jcr.reconstruct.board_in_view import proposed
-from jcr.records import Capture, CellCamera, PosePairs
+from jcr.records import Capture, CellCamera, Finding, PosePairs
 from jcr.records.words import sentence
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
@@ -221,15 +221,15 @@ def _calibrate(capture: Capture, folder: RunFolder, options: RunOptions, progres
             )
         )
     except NothingFoundError as nothing:
-        error = nothing if options.reconstruct.board else _with_board(nothing, capture)
-        _fail(capture, folder, state, options, error)
-        raise error from None
+        board = None if options.reconstruct.board else _board_in_view(capture)
+        _fail(capture, folder, state, options, nothing, board)
+        raise (nothing if board is None else nothing.with_more(sentence(board))) from None
     folder.keep_state(state.model_copy(update={"attempts": choice.attempts}))
     content = calibration_file(
         capture, choice.reconstruction, choice.hand_eye, choice.timings_s, __version__, choice.attempts
     )
     if not options.reconstruct.board and (not content.converged or content.short is not None):
-        board = proposed([read_image(capture.folder / name) for name in capture.images])
+        board = _board_in_view(capture)
         content = content if board is None else content.with_findings(board)
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, choice.hand_eye, choice.reconstruction)
@@ -355,14 +355,18 @@ def _deepened(
     return choice
 
 
-def _with_board(error: NothingFoundError, capture: Capture) -> NothingFoundError:
-    """The error with the --board that would help, where the images show a board."""
-    proposal = proposed([read_image(capture.folder / name) for name in capture.images])
-    return error if proposal is None else NothingFoundError(f"{error}; {sentence(proposal)}", error.attempts)
+def _board_in_view(capture: Capture) -> Finding | None:
+    """The board that would help, where the images show one."""
+    return proposed([read_image(capture.folder / name) for name in capture.images])
 
 
 def _fail(
-    capture: Capture, folder: RunFolder, state: State, options: RunOptions, error: NothingFoundError
+    capture: Capture,
+    folder: RunFolder,
+    state: State,
+    options: RunOptions,
+    error: NothingFoundError,
+    board: Finding | None = None,
 ) -> None:
     """Leave the reason where the results would be, and nothing of another capture or of other options."""
     from jcr.report.html import failed_report_html
@@ -370,7 +374,8 @@ def _fail(
     if folder.earlier(state) is None:
         folder.forget_reconstruction()
     backend, timings = error.attempts[-1].backend, timings_of(error.attempts)
-    failed = failed_file(capture, backend, str(error), timings, __version__, error.attempts)
+    failed = failed_file(capture, backend, error, timings, __version__, error.attempts)
+    failed = failed if board is None else failed.with_findings(board)
     folder.keep_calibration(failed)
     folder.keep_report(failed_report_html(capture, failed, _told(options)))
 

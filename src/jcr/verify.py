@@ -24,6 +24,7 @@ from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction
+from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
 MIN_TO_RECALIBRATE = 5
@@ -150,7 +151,7 @@ def verify(
             systematic,
             options.alpha,
         )
-        notes = (*lost, *([] if unused is None else [unused]))
+        notes = (*lost, *([] if unused is None else [sentence(unused)]))
         return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
     if len(new) < MIN_TO_RECALIBRATE:
         raise NotTrustedError(
@@ -203,7 +204,7 @@ def verify_camera(
     found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
     for camera in found.cameras:
         if camera.parent_from_camera is None:
-            raise NotTrustedError(f"cannot tell: {camera.warnings[0]}")
+            raise NotTrustedError(f"cannot tell: {camera.doubt}")
     assert found.answer is not None
     before, after = found.of[name], found.of[now.name]
     j = found.answer.derivative(after) - found.answer.derivative(before)
@@ -292,9 +293,7 @@ def _by_recalibration(
     reconstruction = reconstruct(new, reconstruct_options, progress)
     hand_eye = calibrate(new, reconstruction)
     if not hand_eye.converged:
-        raise NotTrustedError(
-            f"cannot tell: a new calibration from these images failed ({hand_eye.warnings[0]})"
-        )
+        raise NotTrustedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
     before = np.array(calibration.gripper_from_camera)
     offset = step_between(before, hand_eye.gripper_from_camera)
     covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]

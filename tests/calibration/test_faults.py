@@ -61,6 +61,10 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
     assert said, hand_eye.warnings
     assert [float(size) for size in said[0].groups()] == pytest.approx(sizes, abs=within)
     assert outcome(found, hand_eye).is_sound
+    assert hand_eye.budget is not None
+    parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
+    assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
+    assert np.trace(hand_eye.budget.faults) > 0
     # No one answer is right on both sides of a slip, and a delay of that size leaves ± 10 mm.
     assert hand_eye.converged is (name not in ("slip", "delay"))
 

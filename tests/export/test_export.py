@@ -563,7 +563,11 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
     for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json"):
         (run / name).symlink_to(done / name)
     content = json.loads((done / "calibration.json").read_text())
-    content |= {"converged": False, "warnings": [DOUBT, "and another"]}
+    findings = [
+        {"kind": "reconstruction", "severity": severity, "details": {"text": words}}
+        for severity, words in (("rejects", DOUBT), ("warns", "and another"))
+    ]
+    content |= {"converged": False, "verdict": "rejected", "findings": findings}
     content["robot_errors"]["joints"] = 6 * [{"offset_deg": 0.1, "std_deg": 0.05}]
     (run / "calibration.json").write_text(json.dumps(content))
     for row in FORMATS:

@@ -24,6 +24,7 @@ from jcr.cell.cameras_json import cameras_file
 from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
+from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
 from jcr.records import Capture, CellCamera, Intrinsics, Reconstruction, Tracks
@@ -354,10 +355,10 @@ def test_unseen_direction_has_a_red_bar(run: RunResult):
 
 def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
     capture = run.capture
-    reason = "only 2 of 12 images share features; lay <textured> things on the table"
-    failed = failed_file(capture, "colmap", reason, {"reconstruct": 2.0}, "0.0")
+    fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
+    error = NotTrustedError(fault, remedy)
+    failed = failed_file(capture, "colmap", error, {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
-    fault, remedy = reason.split("; ")
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
     assert names == list(capture.images)
@@ -370,7 +371,7 @@ def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
         covariance[:3, :3] = std**2 * np.outer(optical, optical)
-        told = worst_direction(replace(result.hand_eye, covariance=covariance))
+        told = worst_direction(replace(result.hand_eye.estimate, covariance=covariance))
         assert told == f"along the optical axis: {words}"
 
 

@@ -175,13 +175,13 @@ class Session:
             self.settings.parent,
             self.settings.child,
             self.settings.base,
-            None if result.converged else "; ".join(hand_eye.warnings) or "not accepted",
+            None if result.converged else "; ".join(hand_eye.warnings),
         )
         std = np.sqrt(np.diag(hand_eye.covariance))
         offset = " ".join(f"{1e3 * value:.1f}" for value in hand_eye.gripper_from_camera[:3, 3])
         line = (
             f"camera at {offset} mm on {self.settings.parent}, sigma {1e3 * std[:3].max():.2g} mm and "
-            f"{np.degrees(std[3:6].max()):.2g} deg; {'accepted' if result.converged else 'rejected'}"
+            f"{np.degrees(std[3:6].max()):.2g} deg; {hand_eye.verdict}"
         )
         return mount, result.converged, line
 

@@ -23,7 +23,7 @@ from pydantic import (
 from jcr.calibration.requirement import not_exact_enough
 from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
-from jcr.errors import InputError
+from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text
 from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
@@ -32,6 +32,7 @@ from jcr.records import (
     Attempt,
     Capture,
     DepthCheck,
+    Estimate,
     Finding,
     HandEye,
     ImageVerdict,
@@ -379,7 +380,7 @@ def calibration_file(
             scale_std_percent=float(100 * std[6]),
             covariance=hand_eye.covariance.tolist(),
             order=list(COVARIANCE_ORDER),
-            worst=worst_direction(hand_eye),
+            worst=worst_direction(hand_eye.estimate),
             budget=_budget(hand_eye),
         ),
         held_out=None if held_out is None else HeldOutError(**vars(held_out)),
@@ -430,7 +431,7 @@ def calibration_file(
 def failed_file(
     capture: Capture,
     backend: str,
-    reason: str,
+    error: NotTrustedError,
     timings_s: dict[str, float],
     version: str,
     attempts: Sequence[Attempt] = (),
@@ -456,21 +457,26 @@ def failed_file(
         uncertainty=None,
         held_out=None,
         observability=Observed(
-            observable=False, unobservable=["everything: no camera poses"], advice=[reason]
+            observable=False,
+            unobservable=["everything: no camera poses"],
+            advice=list(error.remedies) or [error.what],
         ),
         robot_noise=None,
         intrinsics=_lens(capture.intrinsics),
-        **_derived([_no_reconstruction(reason)], ()),
+        **_derived(_no_reconstruction(error), ()),
         timings_s=timings_s,
         version=version,
         attempts=list(attempts),
     )
 
 
-def _no_reconstruction(reason: str) -> Finding:
-    return Finding(
-        kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details={"text": reason}
-    )
+def _no_reconstruction(error: NotTrustedError) -> list[Finding]:
+    said = {"text": error.what, "remedy": "; ".join(error.remedies)}
+    also = [
+        Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": more}) for more in error.also
+    ]
+    failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=said)
+    return [failed, *also]
 
 
 def image_verdicts(
@@ -514,15 +520,15 @@ def _share(covariance: Float[ndarray, "7 7"]) -> Share:
     )
 
 
-def worst_direction(hand_eye: HandEye) -> str:
+def worst_direction(estimate: Estimate) -> str:
     """The least certain direction of the translation in words, e.g. "along the optical axis: ±4.0 mm"."""
-    variance, vectors = np.linalg.eigh(hand_eye.covariance[:3, :3])
+    variance, vectors = np.linalg.eigh(estimate.covariance[:3, :3])
     direction = vectors[:, 2]
     std_mm = 1e3 * float(np.sqrt(variance[2]))
     named = {
-        "the optical axis": hand_eye.gripper_from_camera[:3, 2],
-        "the image's x axis": hand_eye.gripper_from_camera[:3, 0],
-        "the image's y axis": hand_eye.gripper_from_camera[:3, 1],
+        "the optical axis": estimate.gripper_from_camera[:3, 2],
+        "the image's x axis": estimate.gripper_from_camera[:3, 0],
+        "the image's y axis": estimate.gripper_from_camera[:3, 1],
     }
     name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
     if abs(axis @ direction) < np.cos(np.radians(30)):
@@ -579,7 +585,7 @@ def read_hand_eye(path: Path) -> Known:
     transform = require_rigid(np.array(found.gripper_from_camera), f"{file}: gripper_from_camera")
     if (uncertainty := found.uncertainty) is not None:
         budget = {} if uncertainty.budget is None else vars(uncertainty.budget)
-        parts = {name: share.covariance for name, share in budget.items()}
+        parts = {name: share.covariance for name, share in budget.items() if share is not None}
         return Known(
             transform,
             np.array(uncertainty.covariance)[:6, :6],

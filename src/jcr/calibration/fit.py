@@ -25,8 +25,11 @@ def fitted(
     """
     registered = len(reconstruction.image_index)
     if registered < 2:
-        few = f"{registered} of {len(capture)} images registered; overlap the views more"
-        raise NotTrustedError("; ".join([few, *reconstruction.warnings, *reconstruction.notes]))
+        raise NotTrustedError(
+            f"{registered} of {len(capture)} images registered",
+            "overlap the views more",
+            also=(*reconstruction.warnings, *reconstruction.notes),
+        )
     gripper = capture.base_from_gripper[reconstruction.image_index]
     cues, contradiction = _measured(capture, reconstruction, options), None
     if cues is None and (metric_std := reconstruction.metric_std) is not None:

@@ -146,5 +146,6 @@ def _worthwhile(
 
 def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
     """What wrong intrinsics add to the covariance."""
-    shifts = [one.shift for one in hand_eye.findings if one.mend == "intrinsics" and one.shift is not None]
-    return sum((np.outer(shift, shift) for shift in shifts), np.zeros((7, 7)))
+    return sum(
+        (one.covariance for one in hand_eye.findings if one.mend == "intrinsics"), start=np.zeros((7, 7))
+    )

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
 from jcr.handeye.solve import judged
@@ -27,9 +25,7 @@ def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
             named.append(finding)
             continue
         accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
-        hand_eye = replace(
-            hand_eye, estimate=hand_eye.estimate.with_fault(np.outer(finding.shift, finding.shift))
-        )
+        hand_eye = replace(hand_eye, estimate=hand_eye.estimate.with_fault(finding.covariance))
         # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
         if not accepted or not judged(hand_eye).converged:
             finding = replace(finding, severity="rejects")

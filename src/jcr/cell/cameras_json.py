@@ -94,7 +94,7 @@ class CameraPlaced(_Part):
     @property
     def doubt(self) -> str | None:
         """Why it is rejected; None when it is."""
-        return None if self.converged else self.warnings[0]
+        return None if self.converged else next(iter(self.warnings))
 
 
 class ArmPlaced(_Part):

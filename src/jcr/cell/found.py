@@ -49,6 +49,11 @@ class CameraFound:
     """The first says why it is rejected, where it is not."""
 
     @property
+    def doubt(self) -> str | None:
+        """Why it is rejected; None when it is not."""
+        return None if self.converged else next(iter(self.warnings), "not placed")
+
+    @property
     def std_at_scene(self) -> float | None:
         """m: one sigma, along the worst axis, of a point that the camera sees at that distance."""
         if self.parent_from_camera is None or self.covariance is None or self.scene_distance is None:

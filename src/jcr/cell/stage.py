@@ -303,7 +303,7 @@ class _Rigs:
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
         if not found.converged:
-            return seen.refused(found.warnings[0])
+            return seen.refused(str(found.doubt))
         rig = np.full(len(seen.shared), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))

@@ -436,6 +436,20 @@ def _widening(
     return max(1.0, float(found) / normal)
 
 
+def _between(one: Float[ndarray, "p p"], other: Float[ndarray, "p p"]) -> Float[ndarray, "p p"]:
+    """The linear map of least displacement that takes errors of one covariance to those of the other.
+
+    Symmetric, where lengths are counted in standard deviations (Knott and Smith, J. Optim. Theory Appl. 43, 1984).
+    """
+    std = np.sqrt(np.diag(one))
+    values, vectors = np.linalg.eigh(one / np.outer(std, std))
+    values = np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
+    root, inverse = (vectors * values @ vectors.T, vectors / values @ vectors.T)
+    squared, axes = np.linalg.eigh(root @ (other / np.outer(std, std)) @ root)
+    by = inverse @ (axes * np.sqrt(np.maximum(squared, 0.0)) @ axes.T) @ inverse
+    return std[:, None] * by / std
+
+
 def _budget(
     equations: Equations, log_sizes: LogSizes, region: Region | None, covariance: Float[ndarray, "p p"]
 ) -> Budget:
@@ -462,16 +476,14 @@ def _budget(
     free = solve(equations, log_sizes)
     intrinsics = free.covariance[:POSES, :POSES] - solution.covariance
     systematic = systematic + _elsewhere(equations, free, log_sizes, region)[:POSES, :POSES]
-    variance = np.diag(random + systematic + intrinsics + images)
-    whole = np.sqrt(np.diag(covariance)[:POSES] / variance)
-    share = np.outer(whole, whole)
-    random, systematic, intrinsics, images = (
-        (share * part)[:7, :7] for part in (random, systematic, intrinsics, images)
-    )
+    parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
+    to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
+    random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)
     return Budget(
         robot_random=random,
         robot_systematic=systematic,
         intrinsics=intrinsics,
-        images=images,
+        # What is unobservable is among it, and the rounding of its large numbers.
+        images=covariance[:7, :7] - random - systematic - intrinsics,
         faults=np.zeros((7, 7)),
     )

@@ -69,7 +69,7 @@ def reconstruct(
             capture.images,
         )
     except NotTrustedError as error:
-        raise NotTrustedError("; ".join([str(error), *warnings])) from None
+        raise error.with_more(*warnings) from None
     notes = sparse.notes
     if missing := [name for row, name in enumerate(capture.images) if row not in sparse.rows]:
         notes += (f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}",)

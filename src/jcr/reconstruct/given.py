@@ -53,8 +53,8 @@ def reconstruct(
         tracks = _triangulated(images, lens, recon_from_camera, options, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
         raise NotTrustedError(
-            f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated; check "
-            "that it belongs to these images, or leave it out (--backend colmap)"
+            f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
+            "check that it belongs to these images, or leave it out (--backend colmap)",
         )
     missing = [name for k, name in enumerate(capture.images) if k not in known]
     notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()

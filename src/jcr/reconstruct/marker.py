@@ -76,8 +76,8 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
         raise NotTrustedError(
-            f"{len(rows)} of {len(capture)} images show {options.board} well enough; check its size and kind, "
-            "that it lies flat and wholly in view, or use a back end that needs no marker"
+            f"{len(rows)} of {len(capture)} images show {options.board} well enough",
+            "check its size and kind, that it lies flat and wholly in view, or use a back end that needs no marker",
         )
     if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
         notes.append(f"the board is not seen, or not sharply, in {', '.join(missing)}")
@@ -106,7 +106,8 @@ def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) ->
     if images < LENS_IMAGES:
         raise NotTrustedError(
             f"{images} of {len(capture)} images show {board.name}, {LENS_IMAGES} are needed to find the unknown "
-            "intrinsics from it; check the board's kind and size, or give the intrinsics"
+            "intrinsics from it",
+            "check the board's kind and size, or give the intrinsics",
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
     rms_px, matrix, distortion, _, _, std, *_ = cv2.calibrateCameraExtended(

@@ -96,7 +96,7 @@ def structure_from_motion(
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
-            raise NotTrustedError(_why_not_registered(database, len(images), model))
+            raise _not_registered(database, len(images), model)
         _adjust_robustly(model, hold_lens=known)
         lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
@@ -412,8 +412,8 @@ def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
-def _why_not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> str:
-    """One line: how many registered, the likely reason, what to do instead."""
+def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> NotTrustedError:
+    """How many registered, the likely reason, what to do instead."""
     with closing(pycolmap.Database.open(database)) as db:
         features = int(np.median([db.num_keypoints_for_image(row + 1) for row in range(n_images)]))
         matched = db.num_verified_image_pairs()
@@ -425,10 +425,10 @@ def _why_not_registered(database: Path, n_images: int, model: pycolmap.Reconstru
         reason = (
             "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
         )
-    return (
-        f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images "
-        f"({reason}); put textured objects or a newspaper on the table, "
-        "let the views overlap more, or use a foundation-model back end or a marker"
+    return NotTrustedError(
+        f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images ({reason})",
+        "put textured objects or a newspaper on the table, let the views overlap more, or use a foundation-model back "
+        "end or a marker",
     )
 
 

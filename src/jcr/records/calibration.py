@@ -362,6 +362,11 @@ class HandEye:
         return self.verdict != "rejected"
 
     @property
+    def doubt(self) -> str | None:
+        """Why it is rejected, in words; None when it is not."""
+        return None if self.converged else sentence(self.findings[0])
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each finding that rejects or warns."""
         return tuple(sentence(finding) for finding in self.findings if finding.severity != "informs")

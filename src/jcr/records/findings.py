@@ -5,6 +5,10 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
 Severity = Literal["rejects", "warns", "informs"]
 Mend = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
 """What would help: another reconstruction of the same images, other motions, more or other images, other intrinsics,
@@ -71,6 +75,12 @@ class Finding:
     the covariance. None where it adds nothing."""
     details: Mapping[str, float | str] = field(default_factory=dict)
     """Further numbers (m, rad, px, shares) and names that the sentence needs."""
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"]:
+        """What it adds to that of the calibration."""
+        shift = np.zeros(7) if self.shift is None else np.array(self.shift)
+        return np.outer(shift, shift)
 
 
 CAMERA = frozenset(

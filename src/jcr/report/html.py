@@ -21,8 +21,8 @@ from jcr.calibration.words import (
 )
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
-from jcr.records import COEFFICIENTS, Capture, Intrinsics
-from jcr.records.words import SHORT, reached_in_words, remedy
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, Kind
+from jcr.records.words import SHORT, reached_in_words, remedy, sentence, text
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.features import features_section
 from jcr.report.figures import ABOVE, OBLIQUE, camera_figure
@@ -61,8 +61,6 @@ LINKS = {
     "details": "Details",
 }
 """To the sections, by their names in the page."""
-BOARD = r"a calibration board is in view[^;]*"
-"""As reconstruct/board_in_view.py proposes one."""
 Options = Mapping[str, Mapping[str, Any]]
 """A stage's name, and its options by name."""
 
@@ -154,10 +152,9 @@ def failed_report_html(capture: Capture, calibration: CalibrationFile, options: 
 
 def _failure(calibration: CalibrationFile) -> str:
     """What is wrong in one sentence, what to do, and below it what each back end that was tried said."""
-    last = calibration.attempts[-1].why_not if calibration.attempts else calibration.doubt
-    fault, *remedies = (last or calibration.doubt or "").split("; ")
-    if board := re.search(BOARD, calibration.doubt or ""):
-        remedies.insert(0, board[0])
+    failed, *others = calibration.findings
+    remedies = [sentence(one) for one in others if one.kind is Kind.BOARD_IN_VIEW]
+    remedies += filter(None, [remedy(failed)])
     items = "".join(
         f"<li><b>{escape(attempt.backend)}</b>{' with ' + attempt.features if attempt.features else ''}, "
         f"{attempt.reconstruct_s + attempt.calibrate_s:.1f} s: "
@@ -166,9 +163,9 @@ def _failure(calibration: CalibrationFile) -> str:
     )
     tried = f'<h3>What was tried</h3><ul class="attempts">{items}</ul>' if items else ""
     cures = "".join(f"<li>{escape(words[0].upper() + words[1:])}.</li>" for words in remedies)
-    remedy = f'<h3>What helps</h3><ul class="attempts">{cures}</ul>' if cures else ""
+    helps = f'<h3>What helps</h3><ul class="attempts">{cures}</ul>' if cures else ""
     return (
-        f'<section class="verdict bad" id="verdict"><h2><b>No calibration: {escape(fault)}.</b></h2>{remedy}'
+        f'<section class="verdict bad" id="verdict"><h2><b>No calibration: {escape(text(failed))}.</b></h2>{helps}'
         f"{tried}</section>"
     )
 

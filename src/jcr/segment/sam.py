@@ -51,7 +51,7 @@ def load_sam(weights: str) -> "Sam2Model":
     try:
         model = Sam2Model.from_pretrained(weights)
     except (OSError, ValueError) as error:
-        reason = str(error).split("\n")[0]
+        reason = str(error).splitlines()[0]
         hint = "the folder must hold config.json and model.safetensors" if os.path.isdir(weights) else ""
         raise InputError(
             f"--sam-weights {weights}: cannot be loaded ({reason}); {hint or 'check the name'}"

@@ -103,8 +103,8 @@ def reconstruct(
     report("direct alignment", 1.0)
     if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
         raise NotTrustedError(
-            f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few; "
-            "take images that overlap more, of a scene that does not move or shine"
+            f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few",
+            "take images that overlap more, of a scene that does not move or shine",
         )
     covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
     points = points.where(points.agreed)
@@ -144,7 +144,7 @@ def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int
         if fits.all():
             return rows, cameras
         if fits.sum() < 3:
-            raise NotTrustedError("direct alignment: fewer than three images fit together; take more")
+            raise NotTrustedError("direct alignment: fewer than three images fit together", "take more")
         rows, level = rows[fits], level.rows(np.flatnonzero(fits))
         cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
 

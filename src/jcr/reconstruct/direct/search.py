@@ -39,7 +39,7 @@ def search(
     """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
         raise NotTrustedError(
-            "direct alignment: the images show one colour and no edges; put different objects in view"
+            "direct alignment: the images show one colour and no edges", "put different objects in view"
         )
     directions = tied_directions(lens_held)
     screen = replace(COARSEST, per_image=SCREENED_POINTS)
@@ -62,7 +62,8 @@ def search(
     if rivals and best.cost > CLEARLY_BETTER * rivals[0].cost:
         raise NotTrustedError(
             f"direct alignment: cameras at different places explain the images alike (cost {best.cost:.3f} and "
-            f"{rivals[0].cost:.3f}); take more images, from more sides, of more and different objects"
+            f"{rivals[0].cost:.3f})",
+            "take more images, from more sides, of more and different objects",
         )
     return best
 

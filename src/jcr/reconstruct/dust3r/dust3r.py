@@ -82,4 +82,4 @@ def reconstruct(capture: Capture, options: Dust3rOptions, progress: Progress | N
             progress=progress,
         )
     except NotTrustedError as error:  # what was used, and its licence, are worth knowing all the same
-        raise NotTrustedError("; ".join([str(error), *notes])) from None
+        raise error.with_more(*notes) from None

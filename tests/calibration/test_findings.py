@@ -1,0 +1,176 @@
+"""Findings are data: ordered, counted as uncertainty, put into words in one place, kept in files, documented."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jcr.calibration.calibration_json import (
+    CalibrationFile,
+    calibration_file,
+    read_calibration,
+    read_hand_eye,
+)
+from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.verdict import with_findings
+from jcr.cell.cameras_json import in_words, read_cameras
+from jcr.errors import InputError
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import CAMERA, Finding, HandEye, Kind, PosePairs, verdict_of
+from jcr.records.words import remedy, sentence, text
+from jcr.simulate.problem import hand_eye_problem
+from places import ROOT
+
+GOLDEN = ROOT / "tests" / "golden"
+"""Files as the version before findings wrote them."""
+AT = {"frame": "gripper", "x": 0.0, "y": 0.6, "z": 0.8}
+LENS = {f"{name}{of}": 600.0 + k for name in ("fx", "fy", "cx", "cy") for k, of in enumerate(("", "_given"))}
+SIZE = {"rotation": 0.01}
+EXAMPLES: dict[Kind, dict] = {
+    Kind.UNOBSERVABLE: {"details": {"motion": "planar"} | AT, "value": 0.01},
+    Kind.FEW_IMAGES: {"value": 3.0},
+    Kind.FEW_AGREE: {"value": 3.0, "details": {"images": 9.0}},
+    Kind.POSES_CONTRADICT_IMAGES: {"value": 0.1, "details": SIZE},
+    Kind.POSE_CONVENTION: {
+        "details": {"reading": "their inverses", "fits": "1 mm", "given": "90 mm", "remedy": "x"}
+    },
+    Kind.NOISE_ABOVE_GIVEN: {"value": 0.01, "details": SIZE | {"given": 1e-3, "given_rotation": 1e-3}},
+    Kind.UNCERTAIN: {"value": 0.1, "details": {"part": "scale"}},
+    Kind.LEAVE_ONE_OUT: {"value": 0.1, "details": {"residual": 0.01}},
+    Kind.NOT_EXACT_ENOUGH: {
+        "details": {
+            "translation_mm": 5.0,
+            "rotation_deg": 1.0,
+            "asked": 0.0,
+            "distance_mm": 0.0,
+            "reached_mm": 9.0,
+            "reached_deg": 0.1,
+        }
+    },
+    Kind.ZOOM: {"value": 0.01, "std": 0.001, "p": 1e-9, "images": ("a.png", "b.png")},
+    Kind.INTRINSICS: {"p": 1e-9, "details": LENS | {"fx_std": 0.1, "fy_std": 0.1, "cx_std": 0.1}},
+    Kind.SLIP: {
+        "value": 0.01,
+        "p": 1e-9,
+        "images": ("a.png", "b.png"),
+        "details": SIZE | {"longer": "after", "count": 5.0},
+    },
+    Kind.DRIFT: {"value": 0.01, "p": 1e-9, "details": SIZE},
+    Kind.DELAY: {"value": 0.01, "std": 0.001, "p": 1e-9, "details": {"unit": "s"}},
+    Kind.WRONG_MOUNT: {"details": {"camera": "overhead"}},
+    Kind.SYSTEMATIC_ERRORS: {"value": 0.01, "p": 1e-9, "details": SIZE},
+    Kind.JOINT_OFFSETS: {"joints": (2,), "p": 1e-9, "details": {"joint_2": 0.01, "joint_2_std": 0.001}},
+    Kind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
+    Kind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
+}
+"""What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""
+
+
+def example(kind: Kind) -> Finding:
+    plain = {"value": 0.01, "std": 0.001, "p": 1e-9, "details": {"text": "a thing is wrong", "remedy": ""}}
+    return Finding(kind=kind, severity="warns", **EXAMPLES.get(kind, plain))
+
+
+@pytest.fixture(scope="module")
+def solved() -> HandEye:
+    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
+    return solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_every_kind_has_words_of_one_line(kind: Kind):
+    finding = example(kind)
+    for words in (text(finding), sentence(finding)):
+        assert words and "\n" not in words and "nan" not in words and not words.endswith(".")
+    assert sentence(finding).startswith(text(finding)) and sentence(finding).endswith(remedy(finding))
+
+
+def test_every_kind_is_documented_and_no_other():
+    page = (ROOT / "docs" / "reference" / "findings.md").read_text("utf-8")
+    rows = re.findall(r"^\| `([^`]+)` \| ", page, re.M)
+    assert [row for row in rows if row not in ("rejects", "warns", "informs")] == list(Kind)
+
+
+def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solved: HandEye):
+    assert solved.verdict == "accepted"
+    shift = (0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01)
+    fault = replace(example(Kind.DELAY), mend="poses", shift=shift)
+    found = with_findings(solved, (fault,))
+    assert [one.kind for one in found.findings] == [Kind.DELAY]  # and not that more images would help
+    assert found.verdict == "rejected" and found.findings[0].severity == "rejects" and not found.converged
+    small = with_findings(solved, (replace(fault, shift=(1e-4, *shift[1:6], 0.0)),))
+    assert small.verdict == "accepted with warnings" and small.warnings == (sentence(fault),)
+    # What else speaks against it comes after.
+    uncertain = replace(example(Kind.UNCERTAIN), severity="rejects")
+    found = with_findings(solved.with_findings(uncertain), (fault,))
+    assert [one.kind for one in found.findings] == [Kind.DELAY, Kind.UNCERTAIN]
+
+
+def test_the_parts_of_the_uncertainty_are_the_whole_with_every_fault(solved: HandEye):
+    before = solved.covariance.copy()
+    faults = [replace(example(kind), shift=(1e-3 * k, *6 * (1e-3,))) for k, kind in enumerate(CAMERA)]
+    found = with_findings(solved, tuple(faults))
+    assert found.budget is not None
+    assert np.allclose(sum(vars(found.budget).values()), found.covariance, rtol=0, atol=1e-12)
+    added = sum(np.outer(one.shift, one.shift) for one in faults if one.shift is not None)
+    assert np.allclose(found.budget.faults, added) and (solved.covariance == before).all()
+
+
+def test_findings_are_in_the_file_and_come_back(tmp_path: Path):
+    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
+    names = tuple(f"{k}.png" for k in range(12))
+    pairs = PosePairs(Path("a"), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    hand_eye = calibrate_poses(pairs).with_findings(*(example(kind) for kind in Kind))
+    hand_eye = with_findings(hand_eye, (replace(example(Kind.SLIP), mend="mount", shift=(1e-3,) * 7),))
+    content = calibration_file(pairs, pairs, hand_eye, {}, "0")
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps(content.model_dump()))
+    written = json.loads(file.read_text())
+    assert written["verdict"] == "accepted with warnings" and written["converged"]
+    assert [one["kind"] for one in written["findings"]][:2] == [
+        "camera moved on the gripper",
+        Kind.UNOBSERVABLE,
+    ]
+    assert all(
+        {"severity", "mend", "images", "joints", "text", "remedy"} <= one.keys()
+        for one in written["findings"]
+    )
+    said = [one["text"] + ("; " + one["remedy"]) * bool(one["remedy"]) for one in written["findings"]]
+    assert written["warnings"] == said
+    assert read_calibration(file) == content
+    parts = [share["covariance"] for share in written["uncertainty"]["budget"].values()]
+    assert np.allclose(np.sum(parts, axis=0), hand_eye.covariance, rtol=0, atol=1e-9)
+    # A verdict that the findings contradict is no calibration.
+    file.write_text(json.dumps(written | {"converged": False}))
+    with pytest.raises(InputError, match="contradict one another"):
+        read_calibration(file)
+
+
+@pytest.mark.parametrize("name", ["accepted", "rejected"])
+def test_files_of_the_version_before_findings_are_read(name: str, tmp_path: Path):
+    file = GOLDEN / f"calibration_{name}.json"
+    old, found = json.loads(file.read_text()), read_calibration(file)
+    assert found.verdict == name == verdict_of(found.findings)
+    assert (found.warnings, found.notes) == (old["warnings"], old["notes"])
+    assert found.doubt == (old["warnings"][0] if name == "rejected" else None)
+    assert found.uncertainty is not None and found.uncertainty.budget is not None
+    assert found.uncertainty.covariance == old["uncertainty"]["covariance"]
+    assert read_hand_eye(file).covariance is not None
+    again = tmp_path / "calibration.json"
+    again.write_text(json.dumps(found.model_dump()))
+    assert read_calibration(again) == found == CalibrationFile.model_validate(found)
+
+
+def test_cameras_of_the_version_before_findings_are_read():
+    old, found = json.loads((GOLDEN / "cameras.json").read_text()), read_cameras(GOLDEN)
+    assert found is not None and [camera.name for camera in found.cameras] == [
+        c["name"] for c in old["cameras"]
+    ]
+    assert (
+        found.cameras[0].converged
+        and found.cameras[0].base_from_camera == old["cameras"][0]["base_from_camera"]
+    )
+    assert in_words(found)
