@@ -15,7 +15,7 @@ from jcr.handeye.mounting import LengthError
 from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.robots import Arm, Joints
 from jcr.handeye.systematic import arm_errors, posed, systematic_errors
-from jcr.records import Capture, Finding, HandEye, Kind, RobotExamined
+from jcr.records import AngleRatio, Capture, Finding, HandEye, Kind, RobotExamined
 
 MIN_EXAMINED = 4
 """Images from which something may be said of the robot's own errors."""
@@ -45,9 +45,9 @@ def robot_examined(
     if posed_arm is not None:
         arm, joints = posed_arm
         offsets = joint_offsets(*of_used, arm, joints[used])
-    ratio = angle_ratio(gripper[used], camera[used])
+    ratio = AngleRatio(*angle_ratio(gripper[used], camera[used]))
     examined = RobotExamined(hand_eye.robot_noise, systematic_p_value(*of_used), offsets, ratio)
-    found = filter(None, (_systematic_finding(examined), angle_finding(*ratio)))
+    found = filter(None, (_systematic_finding(examined), angle_finding(ratio.ratio, ratio.std)))
     return replace(hand_eye, robot=examined).with_findings(*found)
 
 
