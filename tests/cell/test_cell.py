@@ -31,7 +31,6 @@ from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
-from jcr.records import Kind as FindingKind
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8

@@ -45,6 +45,7 @@ from jcr.records import (
     PosePairs,
     Reconstruction,
     Requirement,
+    RobotExamined,
     ScaleCheck,
     Severity,
     Verdict,
@@ -322,8 +323,6 @@ def calibration_file(
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
-    std = np.sqrt(np.diag(hand_eye.covariance))
-    offsets = hand_eye.robot.joint_offsets
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     mount = capture.mount if isinstance(capture, Capture) else "gripper"
     camera, recon = hand_eye.gripper_from_camera.tolist(), hand_eye.base_from_recon.tolist()
@@ -337,15 +336,7 @@ def calibration_file(
         backend=reconstruction.backend,
         images=image_verdicts(capture, reconstruction, hand_eye),
         residuals=hand_eye.residuals,
-        uncertainty=Uncertainty(
-            translation_std_mm=(1e3 * std[:3]).tolist(),
-            rotation_std_deg=np.degrees(std[3:6]).tolist(),
-            scale_std_percent=float(100 * std[6]),
-            covariance=hand_eye.covariance.tolist(),
-            order=list(COVARIANCE_ORDER),
-            worst=worst_direction(hand_eye.estimate),
-            budget=_budget(hand_eye),
-        ),
+        uncertainty=_uncertainty(hand_eye.estimate),
         held_out=hand_eye.held_out,
         observability=Observed(
             observable=hand_eye.observability.observable,
@@ -370,24 +361,41 @@ def calibration_file(
             for pose in hand_eye.next_poses
         ],
         scale_check=hand_eye.scale_evidence.network,
-        robot_errors=RobotErrors(
-            systematic_deg=float(np.degrees(hand_eye.robot_noise.systematic)),
-            translation_mm=1e3 * hand_eye.robot_noise.systematic_left[0],
-            rotation_deg=float(np.degrees(hand_eye.robot_noise.systematic_left[1])),
-            p=hand_eye.robot.systematic_p,
-            joints=None
-            if offsets is None
-            else [
-                JointOffset(offset_deg=off, std_deg=std)
-                for off, std in zip(
-                    np.degrees(offsets.offset).tolist(), np.degrees(offsets.std).tolist(), strict=True
-                )
-            ],
-        ),
+        robot_errors=_robot_errors(hand_eye.robot),
         angle_ratio=hand_eye.robot.angle_ratio,
         depth_check=hand_eye.scale_evidence.depth,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
+    )
+
+
+def _uncertainty(estimate: Estimate) -> Uncertainty:
+    std = np.sqrt(np.diag(estimate.covariance))
+    parts = None if estimate.budget is None else vars(estimate.budget)
+    return Uncertainty(
+        translation_std_mm=(1e3 * std[:3]).tolist(),
+        rotation_std_deg=np.degrees(std[3:6]).tolist(),
+        scale_std_percent=float(100 * std[6]),
+        covariance=estimate.covariance.tolist(),
+        order=list(COVARIANCE_ORDER),
+        worst=worst_direction(estimate),
+        budget=None
+        if parts is None
+        else UncertaintyBudget(**{name: _share(part) for name, part in parts.items()}),
+    )
+
+
+def _robot_errors(robot: RobotExamined) -> RobotErrors:
+    offsets, joints = robot.joint_offsets, None
+    if offsets is not None:
+        degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
+        joints = [JointOffset(offset_deg=offset, std_deg=std) for offset, std in degrees]
+    return RobotErrors(
+        systematic_deg=float(np.degrees(robot.noise.systematic)),
+        translation_mm=1e3 * robot.noise.systematic_left[0],
+        rotation_deg=float(np.degrees(robot.noise.systematic_left[1])),
+        p=robot.systematic_p,
+        joints=joints,
     )
 
 
@@ -457,12 +465,6 @@ def image_verdicts(
             )
         )
     return verdicts
-
-
-def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
-    if (parts := hand_eye.budget) is None:
-        return None
-    return UncertaintyBudget(**{name: _share(part) for name, part in vars(parts).items()})
 
 
 def _share(covariance: Float[ndarray, "7 7"]) -> Share:
