@@ -257,7 +257,7 @@ class CalibrationFile(_Part):
             raise ValueError(f"{other} of a camera whose mount is {self.mount}")
         if self.converged and not found:
             raise ValueError(f"converged without a {name_found}")
-        if not self.converged and not self.warnings:
+        if not self.converged and not self.warnings and self.verdict is None:
             raise ValueError("not converged, and no warning says why")
         if self.verdict is not None and (
             self.verdict != verdict_of(self.findings) or self.converged is (self.verdict == "rejected")
