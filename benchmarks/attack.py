@@ -16,7 +16,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.handeye.equation import predict
-from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records import Capture, HandEye, Kind, Reconstruction
 from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
 DRAWS, FEW, CLEAN = 7, 2, 70
@@ -26,21 +26,21 @@ IMAGES = 12
 LOOSE = (3.0, 3.0)
 """m, rad: gripper poses by which structure from motion is hardly held."""
 NAMES = {
-    "focal length grows": "focus follows distance",
-    "focal length shrinks": "focus follows distance",
-    "focal length differs": "focus scatters",
-    "focal length changes": "zoom",
-    "images are sheared": "rolling shutter",
-    "sheared by itself": "rolling shutter",
-    "images show": "intrinsics",
-    "have moved on the gripper": "slip",
-    "drift on the gripper": "drift",
-    "as if read": "delay",
-    "disagree by": "poses and images disagree",
-    "images agree on one": "poses and images disagree",
-    "is known to ±": "too uncertain",
+    Kind.FOCUS_BY_DISTANCE: "focus follows distance",
+    Kind.FOCUS_BY_IMAGE: "focus scatters",
+    Kind.ZOOM: "zoom",
+    Kind.ROLLING_SHUTTER: "rolling shutter",
+    Kind.ROLLING_SHUTTER_BY_IMAGE: "rolling shutter",
+    Kind.INTRINSICS: "intrinsics",
+    Kind.SLIP: "slip",
+    Kind.DRIFT: "drift",
+    Kind.DELAY: "delay",
+    Kind.POSES_CONTRADICT_IMAGES: "poses and images disagree",
+    Kind.NOISE_ABOVE_GIVEN: "poses and images disagree",
+    Kind.FEW_AGREE: "poses and images disagree",
+    Kind.UNCERTAIN: "too uncertain",
 }
-"""What is said, by words in it."""
+"""What is found, by its kind."""
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,7 @@ def calibrated(
 def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
     """Against the camera's place before a slip or after it, whichever is nearer."""
     std = np.sqrt(np.diag(hand_eye.covariance)[:6])
-    said = frozenset(
-        name for words, name in NAMES.items() if any(words in text for text in hand_eye.warnings)
-    )
+    said = frozenset(NAMES[finding.kind] for finding in hand_eye.findings if finding.kind in NAMES)
     steps = [
         step_between(hand_eye.gripper_from_camera, x)
         for x in (found.gripper_from_camera, found.gripper_from_camera_after)

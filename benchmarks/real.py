@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.peers import opencv
-from jcr.calibration.calibration_json import HeldOutError, read_hand_eye
+from jcr.calibration.calibration_json import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
@@ -26,7 +26,7 @@ from jcr.geometry import (
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.marker import MarkerOptions, reconstruct
-from jcr.records import Capture
+from jcr.records import Capture, HeldOut
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Row:
     """The same in standard deviations of both, where the reference states its own."""
     std_mm: float | None = None
     std_deg: float | None = None
-    held_out: HeldOutError | None = None
+    held_out: HeldOut | None = None
     trusted: bool = False
     seconds: float = 0.0
     says: str = ""
@@ -162,7 +162,7 @@ def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) ->
     told = (
         None
         if held is None
-        else HeldOutError(
+        else HeldOut(
             translation_mm=held.translation_mm,
             rotation_deg=held.rotation_deg,
             reprojection_px=None,
@@ -178,7 +178,7 @@ def _park(gripper: Transforms, camera: Transforms) -> Float[ndarray, "4 4"]:
     return opencv("Park", gripper, camera, 1.0)[0]
 
 
-def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOutError:
+def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOut:
     """Each gripper pose predicted by Park's method from the others, as `held_out` of a calibration has it."""
     missed = []
     for k in range(len(gripper)):
@@ -190,7 +190,7 @@ def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOutError:
         )
         missed.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
     mm, deg = np.mean(missed, axis=0)
-    return HeldOutError(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
+    return HeldOut(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
 
 
 def _off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:

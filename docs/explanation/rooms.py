@@ -37,7 +37,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     ),
     (
         ("geometry.py", "SE(3), one retraction", 1.3),
-        ("records", "what flows", 1),
+        ("records/", "what flows", 1),
         ("files, memory, progress, rounding", "what every stage needs", 2),
     ),
     (

@@ -30,7 +30,8 @@ from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_b
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
-from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import Kind as FindingKind
 from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8
@@ -205,7 +206,8 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert [camera.converged for camera in found.cameras] == [False, False, False]
     assert "must see the same scene" in found.cameras[0].warnings[0]
     assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
-    untrusted = place_cameras(old, [moving], reconstruction, replace(hand_eye, converged=False))
+    uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})
+    untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
 
 

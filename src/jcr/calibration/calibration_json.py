@@ -29,19 +29,24 @@ from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import (
     COVARIANCE_ORDER,
+    AngleRatio,
     Attempt,
     Capture,
     DepthCheck,
     Estimate,
     Finding,
     HandEye,
+    HeldOut,
     ImageVerdict,
     Intrinsics,
     Kind,
     Mount,
+    PaperResiduals,
     PosePairs,
     Reconstruction,
     Requirement,
+    RobotExamined,
+    ScaleCheck,
     Severity,
     Verdict,
     strongest_first,
@@ -105,13 +110,6 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Residuals(_Part):
-    """The paper's residuals over consecutive used images."""
-
-    translation: float
-    rotation: float
-
-
 class Share(_Part):
     """One sigma per axis, root mean square over the axes: squares of shares add up to that of the whole."""
 
@@ -143,13 +141,6 @@ class Uncertainty(_Part):
     worst: str
     """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
-
-
-class HeldOutError(_Part):
-    translation_mm: float
-    rotation_deg: float
-    reprojection_px: float | None
-    how: str
 
 
 class Observed(_Part):
@@ -185,22 +176,6 @@ class RobotErrors(_Part):
     """From the base on; null where the arm is not known."""
 
 
-class AngleRatio(_Part):
-    """Rotation angles between cameras over those between grippers: 1 of a straight arm and the right intrinsics."""
-
-    ratio: float
-    std: Spread
-
-
-class Image(_Part):
-    image: str
-    used: bool
-    reason: str | None
-    translation_residual_mm: float | None
-    rotation_residual_deg: float | None
-    reprojection_px: float | None = None
-
-
 class Lens(IntrinsicsJson):
     """With what is known of their errors."""
 
@@ -215,13 +190,6 @@ class Lens(IntrinsicsJson):
                 f"{4 + len(self.distortion)} parameters"
             )
         return self
-
-
-class NetworkScale(_Part):
-    """How far a metric network's own lengths are from the robot's (positive: too long), and how sure that is."""
-
-    off_percent: float
-    std_percent: float
 
 
 class Proposal(_Part):
@@ -242,10 +210,10 @@ class CalibrationFile(_Part):
     base_from_recon: Matrix | None
     converged: bool
     backend: str
-    images: list[Image]
-    residuals: Residuals | None
+    images: list[ImageVerdict]
+    residuals: PaperResiduals | None
     uncertainty: Uncertainty | None
-    held_out: HeldOutError | None
+    held_out: HeldOut | None
     observability: Observed
     robot_noise: Noise | None
     intrinsics: Lens | None
@@ -258,7 +226,7 @@ class CalibrationFile(_Part):
     timings_s: dict[str, float]
     version: str
     next_poses: list[Proposal] = []
-    scale_check: NetworkScale | None = None
+    scale_check: ScaleCheck | None = None
     robot_errors: RobotErrors | None = None
     angle_ratio: AngleRatio | None = None
     depth_check: DepthCheck | None = None
@@ -289,7 +257,7 @@ class CalibrationFile(_Part):
             raise ValueError(f"{other} of a camera whose mount is {self.mount}")
         if self.converged and not found:
             raise ValueError(f"converged without a {name_found}")
-        if not self.converged and not self.warnings:
+        if not self.converged and not self.warnings and self.verdict is None:
             raise ValueError("not converged, and no warning says why")
         if self.verdict is not None and (
             self.verdict != verdict_of(self.findings) or self.converged is (self.verdict == "rejected")
@@ -355,9 +323,6 @@ def calibration_file(
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
-    std = np.sqrt(np.diag(hand_eye.covariance))
-    held_out, check = hand_eye.held_out, hand_eye.scale_evidence.network
-    offsets, ratio = hand_eye.robot.joint_offsets, hand_eye.robot.angle_ratio
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
     mount = capture.mount if isinstance(capture, Capture) else "gripper"
     camera, recon = hand_eye.gripper_from_camera.tolist(), hand_eye.base_from_recon.tolist()
@@ -369,21 +334,10 @@ def calibration_file(
         gripper_from_object=recon if mount == "base" else None,
         scale=hand_eye.scale,
         backend=reconstruction.backend,
-        images=[
-            Image(**vars(verdict), reprojection_px=pixels)
-            for verdict, pixels in image_verdicts(capture, reconstruction, hand_eye)
-        ],
-        residuals=Residuals(**vars(hand_eye.residuals)),
-        uncertainty=Uncertainty(
-            translation_std_mm=(1e3 * std[:3]).tolist(),
-            rotation_std_deg=np.degrees(std[3:6]).tolist(),
-            scale_std_percent=float(100 * std[6]),
-            covariance=hand_eye.covariance.tolist(),
-            order=list(COVARIANCE_ORDER),
-            worst=worst_direction(hand_eye.estimate),
-            budget=_budget(hand_eye),
-        ),
-        held_out=None if held_out is None else HeldOutError(**vars(held_out)),
+        images=image_verdicts(capture, reconstruction, hand_eye),
+        residuals=hand_eye.residuals,
+        uncertainty=_uncertainty(hand_eye.estimate),
+        held_out=hand_eye.held_out,
         observability=Observed(
             observable=hand_eye.observability.observable,
             unobservable=list(hand_eye.observability.unobservable),
@@ -406,25 +360,42 @@ def calibration_file(
             )
             for pose in hand_eye.next_poses
         ],
-        scale_check=None if check is None else NetworkScale(**vars(check)),
-        robot_errors=RobotErrors(
-            systematic_deg=float(np.degrees(hand_eye.robot_noise.systematic)),
-            translation_mm=1e3 * hand_eye.robot_noise.systematic_left[0],
-            rotation_deg=float(np.degrees(hand_eye.robot_noise.systematic_left[1])),
-            p=hand_eye.robot.systematic_p,
-            joints=None
-            if offsets is None
-            else [
-                JointOffset(offset_deg=off, std_deg=std)
-                for off, std in zip(
-                    np.degrees(offsets.offset).tolist(), np.degrees(offsets.std).tolist(), strict=True
-                )
-            ],
-        ),
-        angle_ratio=None if ratio is None else AngleRatio(ratio=ratio[0], std=ratio[1]),
+        scale_check=hand_eye.scale_evidence.network,
+        robot_errors=_robot_errors(hand_eye.robot),
+        angle_ratio=hand_eye.robot.angle_ratio,
         depth_check=hand_eye.scale_evidence.depth,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
+    )
+
+
+def _uncertainty(estimate: Estimate) -> Uncertainty:
+    std = np.sqrt(np.diag(estimate.covariance))
+    parts = None if estimate.budget is None else vars(estimate.budget)
+    return Uncertainty(
+        translation_std_mm=(1e3 * std[:3]).tolist(),
+        rotation_std_deg=np.degrees(std[3:6]).tolist(),
+        scale_std_percent=float(100 * std[6]),
+        covariance=estimate.covariance.tolist(),
+        order=list(COVARIANCE_ORDER),
+        worst=worst_direction(estimate),
+        budget=None
+        if parts is None
+        else UncertaintyBudget(**{name: _share(part) for name, part in parts.items()}),
+    )
+
+
+def _robot_errors(robot: RobotExamined) -> RobotErrors:
+    offsets, joints = robot.joint_offsets, None
+    if offsets is not None:
+        degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
+        joints = [JointOffset(offset_deg=offset, std_deg=std) for offset, std in degrees]
+    return RobotErrors(
+        systematic_deg=float(np.degrees(robot.noise.systematic)),
+        translation_mm=1e3 * robot.noise.systematic_left[0],
+        rotation_deg=float(np.degrees(robot.noise.systematic_left[1])),
+        p=robot.systematic_p,
+        joints=joints,
     )
 
 
@@ -443,16 +414,7 @@ def failed_file(
         scale=None,
         base_from_recon=None,
         backend=backend,
-        images=[
-            Image(
-                image=name,
-                used=False,
-                reason="not registered",
-                translation_residual_mm=None,
-                rotation_residual_deg=None,
-            )
-            for name in capture.images
-        ],
+        images=[ImageVerdict(image=name, used=False, reason="not registered") for name in capture.images],
         residuals=None,
         uncertainty=None,
         held_out=None,
@@ -481,34 +443,28 @@ def _no_reconstruction(error: NotTrustedError) -> list[Finding]:
 
 def image_verdicts(
     capture: Capture | PosePairs, reconstruction: Reconstruction | PosePairs, hand_eye: HandEye
-) -> list[tuple[ImageVerdict, float | None]]:
-    """What became of every image of the capture, with its median reprojection error."""
+) -> list[ImageVerdict]:
+    """What became of every image of the capture."""
     row_of = {int(row): k for k, row in enumerate(reconstruction.image_index)}
-    images = hand_eye.images
-    verdicts = []
+    images, verdicts = hand_eye.images, []
     for row, name in enumerate(capture.images):
         k = row_of.get(row)
         if k is None:
-            verdicts.append(
-                (ImageVerdict(name, False, f"not registered by {reconstruction.backend}", None, None), None)
-            )
+            why = f"not registered by {reconstruction.backend}"
+            verdicts.append(ImageVerdict(image=name, used=False, reason=why))
             continue
-        verdict = ImageVerdict(
-            name,
-            bool(images.inliers[k]),
-            images.reasons[k],
-            1e3 * float(images.translation_residual_m[k]),
-            float(np.degrees(images.rotation_residual_rad[k])),
+        pixels = np.nan if images.reprojection_px is None else float(images.reprojection_px[k])
+        verdicts.append(
+            ImageVerdict(
+                image=name,
+                used=bool(images.inliers[k]),
+                reason=images.reasons[k],
+                translation_residual_mm=1e3 * float(images.translation_residual_m[k]),
+                rotation_residual_deg=float(np.degrees(images.rotation_residual_rad[k])),
+                reprojection_px=None if np.isnan(pixels) else pixels,
+            )
         )
-        pixels = None if images.reprojection_px is None else float(images.reprojection_px[k])
-        verdicts.append((verdict, None if pixels is None or np.isnan(pixels) else pixels))
     return verdicts
-
-
-def _budget(hand_eye: HandEye) -> UncertaintyBudget | None:
-    if (parts := hand_eye.budget) is None:
-        return None
-    return UncertaintyBudget(**{name: _share(part) for name, part in vars(parts).items()})
 
 
 def _share(covariance: Float[ndarray, "7 7"]) -> Share:
@@ -639,7 +595,7 @@ def _validated(content: dict[str, object], file: Path) -> CalibrationFile:
 
 
 def _of_earlier_version(found: CalibrationFile) -> CalibrationFile:
-    """With its warnings, of which nothing but their words is known, as findings."""
+    """With its warnings as findings; only their words are known."""
     first: Severity = "warns" if found.converged else "rejects"
     findings = [
         Finding(

@@ -4,15 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.records import Attempt, DepthCheck, HeldOut
+from jcr.records import Attempt, DepthCheck, HeldOut, ScaleCheck
 from jcr.records.words import network_scale, reached_in_words
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
     from jcr.calibration.calibration_json import (
         CalibrationFile,
-        HeldOutError,
-        NetworkScale,
         UncertaintyBudget,
     )
 
@@ -132,12 +130,12 @@ def attempt_in_words(attempt: Attempt, images: int) -> str:
     return f"{attempt.backend}{features} registered {registered}, {verdict}; {times}"
 
 
-def missed(held_out: "HeldOut | HeldOutError") -> str:
+def missed(held_out: HeldOut) -> str:
     """By how much images left out are missed."""
     return f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
 
 
-def pixels(held_out: "HeldOut | HeldOutError") -> str:
+def pixels(held_out: HeldOut) -> str:
     """The same in their images, to follow it; empty where no image tells."""
     return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
 
@@ -155,6 +153,6 @@ def depth_in_words(check: DepthCheck) -> str:
     return f"depth camera: its lengths {size}; noise {noise} (1 σ); the map uses corrected depth"
 
 
-def scale_in_words(check: "NetworkScale") -> str:
+def scale_in_words(check: ScaleCheck) -> str:
     """How far a network's own scale is from the robot's, and how sure that is."""
     return network_scale(check.off_percent, check.std_percent)

@@ -84,10 +84,12 @@ def found_alone(
 ) -> CameraFound:
     """What the calibration of a camera by its own images says of it."""
     pictures = []
-    for verdict, pixels in image_verdicts(own, reconstruction, found):
+    for verdict in image_verdicts(own, reconstruction, found):
         row = own.images.index(verdict.image)
         points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
-        pictures.append(PictureFound(verdict.image, verdict.used, points, pixels, verdict.reason))
+        pictures.append(
+            PictureFound(verdict.image, verdict.used, points, verdict.reprojection_px, verdict.reason)
+        )
     std = found.estimate.intrinsics_covariance
     return CameraFound(
         camera.name,

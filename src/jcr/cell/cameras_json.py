@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from jcr.calibration.calibration_json import Lens, Matrix, Spread, Spread3
 from jcr.capture.plain_files import first_fault, is_written, read_json
-from jcr.cell.found import ArmFound, CameraFound, CellFound
+from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.rounding import significant
@@ -48,15 +48,6 @@ class Sureness(_Part):
     scene_distance_m: Spread | None = None
 
 
-class Picture(_Part):
-    image: str
-    used: bool
-    points: int
-    """Shared with the images of the capture's own camera."""
-    reprojection_px: float | None
-    reason: str | None
-
-
 class CameraPlaced(_Part):
     """One camera; of one that was not found the transforms are null, and the first warning says why."""
 
@@ -70,7 +61,7 @@ class CameraPlaced(_Part):
     """Of a camera on a gripper."""
     uncertainty: Sureness | None = None
     intrinsics: Lens | None = None
-    pictures: list[Picture]
+    pictures: list[PictureFound]
     converged: bool
     warnings: list[str]
 
@@ -140,7 +131,7 @@ def _camera(found: CameraFound) -> CameraPlaced:
         else Lens.model_validate(
             vars(lens) | {"distortion": list(lens.distortion), "std": None if std is None else std.tolist()}
         ),
-        pictures=[Picture(**vars(picture)) for picture in found.pictures],
+        pictures=list(found.pictures),
         converged=found.converged,
         warnings=list(found.warnings),
         **{} if transform is None else {key: transform.tolist()},

@@ -35,13 +35,17 @@ ROUGHLY = 2.0
 """A closed form tells how well a reading fits to this factor."""
 MIN_SHARE = 0.8
 """of the images must agree under it."""
+INVERSES = "their inverses (gripper_from_base was given)"
+WXYZ = "quaternions w, x, y, z that were taken as x, y, z, w"
+XYZW = "quaternions x, y, z, w that were taken as w, x, y, z"
+TRANSPOSED = "transposed rotations"
 OPTIONS = {
-    "their inverses": "add --pose-inverted",
-    "quaternions w, x, y, z": "in a table add --pose-convention quat-wxyz",
-    "quaternions x, y, z, w": "in a table add --pose-convention quat-xyzw",
-    "transposed rotations": "in a table of matrices add --pose-convention franka",
+    INVERSES: "add --pose-inverted",
+    WXYZ: "in a table add --pose-convention quat-wxyz",
+    XYZW: "in a table add --pose-convention quat-xyzw",
+    TRANSPOSED: "in a table of matrices add --pose-convention franka",
 }
-"""What reads poses so: options, by how the names of readings begin."""
+"""What reads poses so."""
 EULER_ORDERS = (
     *("xyz", "ZYX", "zyx", "XYZ", "ZYZ", "zyz", "xzy", "yxz", "yzx", "zxy", "XZY", "YXZ", "YZX", "ZXY"),
     *("xyx", "xzx", "yxy", "yzy", "zxz", "XYX", "XZX", "YXY", "YZY", "ZXZ"),
@@ -116,8 +120,7 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
         f"{reading.translation_mm:.1f} mm and {reading.rotation_deg:.2f}° per axis over {reading.used} images"
         for reading in found
     )
-    options = (option for words, option in OPTIONS.items() if found[0].name.startswith(words))
-    remedy = next(options, "correct them at their source")
+    remedy = OPTIONS.get(found[0].name, "correct them at their source")
     return Finding(
         kind=Kind.POSE_CONVENTION,
         severity=severity,
@@ -162,7 +165,7 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     n = len(base_from_gripper)
     every = np.arange(n)
     yield _Candidate("they are given", base_from_gripper, every)
-    yield _Candidate("their inverses (gripper_from_base was given)", inverse(base_from_gripper), every)
+    yield _Candidate(INVERSES, inverse(base_from_gripper), every)
     yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
     for shift in (1, 2):
         if n - shift >= 5:
@@ -182,17 +185,13 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
         return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
-    yield turned(
-        "quaternions w, x, y, z that were taken as x, y, z, w", Rotation.from_quat(np.stack([y, z, w, x], 1))
-    )
-    yield turned(
-        "quaternions x, y, z, w that were taken as w, x, y, z", Rotation.from_quat(np.stack([w, x, y, z], 1))
-    )
+    yield turned(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
+    yield turned(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
     yield turned(
         "rotation vectors in radians that were taken as degrees",
         Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
     )
-    yield turned("transposed rotations", rotation.inv())
+    yield turned(TRANSPOSED, rotation.inv())
     angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
         yield turned(

@@ -6,6 +6,7 @@ and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Met
 
 from jcr.records.calibration import (
     COVARIANCE_ORDER,
+    AngleRatio,
     Attempt,
     Budget,
     DepthCheck,
@@ -42,6 +43,7 @@ from jcr.records.findings import CAMERA, Finding, Kind, Mend, Severity, Verdict,
 from jcr.records.reconstruction import BOTH, MATCHED, NO_DEPTH, PRIOR, CameraEvidence, Reconstruction, Tracks
 
 __all__ = [
+    "AngleRatio",
     "Attempt",
     "BOTH",
     "Budget",

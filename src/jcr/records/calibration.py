@@ -12,7 +12,7 @@ from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdic
 from jcr.records.words import remedy, sentence, unobservable
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageVerdict:
     """What the calibration thinks of one image of the capture."""
 
@@ -20,8 +20,10 @@ class ImageVerdict:
     used: bool
     reason: str | None
     """Why it was not used; None when it was."""
-    translation_residual_mm: float | None
-    rotation_residual_deg: float | None
+    translation_residual_mm: float | None = None
+    rotation_residual_deg: float | None = None
+    reprojection_px: float | None = None
+    """Median reprojection error."""
 
 
 @dataclass(frozen=True)
@@ -241,6 +243,15 @@ class PaperResiduals:
 
 
 @dataclass(frozen=True)
+class AngleRatio:
+    """Rotation angles between cameras over those between grippers: 1 of a straight arm and the right intrinsics,
+    whatever gripper_from_camera is."""
+
+    ratio: float
+    std: float
+
+
+@dataclass(frozen=True)
 class RobotExamined:
     """What the residuals say of the robot itself."""
 
@@ -249,9 +260,7 @@ class RobotExamined:
     """Chance of residuals like these where the robot's errors are random alone."""
     joint_offsets: JointOffsets | None = None
     """None where the arm is not known."""
-    angle_ratio: tuple[float, float] | None = None
-    """Rotation angles between cameras over those between grippers, 1 whatever gripper_from_camera is, and its standard
-    deviation."""
+    angle_ratio: AngleRatio | None = None
 
 
 @dataclass(frozen=True)

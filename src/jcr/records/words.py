@@ -121,7 +121,7 @@ def _stated_remedy(finding: Finding) -> str:
 
 
 def unobservable(finding: Finding) -> str:
-    """The direction that no motion shows."""
+    """The direction that is unobservable, in words."""
     grade = "nearly unseen: " if finding.details.get("nearly") else ""
     return grade + _UNSEEN[str(finding.details["motion"])][0].format(**_of_axis(finding))
 
@@ -188,7 +188,7 @@ _UNSEEN = {
         "move that point too: take two or more images with it 10 cm away from where it was",
     ),
 }
-"""By what the motions are like: what they do not show, and what would."""
+"""By what the motions are like: what is unobservable, and the remedy."""
 
 
 # Poses and images.

@@ -8,11 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jcr.calibration.calibration_json import Image
 from jcr.camera import is_distorted, project, resized, undistort_image, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture, ImageVerdict, Intrinsics
 from jcr.report.figures import picture_url
 from jcr.report.markup import filled
 from jcr.results import RunResult
@@ -24,13 +23,13 @@ MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
 
 
-def shown_names(images: Sequence[Image]) -> list[str]:
+def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
     """File names without their folders, unless two of them would then be the same."""
     short = [Path(image.image).name for image in images]
     return short if len(set(short)) == len(short) else [image.image for image in images]
 
 
-def image_numbers(image: Image) -> str:
+def image_numbers(image: ImageVerdict) -> str:
     """Residuals and median reprojection error of one image, as far as there are any."""
     parts = [
         (image.translation_residual_mm, " mm"),

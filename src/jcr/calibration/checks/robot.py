@@ -9,7 +9,7 @@ from jcr.calibration.checks.checked import Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.residuals import angle_ratio
-from jcr.records import Finding, Kind, RobotExamined
+from jcr.records import AngleRatio, Finding, Kind, RobotExamined
 
 MIN_EXAMINED = 4
 """Images from which something may be said of the robot's own errors."""
@@ -31,9 +31,9 @@ def check_robot(case: Case) -> Checked:
     gripper, camera = case.base_from_gripper[used], case.reconstruction.recon_from_camera[used]
     fit = hand_eye.before or hand_eye, gripper, camera, of_poses(case.robot.systematic, used)
     offsets = None if arm is None or joints is None else joint_offsets(*fit, arm, joints[used])
-    ratio = angle_ratio(gripper, camera)
+    ratio = AngleRatio(*angle_ratio(gripper, camera))
     examined = RobotExamined(hand_eye.robot_noise, systematic_p_value(*fit), offsets, ratio)
-    found = filter(None, (_systematic_finding(examined), angle_finding(*ratio)))
+    found = filter(None, (_systematic_finding(examined), angle_finding(ratio.ratio, ratio.std)))
     return Checked(tuple(found), replace(hand_eye, robot=examined))
 
 

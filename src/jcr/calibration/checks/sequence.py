@@ -116,9 +116,7 @@ def sequence_fault(
     p = float(np.exp(max(log_p, -700)))
     if kind == "delay":
         return _delay(best, p, "interval" if time_s is None else "s")
-    if kind == "drift":
-        return _drift(best, p)
-    return _slip(best, p, k, images)
+    return _drift(best, p) if kind == "drift" else _slip(best, p, k, images)
 
 
 def _drift(found: _Found, p: float) -> Finding:
