@@ -113,15 +113,11 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
         None if estimated else found.lens,
     )
     return capture, Reconstruction(
-        np.arange(m),
-        sfm.bundle.base_from_gripper @ sfm.bundle.gripper_from_camera,
-        lens,
-        lens,
-        np.zeros((m, 1, 1, 3), np.float32),
-        np.zeros((m, 1, 1), np.float32),
-        np.zeros((m, 1, 1, 3), np.uint8),
-        found.tracks,
-        "simulated",
+        image_index=np.arange(m),
+        recon_from_camera=sfm.bundle.base_from_gripper @ sfm.bundle.gripper_from_camera,
+        intrinsics=lens,
+        tracks=found.tracks,
+        backend="simulated",
     )
 
 

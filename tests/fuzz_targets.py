@@ -28,7 +28,7 @@ from jcr.geometry import inverse
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Attempt, Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
+from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, PosePairs, Reconstruction, Tracks
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
@@ -142,10 +142,12 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         image_index=np.arange(COUNT),
         recon_from_camera=cameras,
         intrinsics=capture.intrinsics,
-        pointmap_intrinsics=capture.intrinsics,
-        points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
-        confidence=np.ones((COUNT, height, width), np.float32),
-        colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        pointmaps=Pointmaps(
+            intrinsics=capture.intrinsics,
+            points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
+            confidence=np.ones((COUNT, height, width), np.float32),
+            colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        ),
         tracks=tracks,
         backend="colmap",
     )

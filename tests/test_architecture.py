@@ -21,6 +21,7 @@ LAYERS = [
     {"capture"},
     {"match"},
     {"reconstruct"},
+    {"depth"},
     {"calibration"},
     {"cell"},
     {"represent", "segment"},
@@ -30,6 +31,7 @@ LAYERS = [
     {"run_folder"},
     {"results"},
     {"mapping", "report"},
+    {"stages"},
     {"live", "pipeline"},
     {"batch", "touch", "verify"},
     {"view"},
@@ -47,11 +49,11 @@ SOLVERS = [
         f"calibration.{name}"
         for name in ("bundle", "cues", "drift", "elimination", "given_intrinsics", "stage")
     ),
-    *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
+    "depth",
+    *(f"reconstruct.{name}" for name in ("colmap", "direct", "relocate", "sfm")),
 ]
 FORBIDDEN = {
-    "reconstruct.global_alignment": ["dust3r", "direct", "depth", "views_at_once", *BACK_ENDS],
-    "reconstruct.depth": ["dust3r", "direct", "global_alignment", "views_at_once", *BACK_ENDS],
+    "reconstruct.global_alignment": ["dust3r", "direct", "views_at_once", *BACK_ENDS],
     "reconstruct.direct": ["dust3r", "global_alignment", "views_at_once", *BACK_ENDS],
     "report": SOLVERS,
     "cli": SOLVERS,

@@ -1,7 +1,7 @@
 """How a calibration is found; apart from the stage, so that the command line's help need not import SciPy."""
 
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, radians
 from typing import Annotated, Literal
 
 import tyro
@@ -39,6 +39,11 @@ class CalibrateOptions:
         bool, tyro.conf.arg(help="Use camera poses only; skip the refinement with image points.")
     ] = True
     """Refine by the points that images share."""
+
+    @property
+    def robot_noise_m_rad(self) -> tuple[float, float] | None:
+        """`robot_noise` in metres and radians."""
+        return None if self.robot_noise is None else (self.robot_noise[0] / 1e3, radians(self.robot_noise[1]))
 
 
 def check_options(options: CalibrateOptions) -> None:

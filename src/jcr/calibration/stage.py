@@ -21,11 +21,11 @@ from jcr.calibration.sequence import sequence_fault
 from jcr.calibration.words import scale_in_words
 from jcr.capture.checks import how_turned
 from jcr.errors import InputError, NotTrustedError
-from jcr.geometry import ARM, inverse, retract, scale_translation, step_between
+from jcr.geometry import inverse, retract, scale_translation, step_between
 from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, explained
 from jcr.handeye.fit import Cues, exceeds
-from jcr.handeye.residuals import paper_residuals
+from jcr.handeye.residuals import leave_one_out_m, paper_residuals
 from jcr.handeye.solve import SCALE_STD, judged, solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
 from jcr.least_squares import one_blas_thread
@@ -106,7 +106,7 @@ def _calibrated(
     if len(camera) < 2:
         few = f"{len(camera)} of {len(capture)} images registered; overlap the views more"
         raise NotTrustedError("; ".join([few, *reconstruction.warnings, *reconstruction.notes]))
-    noise = _noise(options)
+    noise = options.robot_noise_m_rad
     cues = _cues(capture, reconstruction, options)
     camera_covariance = None if evidence is None else evidence.covariance
     contradiction = None
@@ -285,14 +285,7 @@ def _in_sequence(
 
 def _better(one: HeldOut | None, other: HeldOut | None) -> bool:
     """Whether the leave-one-out error is smaller; not, where there are too few images."""
-    return other is not None and missed_m(one) < missed_m(other)
-
-
-def missed_m(held_out: HeldOut | None) -> float:
-    """Both errors on images left out as one length (m), by which calibrations can be compared; infinite without."""
-    if held_out is None:
-        return float("inf")
-    return float(np.hypot(1e-3 * held_out.translation_mm, ARM * np.radians(held_out.rotation_deg)))
+    return other is not None and leave_one_out_m(one) < leave_one_out_m(other)
 
 
 def _scale_checked(hand_eye: HandEye) -> HandEye:
@@ -320,7 +313,7 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
-    gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, _noise(options)
+    gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, options.robot_noise_m_rad
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
@@ -357,12 +350,6 @@ def is_one(hand_eye: HandEye) -> bool:
 
 def _intrinsics_prior(capture: Capture, found: Intrinsics) -> IntrinsicsPrior:
     return prior_about(found, capture.intrinsics is not None, capture.intrinsics_std)
-
-
-def _noise(options: CalibrateOptions) -> tuple[float, float] | None:
-    if options.robot_noise is None:
-        return None
-    return options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
 
 
 def _cues(capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions) -> Cues | None:

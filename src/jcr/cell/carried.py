@@ -100,9 +100,7 @@ def refined(
     )
     systematic, _, _ = robot_errors(capture, options)
     among = (6 * rows[:, None] + np.arange(6)).ravel()
-    noise = None
-    if options.robot_noise is not None:
-        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
+    noise = options.robot_noise_m_rad
     start = found.gripper_from_camera, found.base_from_recon
     tie = Tie(each, capture.base_from_gripper[rows], systematic[np.ix_(among, among)], start, exchanged=True)
     answer = tied(imaged, [tie], 1.0, noise)

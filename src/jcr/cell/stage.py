@@ -104,10 +104,7 @@ def place_cameras(
     if not placed:
         return CellFound(tuple(failed), (), None)
     imaged, medians = _adjusted(capture, reconstruction, hand_eye, known, placed, rigs)
-    noise = None
-    if options.robot_noise is not None:
-        noise = options.robot_noise[0] / 1e3, float(np.radians(options.robot_noise[1]))
-    answer = tied(imaged, rigs.ties(options), 1.0, noise)
+    answer = tied(imaged, rigs.ties(options), 1.0, options.robot_noise_m_rad)
     of = {member.camera.name: _place_of(member, c) for c, member in enumerate(placed, start=1)}
     cameras = {
         member.camera.name: _found(member, c, answer, of[member.camera.name], medians, hand_eye)

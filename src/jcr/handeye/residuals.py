@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_angle, scale_translation
+from jcr.geometry import ARM, inverse, rotation_angle, scale_translation
+from jcr.records import HeldOut
 
 
 def paper_residuals(
@@ -46,3 +47,10 @@ def angle_ratio(
     without = np.array([ratio(np.arange(n) != k) for k in range(n)])
     std = np.sqrt((n - 1) / n * ((without - without.mean()) ** 2).sum())
     return ratio(np.ones(n, dtype=bool)), float(std)
+
+
+def leave_one_out_m(error: HeldOut | None) -> float:
+    """A leave-one-out error as one length (m), by which calibrations can be compared; infinite without one."""
+    if error is None:
+        return float("inf")
+    return float(np.hypot(1e-3 * error.translation_mm, ARM * np.radians(error.rotation_deg)))

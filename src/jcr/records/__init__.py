@@ -34,7 +34,16 @@ from jcr.records.capture import (
 )
 from jcr.records.cloud import PointCloud
 from jcr.records.findings import RANK, Finding, Kind, Mend, Severity, Verdict, verdict_of
-from jcr.records.reconstruction import BOTH, MATCHED, NO_DEPTH, PRIOR, CameraEvidence, Reconstruction, Tracks
+from jcr.records.reconstruction import (
+    BOTH,
+    MATCHED,
+    NO_DEPTH,
+    PRIOR,
+    CameraEvidence,
+    Pointmaps,
+    Reconstruction,
+    Tracks,
+)
 
 __all__ = [
     "Attempt",
@@ -64,6 +73,7 @@ __all__ = [
     "Observability",
     "PRIOR",
     "PointCloud",
+    "Pointmaps",
     "PosePairs",
     "RANK",
     "Reconstruction",
