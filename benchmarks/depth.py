@@ -77,8 +77,9 @@ def run(long: bool = False) -> str:
             f"## {name}",
             "",
             f"Back end {backend}, {len(found.image_index)} images, reconstruction {seconds:.0f} s; "
-            f"{100 * (found.dense.confidence > 0).mean():.1f} % of all pixels have a depth. Places covered by all pointmaps "
-            f"within {', '.join(map(str, LIMITS_MM))} mm: table {_shares(table)} %, objects {_shares(things)} %.",
+            f"{100 * (found.dense.confidence > 0).mean():.1f} % of all pixels have a depth. Places covered by all "
+            f"pointmaps within {', '.join(map(str, LIMITS_MM))} mm: table {_shares(table)} %, objects "
+            f"{_shares(things)} %.",
             "",
             *by_texture(found, hand_eye, shown),
         ]

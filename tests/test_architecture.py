@@ -49,7 +49,7 @@ SOLVERS = [
         f"calibration.{name}"
         for name in ("bundle", "cues", "drift", "elimination", "given_intrinsics", "stage")
     ),
-    "depth",
+    *(f"depth.{name}" for name in ("dense", "densify", "fused", "matched", "patch_match", "priors")),
     *(f"reconstruct.{name}" for name in ("colmap", "direct", "relocate", "sfm")),
 ]
 FORBIDDEN = {

@@ -60,6 +60,19 @@ def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
     )
 
 
+def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
+    """Pointmaps in which no pixel has a depth."""
+    nothing = np.zeros((len(made.image_index), 2, 2))
+    pointmaps = Pointmaps(
+        intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
+        points_in_recon=np.zeros((*nothing.shape, 3)),
+        confidence=nothing,
+        colors=np.zeros((*nothing.shape, 3), np.uint8),
+        reason=nothing.astype(np.uint8),
+    )
+    return replace(made, pointmaps=pointmaps)
+
+
 def auto_result(
     problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Reconstruction, list[str]]:
@@ -255,6 +268,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
         return reconstruction(options.backend, problem.recon_from_camera)
 
     monkeypatch.setattr(attempts, "reconstruct", door)
+    monkeypatch.setattr(attempts, "densify", without_surface)
     lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
@@ -262,7 +276,8 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     # Where there is no choice, the reconstruction is kept before it is calibrated: mended options find it there.
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
-    assert RunFolder(tmp_path / "colmap").reconstruction().backend == "colmap"
+    kept = RunFolder(tmp_path / "colmap").reconstruction()
+    assert kept.backend == "colmap" and kept.pointmaps is not None
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     assert made == ["colmap", "colmap"]
@@ -278,14 +293,7 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
 
     def deeper(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
         densified.append(made.backend)
-        count = len(made.image_index)
-        pointmaps = Pointmaps(
-            intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
-            points_in_recon=np.zeros((count, 2, 2, 3)),
-            confidence=np.zeros((count, 2, 2)),
-            colors=np.zeros((count, 2, 2, 3), np.uint8),
-        )
-        return replace(made, pointmaps=pointmaps)
+        return without_surface(capture, made)
 
     monkeypatch.setattr(
         attempts,

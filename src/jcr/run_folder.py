@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr import __version__
 from jcr.calibration.calibration_json import CalibrationFile, read_calibration, write_calibration
@@ -57,8 +57,6 @@ OF_RECONSTRUCTION = (STATE, DEPTH, RECONSTRUCTION)
 """A kill between two of them leaves none without what it was made from."""
 OF_CALIBRATION = (CLOUD, MAP, REPORT, CAMERAS)
 """What holds of one calibration alone."""
-OF_DEPTH = ("dense", "priors")
-"""Options of densify that files have under reconstruct that were written before it was a stage."""
 PASSING = {"timings_s", "warnings", "notes", "version", "attempts", "requirement", "next_poses"}
 """Of calibration.json: what may differ between two of the same calibration."""
 
@@ -70,18 +68,6 @@ class MadeWith(BaseModel):
     reconstruct: ReconstructOptions
     calibrate: CalibrateOptions
     depth: DepthOptions = DepthOptions()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _with_depth_apart(cls, content: Any) -> Any:
-        """The options of a file in which reconstruct had those of the depth."""
-        if not isinstance(content, dict) or not isinstance(content.get("reconstruct"), dict):
-            return content
-        depth = {name: content["reconstruct"][name] for name in OF_DEPTH if name in content["reconstruct"]}
-        if not depth:
-            return content
-        others = {name: value for name, value in content["reconstruct"].items() if name not in OF_DEPTH}
-        return {"depth": depth} | content | {"reconstruct": others}
 
 
 class State(BaseModel):
@@ -114,7 +100,7 @@ class RunFolder:
         """run.json; InputError where there is no run, or its file was damaged."""
         file = self.path / STATE
         try:
-            return State.model_validate_json(read_bytes(file), strict=True)
+            return State.model_validate_json(_with_depth_apart(read_bytes(file)), strict=True)
         except ValidationError as error:
             raise InputError(
                 f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"
@@ -309,6 +295,18 @@ def held(path: Path) -> Iterator[RunFolder]:
         finally:
             if new and os.listdir(path) == [LOCK]:
                 shutil.rmtree(path)
+
+
+def _with_depth_apart(content: bytes) -> bytes:
+    """A run.json in which reconstruct had the options of the depth, as it is written now."""
+    try:
+        state = json.loads(content)
+        old = state["options"]["reconstruct"]
+        del old["dense"]  # which was set by the command
+        state["options"]["depth"] = {"priors": old.pop("priors")}
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return content  # as it is written now, or damaged: where, the model says
+    return json.dumps(state).encode()
 
 
 def state_of(capture: Capture, options: MadeWith) -> State:
