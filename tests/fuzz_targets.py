@@ -24,6 +24,7 @@ from jcr.capture.lerobot_files import Info, read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
+from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
@@ -152,6 +153,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
+    write_depth(folder / "depth.npz", reconstruction.dense, "y")
     ones = np.ones(200)
     cloud = PointCloud(
         points_in_base=draw.random((200, 3)),
@@ -175,6 +177,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     readers: dict[str, Callable[[Path], object]] = {
         "calibration.json": read_calibration,
         "reconstruction.npz": read_reconstruction,
+        "depth.npz": lambda path: read_depth(path, COUNT),
         "cloud.ply": read_cloud,
         "map.safetensors": load_map,
         "reference.json": read_hand_eye,

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.depth.densify import densify
+from jcr.depth.options import DepthOptions
 from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
@@ -308,7 +309,7 @@ def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
         tracks=replace(scene.tracks, image=by_name[scene.tracks.image]),
         backend="colmap",
     )
-    made = densify(capture, sparse)
+    made = densify(capture, sparse, DepthOptions(pointmap_size_px=PINHOLE.width))
     assert made.dense.intrinsics == PINHOLE and not made.dense.is_predicted
     np.testing.assert_array_equal(made.dense.colors, scene.images[order])
     np.testing.assert_array_equal(made.tracks.image, sparse.tracks.image)
