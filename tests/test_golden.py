@@ -18,7 +18,7 @@ from places import ROOT
 
 GOLDEN = ROOT / "tests" / "golden"
 """Five images and a fixed camera, 320x240; `run` by `jcr run --backend colmap`, `calibrated` by `jcr calibrate` of the
-same, both with pointmaps 32 pixels wide, without map and report, and with compressed arrays."""
+same, both with pointmaps 40 pixels wide, without map and report, and with compressed arrays."""
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_what_an_earlier_version_wrote_is_read(golden: Callable[[str], Path], na
         assert reconstruction.pointmaps is None
     else:
         dense = reconstruction.dense
-        assert dense.confidence.shape == (5, 24, 32) and dense.confidence.any() and not dense.is_predicted
+        assert dense.confidence.shape == (5, 30, 40) and dense.confidence.any() and not dense.is_predicted
 
 
 def test_the_same_calibration_comes_of_it(
@@ -88,5 +88,5 @@ def test_a_map_is_built_on_it(
     out = golden(name)
     result = jcr.build_map(out, map=MapOptions(max_seconds=5.0))
     assert result.cloud is not None and len(result.cloud.points_in_base) > 500
-    assert (result.reconstruction.dense.confidence.shape[2] == 32) == (name == "run")
+    assert (result.reconstruction.dense.confidence.shape[2] == 40) == (name == "run")
     assert RunFolder(out).has_map() and RunFolder(out).calibration().converged

@@ -22,8 +22,8 @@ class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
     CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
-    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, cloud.ply,
-    map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
+    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, depth.npz,
+    cloud.ply, map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
 
     examples:
       jcr run examples/tabletop out/tabletop
