@@ -51,7 +51,7 @@ FEATURES = (
     "src/jcr/reconstruct/sfm.py",
     "src/jcr/attempts.py",
 )
-DEPTH = ("src/jcr/reconstruct/depth", "src/jcr/reconstruct/pointmaps.py")
+DEPTH = ("src/jcr/depth", "src/jcr/reconstruct/pointmaps.py")
 MAP = ("src/jcr/represent", "src/jcr/mapping.py")
 READING = ("src/jcr/capture",)
 WHOLE = (*SOLVER, *FEATURES, *DEPTH, *MAP, *READING, "src/jcr/pipeline.py", "src/jcr/report")

@@ -115,15 +115,11 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
         None if estimated else found.lens,
     )
     return capture, Reconstruction(
-        np.arange(m),
-        rigs @ x,
-        lens,
-        lens,
-        np.zeros((m, 1, 1, 3), np.float32),
-        np.zeros((m, 1, 1), np.float32),
-        np.zeros((m, 1, 1, 3), np.uint8),
-        found.tracks,
-        "simulated",
+        image_index=np.arange(m),
+        recon_from_camera=rigs @ x,
+        intrinsics=lens,
+        tracks=found.tracks,
+        backend="simulated",
     )
 
 

@@ -57,7 +57,7 @@ def _measured(captures: list[Path], out: Path, processes: int) -> tuple[float, d
     reconstruct = ReconstructOptions(predictions=captures[0] / "pointmaps.npz")
     options = BatchOptions(processes=processes, calibrate_only=True)
     begun = time.perf_counter()
-    rows = batch(captures, out, RunOptions(reconstruct), options, watch)
+    rows = batch(captures, out, RunOptions(reconstruct=reconstruct), options, watch)
     took = time.perf_counter() - begun
     if any(row.status == "failed" for row in rows):
         raise RuntimeError(next(row.reason for row in rows if row.status == "failed"))

@@ -147,7 +147,7 @@ def _withheld(folder: Path) -> list[Row]:
     kept = [row for row in range(len(capture)) if row not in apart]
     rest = _of_rows(capture, kept)
     try:
-        reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap", dense=False))
+        reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap"))
         hand_eye = calibrate(rest, reconstruction)
     except NotTrustedError as refusal:
         return [Row(folder.name, "–", "", 0, None, says=str(refusal))]

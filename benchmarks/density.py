@@ -16,6 +16,7 @@ from benchmarks.table1 import PUBLISHED, WEBCAM
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify
 from jcr.files import write_bytes
 from jcr.geometry import apply_similarity
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -95,7 +96,7 @@ def run(out: Path | None = None) -> str:
 
 def _clouds(capture: Capture, options: ReconstructOptions, name: str) -> tuple[Cloud, Cloud]:
     """The points that were matched, and the dense cloud."""
-    found = reconstruct(capture, options)
+    found = densify(capture, reconstruct(capture, options))
     hand_eye = calibrate(capture, found)
     dense = point_cloud(capture, found, hand_eye)
     return _matched(found, hand_eye), Cloud(name, dense.points_in_base, dense.color)

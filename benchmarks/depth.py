@@ -16,6 +16,7 @@ from benchmarks.table1 import WEBCAM
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify
 from jcr.geometry import apply, inverse
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import BOTH, MATCHED, PRIOR, HandEye, Intrinsics, Reconstruction
@@ -59,7 +60,7 @@ def run(long: bool = False) -> str:
             made = simulate(Path(folder) / "capture", options)
             capture = read_capture(made)
             begun = time.perf_counter()
-            found = reconstruct(capture, ReconstructOptions(backend))
+            found = densify(capture, reconstruct(capture, ReconstructOptions(backend)))
             seconds = time.perf_counter() - begun
             hand_eye = calibrate(capture, found)
             shown = shown_by(made, found)
@@ -76,8 +77,9 @@ def run(long: bool = False) -> str:
             f"## {name}",
             "",
             f"Back end {backend}, {len(found.image_index)} images, reconstruction {seconds:.0f} s; "
-            f"{100 * (found.confidence > 0).mean():.1f} % of all pixels have a depth. Places covered by all pointmaps "
-            f"within {', '.join(map(str, LIMITS_MM))} mm: table {_shares(table)} %, objects {_shares(things)} %.",
+            f"{100 * (found.dense.confidence > 0).mean():.1f} % of all pixels have a depth. Places covered by all "
+            f"pointmaps within {', '.join(map(str, LIMITS_MM))} mm: table {_shares(table)} %, objects "
+            f"{_shares(things)} %.",
             "",
             *by_texture(found, hand_eye, shown),
         ]
@@ -86,7 +88,7 @@ def run(long: bool = False) -> str:
 
 def shown_by(folder: Path, found: Reconstruction) -> Shown:
     """The truth of a simulated capture at the pixels of its pointmaps."""
-    truth, grid = read_truth(folder), found.pointmap_intrinsics
+    truth, grid = read_truth(folder), found.dense.intrinsics
     direction = rays(grid)
     place = project(truth.intrinsics, direction).astype(np.float32)
     nearest = np.rint(place).astype(int).clip(0, [truth.intrinsics.width - 1, truth.intrinsics.height - 1])
@@ -110,7 +112,7 @@ def shown_by(folder: Path, found: Reconstruction) -> Shown:
         for j in range(len(x)):
             if i != j:
                 others[i] += _sees(apply(inverse(base_from_camera[j]), x[i]), depth[j], grid)
-    grey = found.colors.mean(-1).astype(np.float32)
+    grey = found.dense.colors.mean(-1).astype(np.float32)
     spread = [np.sqrt(np.maximum(cv2.blur(g * g, (9, 9)) - cv2.blur(g, (9, 9)) ** 2, 0)) for g in grey]
     texture = np.digitize(np.stack(spread), [PLAIN, WEAK])
     return Shown(np.stack(depth), x, asked & (others > 0), labels == 1, texture)
@@ -130,8 +132,8 @@ def covered(
     found: Reconstruction, hand_eye: HandEye, shown: Shown
 ) -> tuple[Float[ndarray, " k"], Float[ndarray, " k"]]:
     """Percent of the table's and the objects' places with a point of all pointmaps within each limit."""
-    has = found.confidence > 0
-    x = hand_eye.scale * found.points_in_recon[has].astype(np.float64)
+    has = found.dense.confidence > 0
+    x = hand_eye.scale * found.dense.points_in_recon[has].astype(np.float64)
     tree = KDTree(apply(hand_eye.base_from_recon, x))
     drawn = np.random.default_rng(0).choice(int(shown.asked.sum()), PLACES, replace=False)
     distance = tree.query(shown.x_in_base[shown.asked][drawn], distance_upper_bound=0.011)[0]
@@ -142,12 +144,12 @@ def covered(
 
 def by_texture(found: Reconstruction, hand_eye: HandEye, shown: Shown) -> list[str]:
     """A table: of the pixels that another image shows too, how many have a depth and how good it is."""
-    direction = rays(found.pointmap_intrinsics)
-    pairs = zip(inverse(found.recon_from_camera), found.points_in_recon, strict=True)
+    direction = rays(found.dense.intrinsics)
+    pairs = zip(inverse(found.recon_from_camera), found.dense.points_in_recon, strict=True)
     depth = np.stack([apply(pose, x.astype(np.float64))[..., 2] for pose, x in pairs])
     error_mm = 1e3 * np.abs(hand_eye.scale * depth - shown.depth) * np.linalg.norm(direction, axis=-1)
-    has = found.confidence > 0
-    reason = found.reason
+    has = found.dense.confidence > 0
+    reason = found.dense.reason
     assert reason is not None
     lines = [
         "| pixels of | share, % | with depth, % | complete at 2, 5, 10 mm, % | accurate at 2, 5, 10 mm, % | off by more "

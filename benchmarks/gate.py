@@ -118,7 +118,7 @@ def table(verdicts: Sequence[Verdict], seeds: Mapping[FeatureName, int]) -> str:
 def judged(kind: str, drawn: Drawn, features: FeatureName, gate: bool) -> Verdict:
     """One reconstruction and calibration, held against the truth."""
     begun = time.perf_counter()
-    options = ColmapOptions(dense=False, features=features, robot_checks=gate)
+    options = ColmapOptions(features=features, robot_checks=gate)
     try:
         made = reconstruct(drawn.capture, options)
         hand_eye = calibrate(drawn.capture, made)

@@ -20,7 +20,7 @@ from jcr.errors import NotTrustedError
 from jcr.files import write_bytes
 from jcr.geometry import transform
 from jcr.handeye.solve import solve_hand_eye
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
 from jcr.records import HandEye
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
@@ -170,7 +170,7 @@ def _verdict(trial: Trial) -> Verdict:
         # The last one: what happens midway has happened.
         picture = cv2.resize(read_image(_pictures(made)[-1]), PICTURE, interpolation=cv2.INTER_AREA)
         try:
-            reconstruction = reconstruct(capture, ColmapOptions(dense=False))
+            reconstruction = reconstruct(capture)
             found = calibrate(capture, reconstruction)
         except NotTrustedError as refusal:
             return Verdict(trial, np.asarray(picture, np.uint8), reason=_short(str(refusal)))

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify
 from jcr.errors import InputError
 from jcr.export.provenance import Provenance
 from jcr.export.volume import write_octomap
@@ -316,8 +317,8 @@ def true_cloud(truth: Truth, points: int = 200_000, noise: float = 0.0, seed: in
 def calibrated_cloud(truth: Truth) -> PointCloud:
     """The cloud that COLMAP and the calibration of the capture give, labelled by the true masks."""
     capture = read_capture(truth.folder)
-    reconstruction = reconstruct(capture, ReconstructOptions("colmap"))
-    size = reconstruction.confidence.shape[:0:-1]
+    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions("colmap")))
+    size = reconstruction.dense.confidence.shape[:0:-1]
     labels = [
         cv2.resize(true_labels(truth, row), size, interpolation=cv2.INTER_NEAREST)
         for row in reconstruction.image_index

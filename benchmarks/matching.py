@@ -93,7 +93,7 @@ def reference_of(folder: Path) -> Reference:
 def by_board(folder: Path, board: str) -> Reference | None:
     """The marker back end's from a board in the images; None where it rejects it."""
     capture = read_capture(folder)
-    hand_eye = calibrate(capture, marker.reconstruct(capture, marker.MarkerOptions(board, dense=False)))
+    hand_eye = calibrate(capture, marker.reconstruct(capture, board))
     return (
         Reference(hand_eye.gripper_from_camera, hand_eye.covariance[:6, :6]) if hand_eye.converged else None
     )
@@ -143,7 +143,7 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
     begun = time.perf_counter()
     made = None
     try:
-        made = reconstruct(capture, ColmapOptions(dense=False, features=features, robot_checks=gate))
+        made = reconstruct(capture, ColmapOptions(features=features, robot_checks=gate))
         hand_eye = calibrate(capture, made)
     except NotTrustedError as refusal:
         count = 0 if made is None else len(made.image_index)

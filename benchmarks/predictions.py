@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.synthetic_pairs import pairs_of_capture
-from jcr.calibration.options import CalibrateOptions
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
 from jcr.pipeline import run as run_all
@@ -77,7 +76,7 @@ def end_to_end(images: int, seed: int, noise: tuple[float, float]) -> EndToEnd:
         predictions, truth = pairs_of_capture(made, seed=seed)
         pairs = Path(folder) / "pairs.npz"
         write_pairs(pairs, predictions)
-        options = RunOptions(ReconstructOptions(predictions=pairs), CalibrateOptions())
+        options = RunOptions(reconstruct=ReconstructOptions(predictions=pairs))
         result = run_all(read_capture(made), Path(folder) / "out", options)
         # Metres per geometric mean of the pairs' units.
         return scored(result, made, float(np.exp(-np.log(truth.pair_unit).mean())))

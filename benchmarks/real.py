@@ -25,7 +25,7 @@ from jcr.geometry import (
 )
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.marker import MarkerOptions, reconstruct
+from jcr.reconstruct.marker import reconstruct
 from jcr.records import Capture, HeldOut
 
 
@@ -103,7 +103,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     how = "images alone" if board is None else f"`{board}`"
     known = read_hand_eye(folder / "reference.json")
     reference = known.gripper_from_camera
-    options = RunOptions(ReconstructOptions(board=board))
+    options = RunOptions(reconstruct=ReconstructOptions(board=board))
     begun = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as out:
@@ -152,7 +152,7 @@ def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) ->
         return []
     blind = replace(capture, intrinsics=None)
     try:
-        found = reconstruct(blind, MarkerOptions(board, dense=False))
+        found = reconstruct(blind, board)
         hand_eye = calibrate_stage(blind, found)
     except NotTrustedError:
         return []

@@ -201,7 +201,7 @@ def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cel
     """Every method on one set of images; networks where their weights are."""
     networks = [name for name in candidates(ReconstructOptions()) if BACKENDS[name].hub_id]
     try:
-        sparse = reconstruct_with_colmap(capture, ColmapOptions(dense=False))
+        sparse = reconstruct_with_colmap(capture, ColmapOptions())
         on_colmap = _papers(capture, truth, sparse), _ours(capture, truth, sparse)
     except NotTrustedError:
         on_colmap = Cell(0), Cell(0, trusted=False)

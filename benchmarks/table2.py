@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
@@ -124,7 +125,7 @@ def _scene(folder: Path, seed: int, images: int) -> Scene:
     capture = replace(
         capture, images=capture.images[:images], base_from_gripper=capture.base_from_gripper[:images]
     )
-    reconstruction = reconstruct(capture, ReconstructOptions("colmap"))
+    reconstruction = densify(capture, reconstruct(capture, ReconstructOptions("colmap")))
     hand_eye = calibrate(capture, reconstruction)
     given = read_labels(capture, reconstruction)
     assert given is not None  # copied above

@@ -22,6 +22,7 @@ import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS, NO_DEFAULT, configuration
+from jcr.depth.depth_npz import About as DepthAbout
 from jcr.reconstruct.reconstruction_npz import About
 from jcr.run_folder import State
 
@@ -32,6 +33,7 @@ RESULTS_OF_CALLS = (
     "jcr.records:Capture",
     "jcr.records:HandEye",
     "jcr.records:Reconstruction",
+    "jcr.records:Pointmaps",
     "jcr.represent.scene:SceneMap",
     "jcr.represent.sample:Sample",
 )
@@ -46,6 +48,10 @@ FORMATS = {
     "reconstruction.npz": (
         About,
         "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#reconstruction).",
+    ),
+    "depth.npz": (
+        DepthAbout,
+        "The array `about` in it, as JSON; other arrays have the names of [Pointmaps](api.md#pointmaps).",
     ),
 }
 """Files of a run folder that a pydantic model in the source describes."""

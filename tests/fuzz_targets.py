@@ -24,11 +24,12 @@ from jcr.capture.lerobot_files import Info, read_episode
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.cli.query import read_points
+from jcr.depth.depth_npz import read_depth, write_depth
 from jcr.geometry import inverse
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays, read_arrays
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
-from jcr.records import Attempt, Capture, Intrinsics, PointCloud, PosePairs, Reconstruction, Tracks
+from jcr.records import Attempt, Capture, Intrinsics, PointCloud, Pointmaps, PosePairs, Reconstruction, Tracks
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import load_map
 from jcr.represent.options import MapOptions
@@ -142,14 +143,17 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
         image_index=np.arange(COUNT),
         recon_from_camera=cameras,
         intrinsics=capture.intrinsics,
-        pointmap_intrinsics=capture.intrinsics,
-        points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
-        confidence=np.ones((COUNT, height, width), np.float32),
-        colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        pointmaps=Pointmaps(
+            intrinsics=capture.intrinsics,
+            points_in_recon=draw.random((COUNT, height, width, 3)).astype(np.float32),
+            confidence=np.ones((COUNT, height, width), np.float32),
+            colors=np.zeros((COUNT, height, width, 3), np.uint8),
+        ),
         tracks=tracks,
         backend="colmap",
     )
     write_reconstruction(folder / "reconstruction.npz", reconstruction)
+    write_depth(folder / "depth.npz", reconstruction.dense, "y")
     ones = np.ones(200)
     cloud = PointCloud(
         points_in_base=draw.random((200, 3)),
@@ -173,6 +177,7 @@ def results(folder: Path, capture: Capture, cameras: np.ndarray) -> dict[str, Ta
     readers: dict[str, Callable[[Path], object]] = {
         "calibration.json": read_calibration,
         "reconstruction.npz": read_reconstruction,
+        "depth.npz": lambda path: read_depth(path, COUNT),
         "cloud.ply": read_cloud,
         "map.safetensors": load_map,
         "reference.json": read_hand_eye,

@@ -22,6 +22,7 @@ LAYERS = [
     {"capture"},
     {"match"},
     {"reconstruct"},
+    {"depth"},
     {"calibration"},
     {"cell"},
     {"represent", "segment"},
@@ -31,6 +32,7 @@ LAYERS = [
     {"run_folder"},
     {"results"},
     {"mapping", "report"},
+    {"stages"},
     {"live", "pipeline"},
     {"batch", "touch", "verify"},
     {"view"},
@@ -49,11 +51,11 @@ SOLVERS = [
         f"calibration.{name}"
         for name in ("adjust", "case", "checks", "cues", "drift", "fit", "poses", "stage", "verdict")
     ),
-    *(f"reconstruct.{name}" for name in ("colmap", "depth", "direct", "relocate", "sfm")),
+    *(f"depth.{name}" for name in ("dense", "densify", "fused", "matched", "patch_match", "priors")),
+    *(f"reconstruct.{name}" for name in ("colmap", "direct", "relocate", "sfm")),
 ]
 FORBIDDEN = {
-    "reconstruct.global_alignment": ["dust3r", "direct", "depth", "views_at_once", *BACK_ENDS],
-    "reconstruct.depth": ["dust3r", "direct", "global_alignment", "views_at_once", *BACK_ENDS],
+    "reconstruct.global_alignment": ["dust3r", "direct", "views_at_once", *BACK_ENDS],
     "reconstruct.direct": ["dust3r", "global_alignment", "views_at_once", *BACK_ENDS],
     "report": SOLVERS,
     "cli": SOLVERS,

@@ -19,7 +19,7 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
@@ -50,19 +50,27 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
     lens = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
-    nothing = np.zeros((len(poses), 2, 2))
     tracks = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
         intrinsics=lens,
-        pointmap_intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
-        points_in_recon=np.zeros((len(poses), 2, 2, 3)),
-        confidence=nothing,
-        colors=nothing[..., None].repeat(3, -1).astype(np.uint8),
         tracks=tracks,
         backend=backend,
     )
+
+
+def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
+    """Pointmaps in which no pixel has a depth."""
+    nothing = np.zeros((len(made.image_index), 2, 2))
+    pointmaps = Pointmaps(
+        intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
+        points_in_recon=np.zeros((*nothing.shape, 3)),
+        confidence=nothing,
+        colors=np.zeros((*nothing.shape, 3), np.uint8),
+        reason=nothing.astype(np.uint8),
+    )
+    return replace(made, pointmaps=pointmaps)
 
 
 def auto_result(
@@ -260,6 +268,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
         return reconstruction(options.backend, problem.recon_from_camera)
 
     monkeypatch.setattr(attempts, "reconstruct", door)
+    monkeypatch.setattr(attempts, "densify", without_surface)
     lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
@@ -267,47 +276,43 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     # Where there is no choice, the reconstruction is kept before it is calibrated: mended options find it there.
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
-    assert RunFolder(tmp_path / "colmap").reconstruction().backend == "colmap"
+    kept = RunFolder(tmp_path / "colmap").reconstruction()
+    assert kept.backend == "colmap" and kept.pointmaps is not None
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     assert made == ["colmap", "colmap"]
 
 
-def test_dense_depth_is_made_for_the_attempt_that_is_kept_alone(
+def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the_calibration(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good = problem.recon_from_camera
     answers = {"colmap": good[np.random.default_rng(4).permutation(8)], "direct": good}
-    asked, deepened = [], []
+    densified = []
 
-    def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
-        asked.append((options.backend, options.dense))
-        return reconstruction(options.backend, answers[options.backend])
+    def deeper(capture: Capture, made: Reconstruction, *_: object, **__: object) -> Reconstruction:
+        densified.append(made.backend)
+        return without_surface(capture, made)
 
-    def deeper(capture: Capture, made: Reconstruction, options: object, progress: object) -> Reconstruction:
-        deepened.append(made.backend)
-        return replace(made, confidence=made.confidence + 1)
-
-    monkeypatch.setattr(attempts, "reconstruct", door)
-    monkeypatch.setattr(attempts, "with_depth_of", deeper)
+    monkeypatch.setattr(
+        attempts,
+        "reconstruct",
+        lambda _, options, __: reconstruction(options.backend, answers[options.backend]),
+    )
+    monkeypatch.setattr(attempts, "densify", deeper)
     names = tuple(f"{k:02d}.png" for k in range(8))
     capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
     chosen = []
     choice = attempts.choose(
         capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)
     )
-    assert asked == [("colmap", False), ("direct", False)] and deepened == ["direct"]
-    assert choice.reconstruction.confidence.all() and chosen == [choice.reconstruction]
-    deepened.clear()
-    attempts.choose(capture, ReconstructOptions(dense=False), CalibrateOptions())
-    assert not deepened
-    # A known length is read from the depth, in each attempt that is calibrated.
-    asked.clear()
-    with pytest.raises(InputError, match="nowhere"):
-        lost = CalibrateOptions(known_length=("nowhere.png", 0.0, 0.0, 9.0, 9.0, 50.0))
-        attempts.choose(capture, ReconstructOptions(), lost)
-    assert asked == [("colmap", True)]
+    assert not densified and chosen == [choice.reconstruction] and choice.reconstruction.pointmaps is None
+    for length, why in (("nowhere.png", "nowhere"), ("00.png", "no surface was found")):
+        lost = CalibrateOptions(known_length=(length, 0.0, 0.0, 9.0, 9.0, 50.0))
+        with pytest.raises(InputError, match=why):
+            attempts.choose(capture, ReconstructOptions(), lost)
+    assert densified == ["colmap", "colmap"]
 
 
 def test_no_other_back_end_cures_a_motion_that_shows_too_little(

@@ -9,7 +9,7 @@ import pytest
 import jcr
 from jcr.calibration.stage import calibrate
 from jcr.geometry import apply_similarity, fit_similarity, rotation_between_deg
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_within_reach_of_the_marker_reference(
 ):
     """And the cameras follow the gripper."""
     capture = jcr.read_capture(real_captures / name)
-    found = reconstruct(capture, ColmapOptions(dense=False))
+    found = reconstruct(capture)
     solved = calibrate(capture, found)
     reference = np.array(
         json.loads((real_captures / name / "reference.json").read_text())["gripper_from_camera"]
@@ -44,4 +44,4 @@ def test_within_reach_of_the_marker_reference(
 def test_a_plain_background_is_not_trusted(real_captures: Path):
     capture = jcr.read_capture(real_captures / "franka_plain_background")
     with pytest.raises(jcr.NotTrustedError, match=r"0 of 8 images \(too little texture"):
-        reconstruct(capture, ColmapOptions(dense=False))
+        reconstruct(capture)

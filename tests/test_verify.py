@@ -58,15 +58,10 @@ def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
     """Of the old images, as a structure from motion without error would give."""
     lens = capture.intrinsics
     assert lens is not None
-    none = np.zeros((OLD, 4, 6))
     return Reconstruction(
         image_index=np.arange(OLD),
         recon_from_camera=cameras(capture, x)[:OLD],
         intrinsics=lens,
-        pointmap_intrinsics=replace(lens, width=6, height=4),
-        points_in_recon=np.zeros((*none.shape, 3)),
-        confidence=none,
-        colors=np.zeros((*none.shape, 3), np.uint8),
         tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
         backend="colmap",
     )

@@ -14,7 +14,8 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
         ("verify.py", "has the camera moved?", 1),
         ("touch.py", "does the tip agree?", 1),
     ),
-    (("live/", "take a capture", 1), ("pipeline.py", "the stages in order, each timed", 2)),
+    (("live/", "take a capture", 1), ("pipeline.py", "the stages in order", 2)),
+    (("stages.py", "each stage on a run folder, from the files of those before it, timed", 1),),
     (("mapping.py", "the map stage", 1), ("report/", "the page a person reads", 1)),
     (
         ("check.py", "judge a capture", 1),
@@ -26,6 +27,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("cell/", "every camera of the cell: fixed, several on a wrist, two arms, eye-to-hand", 1),),
     (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
+    (("depth/", "the stage densify: PatchMatch and planes on known cameras", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
     (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
@@ -50,7 +52,6 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
 """From the top down: name, what it is for, share of the row's width."""
 INSIDE = {
     "reconstruct/": (
-        ("depth/", "PatchMatch, planes"),
         ("direct/", "by colour"),
         ("global_alignment/", "pairs to cameras"),
         ("dust3r/", "predicts pairs"),
@@ -59,7 +60,7 @@ INSIDE = {
 }
 FLOW = {
     "capture/": ("Capture", "images, gripper poses, intrinsics"),
-    "reconstruct/": ("Reconstruction", "cameras, tracks, pointmaps; up to scale"),
+    "reconstruct/": ("Reconstruction", "cameras, tracks; up to scale"),
     "calibration/": ("HandEye", "camera on the gripper, scale, covariance"),
     "represent/": ("PointCloud, SceneMap", "metres, in the robot's base frame"),
     "report/": ("report.html", "from the RunResult of all stages"),

@@ -147,7 +147,7 @@ def _registered(
     size_px: int | None = None,
 ) -> tuple[_Held | None, list[str]]:
     """The gripper poses held against cameras that features find, and what else that shows; None where none are found."""
-    options = ColmapOptions(seed=seed, dense=False)
+    options = ColmapOptions(seed=seed)
     if size_px is not None:
         options = replace(options, working_size_px=size_px)
     try:

@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.memory import give_back
 from jcr.progress import Progress
-from jcr.reconstruct.backends import ReconstructOptions, device_of
+from jcr.reconstruct.backends import device_of
 from jcr.records import Capture, PointCloud
 from jcr.represent.cloud import point_cloud
 from jcr.represent.map_file import require_packages
@@ -32,14 +33,14 @@ class Mapped:
     """What the user should know of the labels."""
 
 
-def require_map(options: ReconstructOptions) -> None:
+def require_map(options: DepthOptions) -> None:
     """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
     if not options.dense:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
     require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do not need it")
 
 
-def mapped(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
+def make_map(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:
     """The map of a calibrated run and of images that were added to it later.
 
     Raises InputError where no point is confident enough, or the options leave nothing to map.
@@ -70,7 +71,7 @@ def _extended(result: RunResult, added: Capture, options: RunOptions, progress: 
     """With the added images in the reconstruction."""
     if not len(added):
         return result
-    from jcr.reconstruct.added import extend
+    from jcr.depth.added import extend
 
     memory_gb, count = options.reconstruct.memory_gb, len(result.capture)
     reconstruction = extend(result.reconstruction, result.hand_eye, count, added, progress, memory_gb)

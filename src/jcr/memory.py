@@ -5,6 +5,7 @@ A budget in GB is one of the peak resident set: what `ps` and `/usr/bin/time -v`
 
 import ctypes
 import math
+import os
 import resource
 import sys
 from functools import cache
@@ -18,6 +19,8 @@ ALLOWANCE = 150_000_000
 
 MAP = 300_000_000
 """Bytes of calibration, map and report beside the reconstruction."""
+FOUND = 5_000_000
+"""Bytes per image: features, matches and tracks in structure from motion and bundle adjustment."""
 
 
 def resident() -> int:
@@ -57,6 +60,28 @@ def require(needed: int, budget: float, what: str) -> None:
             f"--memory-gb {budget / GB:.2g}: {what} needs {needed / GB:.2g} GB; raise --memory-gb to {least:g}, or "
             "use smaller images"
         )
+
+
+def plan(
+    images: int, size: tuple[int, int], memory_gb: float, *, features: int = 0, result: int = 0, work: int = 0
+) -> None:
+    """Say what memory a stage over this many images of a size, and those after it, will take before it starts.
+
+    All in bytes: `features` are what finding those of one image takes at least, `result` what stays of each image,
+    `work` what an image takes while it is worked on. Raises InputError where the budget cannot be kept with one image
+    at a time.
+    """
+    width, height = size
+    program = resident() + ALLOWANCE
+    pictures = 3 * width * height * images
+    results = images * (result + FOUND)
+    budget = memory_gb * GB
+    least = program + pictures + max(features, results + max(work, MAP))
+    require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
+    at_once = min(os.cpu_count() or 1, images)
+    # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
+    ample = program + pictures + max(features * at_once, results + at_once * work + MAP)
+    announce(min(ample, int(budget)), budget)
 
 
 @cache

@@ -1,9 +1,11 @@
 """What the whole job is given, and what it hands to the report, the command line and the caller."""
 
-from dataclasses import dataclass, field
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,10 +14,12 @@ from numpy import ndarray
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
+from jcr.depth.options import DepthOptions
 from jcr.geometry import rotation_log
-from jcr.reconstruct.backends import ReconstructOptions
+from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
 from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
 from jcr.represent.options import CloudOptions, MapOptions
+from jcr.run_folder import MadeWith
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """The options of every stage."""
 
@@ -33,6 +37,47 @@ class RunOptions:
     map: MapOptions | None = field(default_factory=MapOptions)
     """None: no cloud and no map, and no dense depth, which only these need."""
     segment: SegmentOptions = field(default_factory=SegmentOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+
+    @classmethod
+    def of(
+        cls,
+        made_with: MadeWith,
+        *,
+        map: MapOptions | None,
+        cloud: CloudOptions | None = None,
+        segment: SegmentOptions | None = None,
+    ) -> "RunOptions":
+        """The options that a run was made with, those of the map chosen again."""
+        return cls(
+            reconstruct=made_with.reconstruct,
+            calibrate=made_with.calibrate,
+            depth=replace(made_with.depth, dense=True),
+            cloud=cloud or CloudOptions(),
+            map=map,
+            segment=segment or SegmentOptions(),
+        )
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether anything needs dense depth: a map, or a known length, which ends on surfaces."""
+        return self.map is not None or self.calibrate.known_length is not None
+
+    @property
+    def made_with(self) -> MadeWith:
+        """What the run folder keeps of them: the map may be made again with other ones."""
+        return MadeWith(reconstruct=self.reconstruct, calibrate=self.calibrate, depth=self.depth)
+
+    @property
+    def for_report(self) -> dict[str, Mapping[str, Any]]:
+        """The options of the stages up to the map, which has its own history."""
+        stages = {"reconstruct": self.reconstruct, "calibrate": self.calibrate, "densify": self.depth}
+        return {stage: asdict(options) for stage, options in stages.items()}
+
+    def for_capture(self, capture: Capture, backend: str | None = None) -> "RunOptions":
+        """The same with another back end, or the one that takes the capture's own camera poses."""
+        reconstruct = self.reconstruct if backend is None else replace(self.reconstruct, backend=backend)
+        return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
 @dataclass(frozen=True)
@@ -55,6 +100,12 @@ class RunResult:
     def converged(self) -> bool:
         """Whether the calibration may be trusted."""
         return self.hand_eye.converged
+
+    def timed(self, stage: str, start: float, notes: Sequence[str] = ()) -> "RunResult":
+        """With the seconds since `start` (time.perf_counter) and the notes of one more stage."""
+        timings = self.calibration.timings_s | {stage: round(time.perf_counter() - start, 3)}
+        update = {"timings_s": timings, "notes": [*self.calibration.notes, *notes]}
+        return replace(self, calibration=self.calibration.model_copy(update=update))
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:

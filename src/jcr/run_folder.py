@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,10 +27,14 @@ from jcr.capture.plain_files import first_fault
 from jcr.capture.read import read_capture
 from jcr.cell.cameras_json import FILE as CAMERAS
 from jcr.cell.cameras_json import CamerasFile, read_cameras, write_cameras
+from jcr.depth.depth_npz import FILE as DEPTH
+from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
+from jcr.depth.depth_npz import read_depth, write_depth
+from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.files import read_bytes, remove_unfinished, write_text
 from jcr.reconstruct.backends import ReconstructOptions, candidates
-from jcr.reconstruct.reconstruction_npz import FORMAT, read_reconstruction, write_reconstruction
+from jcr.reconstruct.reconstruction_npz import FORMAT, WITH_DEPTH, read_reconstruction, write_reconstruction
 from jcr.records import Attempt, Capture, PointCloud, Reconstruction
 from jcr.represent.cloud_ply import read_cloud, write_cloud
 from jcr.represent.map_file import FILE as MAP
@@ -49,7 +53,8 @@ STATE = "run.json"
 """The capture, the options of its calibration, and what reconstruction.npz was made from."""
 RECONSTRUCTION, CALIBRATION, LOG = "reconstruction.npz", "calibration.json", "log.txt"
 CLOUD, REPORT = "cloud.ply", "report.html"
-OF_RECONSTRUCTION = (STATE, RECONSTRUCTION)
+OF_RECONSTRUCTION = (STATE, DEPTH, RECONSTRUCTION)
+"""A kill between two of them leaves none without what it was made from."""
 OF_CALIBRATION = (CLOUD, MAP, REPORT, CAMERAS)
 """What holds of one calibration alone."""
 PASSING = {"timings_s", "warnings", "notes", "version", "attempts", "requirement", "next_poses"}
@@ -62,6 +67,7 @@ class MadeWith(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     reconstruct: ReconstructOptions
     calibrate: CalibrateOptions
+    depth: DepthOptions = DepthOptions()
 
 
 class State(BaseModel):
@@ -76,6 +82,13 @@ class State(BaseModel):
     attempts: tuple[Attempt, ...] = ()
     """How that reconstruction was chosen."""
 
+    @property
+    def depth(self) -> str:
+        """The fingerprint of the depth.npz that belongs to it."""
+        options = asdict(self.options.depth)
+        del options["dense"]  # whether it is made changes nothing in it
+        return hashlib.sha256(json.dumps([self.reconstruct, options, DEPTH_FORMAT]).encode()).hexdigest()
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -87,7 +100,7 @@ class RunFolder:
         """run.json; InputError where there is no run, or its file was damaged."""
         file = self.path / STATE
         try:
-            return State.model_validate_json(read_bytes(file), strict=True)
+            return State.model_validate_json(_with_depth_apart(read_bytes(file)), strict=True)
         except ValidationError as error:
             raise InputError(
                 f"{file}: {first_fault(error)}; run `jcr calibrate` or `jcr run` again"
@@ -115,9 +128,15 @@ class RunFolder:
         """calibration.json; InputError where there is none, or it was damaged."""
         return read_calibration(self.path)
 
-    def reconstruction(self) -> Reconstruction:
-        """reconstruction.npz; InputError where there is none, or it was damaged."""
-        return read_reconstruction(self.path / RECONSTRUCTION)
+    def reconstruction(self, depth: str | None = None) -> Reconstruction:
+        """reconstruction.npz, with the pointmaps of depth.npz where there are some (of the fingerprint `depth` alone).
+
+        InputError where there is no reconstruction, or a file was damaged.
+        """
+        found = read_reconstruction(self.path / RECONSTRUCTION)
+        if found.pointmaps is None and (self.path / DEPTH).is_file():
+            found = replace(found, pointmaps=read_depth(self.path / DEPTH, len(found.image_index), depth))
+        return found
 
     def calibrated(self) -> tuple[CalibrationFile, Reconstruction]:
         """A calibration and the reconstruction behind it.
@@ -153,26 +172,54 @@ class RunFolder:
         """Whether there is a map, sound or not."""
         return (self.path / MAP).is_file()
 
-    def earlier(self, state: State) -> State | None:
+    def earlier(self, capture: Capture, state: State) -> State | None:
         """The state of an earlier run whose reconstruction was made from the same; else it is to be made again.
 
-        A state that cannot be read vouches for nothing: to make every stage again is always right.
+        A state that cannot be read proves nothing: to make every stage again is always right.
         """
         try:
             found = self.state()
         except InputError:
             return None
-        return found if found.reconstruct == state.reconstruct else None
+        if found.reconstruct == state.reconstruct:
+            return found
+        return found if found.reconstruct in fingerprints_with_depth(capture, state.options) else None
+
+    def reuse_reconstruction(self, capture: Capture, state: State) -> tuple[Reconstruction, State] | None:
+        """The reconstruction of an earlier run of the same, with its pointmaps, and that run's state."""
+        if (earlier := self.earlier(capture, state)) is None:
+            return None
+        if earlier.reconstruct == state.reconstruct:
+            return self.reconstruction(state.depth), earlier
+        found = self.reconstruction()  # with its depth in one file: from now on in two
+        self.keep_reconstruction(found, state.model_copy(update={"attempts": earlier.attempts}))
+        return found, earlier
 
     def keep_capture(self, capture: Capture) -> Capture:
         """The capture as later commands will find it: where it lies, or copied if it is of another format."""
         return kept(capture, self.path / CAPTURE)
 
     def keep_reconstruction(self, reconstruction: Reconstruction, state: State) -> None:
-        """Write it, then the state that vouches for it."""
-        (self.path / STATE).unlink(missing_ok=True)  # or it would vouch for a file that it does not know
-        write_reconstruction(self.path / RECONSTRUCTION, reconstruction)
+        """Write it, then what it was made from; pointmaps that were estimated become depth.npz."""
+        for name in (STATE, DEPTH):  # of the one before
+            (self.path / name).unlink(missing_ok=True)
+        pointmaps = reconstruction.pointmaps
+        predicted = pointmaps if pointmaps is not None and pointmaps.is_predicted else None
+        write_reconstruction(self.path / RECONSTRUCTION, replace(reconstruction, pointmaps=predicted))
         self.keep_state(state)
+        self.keep_depth(reconstruction, state)
+
+    def has_depth(self, reconstruction: Reconstruction, state: State) -> bool:
+        """Whether depth.npz was made from this reconstruction with these options."""
+        file = self.path / DEPTH
+        return file.is_file() and read_depth(file, len(reconstruction.image_index), state.depth) is not None
+
+    def keep_depth(self, reconstruction: Reconstruction, state: State) -> None:
+        """Write depth.npz, where the reconstruction has estimated pointmaps and they are not there already."""
+        pointmaps = reconstruction.pointmaps
+        if pointmaps is None or pointmaps.is_predicted or self.has_depth(reconstruction, state):
+            return
+        write_depth(self.path / DEPTH, pointmaps, state.depth)
 
     def keep_state(self, state: State) -> None:
         """Write run.json."""
@@ -250,19 +297,43 @@ def held(path: Path) -> Iterator[RunFolder]:
                 shutil.rmtree(path)
 
 
-def state_of(capture: Capture, reconstruct: ReconstructOptions, calibrate: CalibrateOptions) -> State:
+def _with_depth_apart(content: bytes) -> bytes:
+    """A run.json in which reconstruct had the options of the depth, as it is written now."""
+    try:
+        state = json.loads(content)
+        old = state["options"]["reconstruct"]
+        del old["dense"]  # which was set by the command
+        state["options"]["depth"] = {"priors": old.pop("priors")}
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return content  # as it is written now, or damaged: where, the model says
+    return json.dumps(state).encode()
+
+
+def state_of(capture: Capture, options: MadeWith) -> State:
     """The state of a run with these options, before anything was tried."""
-    # What auto stands for changes with the weights that are on this machine.
-    options = reconstruct.as_json() | {"backend": candidates(reconstruct)}
     return State(
         capture=str(capture.folder.resolve()),
-        reconstruct=fingerprint(capture, options),
-        options=MadeWith(reconstruct=reconstruct.with_absolute_paths(), calibrate=calibrate),
+        reconstruct=fingerprint(capture, _deciding(options.reconstruct)),
+        options=options.model_copy(update={"reconstruct": options.reconstruct.with_absolute_paths()}),
     )
 
 
-def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
-    """A hash of all that a stage's result depends on: images, poses, intrinsics, options and version."""
+def fingerprints_with_depth(capture: Capture, options: MadeWith) -> list[str]:
+    """Those of the same reconstruction in files that held its depth: with the same depth, or none."""
+    made = _deciding(options.reconstruct)
+    return [
+        fingerprint(capture, made | {"dense": dense, "priors": priors}, WITH_DEPTH)
+        for dense, priors in ((True, options.depth.priors), (False, True), (False, False))
+    ]
+
+
+def _deciding(options: ReconstructOptions) -> dict[str, Any]:
+    """The options as they decide a reconstruction: what auto stands for changes with the weights on this machine."""
+    return options.as_json() | {"backend": candidates(options)}
+
+
+def fingerprint(capture: Capture, options: dict[str, Any], format: str = FORMAT) -> str:
+    """A hash of all that a stage's result depends on: images, poses, intrinsics, options, version and file format."""
     digest = hashlib.sha256()
     for name in capture.images:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
@@ -276,5 +347,5 @@ def fingerprint(capture: Capture, options: dict[str, Any]) -> str:
         files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         options = options | {name: states or options[name]}
-    digest.update(json.dumps([lens, options, __version__, FORMAT], sort_keys=True).encode())
+    digest.update(json.dumps([lens, options, __version__, format], sort_keys=True).encode())
     return digest.hexdigest()

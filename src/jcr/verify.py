@@ -228,7 +228,6 @@ def fitted(
     is the covariance of the systematic errors of the poses used, at 1 rad.
     """
     row_used = _used(calibration, reconstruction)
-    noise = options.robot_noise
     poses = (
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
@@ -241,7 +240,7 @@ def fitted(
             np.array(calibration.base_from_recon),
         ),
         np.ones(int(row_used.sum()), bool),
-        None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+        options.robot_noise_m_rad,
         systematic=systematic,
         averaged=False,
     )

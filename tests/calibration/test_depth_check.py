@@ -19,7 +19,17 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import MATCHED, PRIOR, Capture, HandEye, Intrinsics, Reconstruction, ScaleEvidence, Tracks
+from jcr.records import (
+    MATCHED,
+    PRIOR,
+    Capture,
+    HandEye,
+    Intrinsics,
+    Pointmaps,
+    Reconstruction,
+    ScaleEvidence,
+    Tracks,
+)
 from jcr.represent.measured_depth import with_measured_depth
 
 LENS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
@@ -64,10 +74,22 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
     points = np.stack([apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(LENS)[v, u], strict=True)])
     tracks = Tracks(image, np.stack([u, v], 1).astype(float), np.arange(len(image)), points)
     nothing = np.zeros(true.shape)
+    pointmaps = Pointmaps(
+        intrinsics=LENS,
+        points_in_recon=np.zeros((*true.shape, 3)),
+        confidence=nothing,
+        colors=np.zeros((*true.shape, 3), np.uint8),
+        reason=nothing.astype(np.uint8),
+        depth_std=nothing,
+    )
     return Reconstruction(
-        np.arange(len(true)), cameras, LENS, LENS, np.zeros((*true.shape, 3)), nothing,
-        np.zeros((*true.shape, 3), np.uint8), tracks, "cast", reason=nothing.astype(np.uint8), depth_std=nothing,
-    )  # fmt: skip
+        image_index=np.arange(len(true)),
+        recon_from_camera=cameras,
+        intrinsics=LENS,
+        tracks=tracks,
+        backend="cast",
+        pointmaps=pointmaps,
+    )
 
 
 def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple):
@@ -91,14 +113,15 @@ def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple
 def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured: tuple):
     capture, reconstruction, hand_eye, true = measured
     hand_eye = with_depth(capture, reconstruction, hand_eye)
-    found, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    mapped, notes = with_measured_depth(capture, reconstruction, hand_eye)
+    found = mapped.dense
     assert not notes and (found.reason == np.where(found.confidence > 0, MATCHED, 0)).all()
     there = found.confidence > 0
     assert there.mean() > 0.5 * (true > 0).mean() and not there[:, 51:59, 101:119].any()
     z = hand_eye.scale * np.stack(
         [
             apply(inverse(c), p)[..., 2]
-            for c, p in zip(found.recon_from_camera, found.points_in_recon, strict=True)
+            for c, p in zip(with_depth.recon_from_camera, found.points_in_recon, strict=True)
         ]
     )
     off, sigma = (z - true)[there], hand_eye.scale * np.asarray(found.depth_std)[there]
@@ -122,8 +145,11 @@ def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(mea
     reason = np.where(matched > 0, MATCHED, 0).astype(np.uint8)
     reason[:, :20] = np.where(matched[:, :20] > 0, PRIOR, 0)
     std = np.full(true.shape, 5e-4 / SCALE)
-    dense = replace(reconstruction, points_in_recon=points, confidence=matched, reason=reason, depth_std=std)
-    found, notes = with_measured_depth(capture, dense, hand_eye)
+    dense = replace(
+        reconstruction.dense, points_in_recon=points, confidence=matched, reason=reason, depth_std=std
+    )
+    with_depth, notes = with_measured_depth(capture, replace(reconstruction, pointmaps=dense), hand_eye)
+    found = with_depth.dense
     assert notes and "differ" in notes[0]
     left = np.zeros(true.shape, bool)
     left[:, 20:, : WIDTH // 2] = matched[:, 20:, : WIDTH // 2] > 0

@@ -28,15 +28,11 @@ def pictured(
         Path("."), tuple(f"{k}.png" for k in range(images)), problem.base_from_gripper, (640, 480), lens
     )
     reconstruction = Reconstruction(
-        np.arange(images),
-        problem.recon_from_camera,
-        lens or LENS,
-        lens or LENS,
-        np.zeros((images, 1, 1, 3), np.float32),
-        np.zeros((images, 1, 1), np.float32),
-        np.zeros((images, 1, 1, 3), np.uint8),
-        tracks,
-        "test",
+        image_index=np.arange(images),
+        recon_from_camera=problem.recon_from_camera,
+        intrinsics=lens or LENS,
+        tracks=tracks,
+        backend="test",
     )
     return problem, capture, reconstruction
 

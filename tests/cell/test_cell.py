@@ -154,17 +154,12 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     lens = capture.intrinsics
     assert lens is not None
     nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
-    none = np.zeros((OLD, 4, 6))
     reconstruction = Reconstruction(
-        np.arange(OLD),
-        poses,
-        lens,
-        lens,
-        np.zeros((OLD, 4, 6, 3)),
-        none,
-        np.zeros((OLD, 4, 6, 3), np.uint8),
-        nothing,
-        "test",
+        image_index=np.arange(OLD),
+        recon_from_camera=poses,
+        intrinsics=lens,
+        tracks=nothing,
+        backend="test",
     )
     old = replace(
         capture,
@@ -226,9 +221,6 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         reconstruction,
         image_index=np.arange(len(frame)),
         recon_from_camera=its_own,
-        points_in_recon=reconstruction.points_in_recon[frame],
-        confidence=reconstruction.confidence[frame],
-        colors=reconstruction.colors[frame],
         tracks=replace(reconstruction.tracks, points_in_recon=apply(its_own[0], np.eye(3) + 1.0)),
     )
     asked: list[Capture] = []
@@ -276,9 +268,6 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
         reconstruction,
         image_index=np.arange(len(frame)),
         recon_from_camera=scale_translation(seen_from, 1 / SCALE),
-        points_in_recon=reconstruction.points_in_recon[frame],
-        confidence=reconstruction.confidence[frame],
-        colors=reconstruction.colors[frame],
         tracks=replace(reconstruction.tracks, points_in_recon=0.05 * np.eye(3)),
     )
     monkeypatch.setattr(carried, "reconstruct", lambda *_: whole)

@@ -39,6 +39,7 @@ def test_a_run_leaves_every_file_and_nothing_half_written(done: Path):
     assert {
         "calibration.json",
         "reconstruction.npz",
+        "depth.npz",
         "cloud.ply",
         "map.safetensors",
         "report.html",
@@ -95,8 +96,18 @@ def test_a_map_of_a_folder_without_depth_adds_the_depth_of_a_whole_run(small_cap
     assert jcr.measure(tmp_path / "out").objects
     whole = jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options))
     one, other = mapped.reconstruction, whole.reconstruction
-    np.testing.assert_array_equal(one.points_in_recon, other.points_in_recon)
-    np.testing.assert_array_equal(one.confidence, other.confidence)
+    np.testing.assert_array_equal(one.dense.points_in_recon, other.dense.points_in_recon)
+    np.testing.assert_array_equal(one.dense.confidence, other.dense.confidence)
+    for name in ("reconstruction.npz", "depth.npz"):
+        with np.load(tmp_path / "out" / name) as one_file, np.load(tmp_path / "whole" / name) as other_file:
+            assert set(one_file) == set(other_file)
+            for array in one_file:
+                np.testing.assert_array_equal(one_file[array], other_file[array])
+    stamp, stages[:] = (tmp_path / "whole" / "depth.npz").stat().st_mtime_ns, []
+    report = lambda stage, share: stages.append(stage)  # noqa: E731
+    jcr.run(capture, tmp_path / "whole", jcr.RunOptions(map=options), progress=report)
+    assert "dense depth" not in stages and "matching" not in stages
+    assert (tmp_path / "whole" / "depth.npz").stat().st_mtime_ns == stamp
     np.testing.assert_array_equal(mapped.gripper_from_camera, whole.gripper_from_camera)
 
 

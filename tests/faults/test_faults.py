@@ -31,6 +31,7 @@ from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.handeye.arms import arm_named
 from jcr.handeye.robots import forward_kinematics
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
+from jcr.run_folder import RunFolder
 from jcr.simulate.problem import hand_eye_problem
 
 SIZE = (96, 72)
@@ -477,14 +478,17 @@ def test_each_fault_ends_in_one_line_and_harms_nothing(
         assert json.loads((case.out / "calibration.json").read_text())["converged"] is False
 
 
-def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(tmp_path: Path, done: Path, capsys):
+@pytest.mark.parametrize("name", ["reconstruction.npz", "depth.npz"])
+def test_a_damaged_reconstruction_is_named_and_nothing_else_is_touched(
+    tmp_path: Path, done: Path, name: str, capsys
+):
     copy = tmp_path / "done"
     shutil.copytree(done, copy)
-    cut(copy / "reconstruction.npz")
+    cut(copy / name)
     before = state(copy)
     assert dispatch(["map", str(copy), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "reconstruction.npz: damaged" in said and said.count("\n") == 1
+    assert f"{name}: damaged" in said and said.count("\n") == 1
     assert state(copy) == before
 
 
@@ -534,7 +538,7 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
     """Killed between the two files of another capture, the first capture's run would take the wrong one."""
     out = tmp_path / "out"
     shutil.copytree(done, out)
-    kept = read_reconstruction(done / "reconstruction.npz")
+    kept = RunFolder(done).reconstruction()
     monkeypatch.setattr(attempts, "reconstruct", lambda *_: kept)
 
     def killed(*_) -> None:
@@ -547,10 +551,11 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/5": {
-        "about", "colors", "confidence", "depth_std", "image_index", "points_in_recon", "reason", "recon_from_camera",
-        "track_image", "track_point", "track_points_in_recon", "track_x_px", "tracks_from_pointmaps",
-    }
+    "jcr.reconstruction/6": {
+        "about", "image_index", "recon_from_camera", "track_image", "track_point", "track_points_in_recon",
+        "track_x_px", "tracks_from_board", "tracks_from_pointmaps",
+    },
+    "jcr.depth/1": {"about", "colors", "confidence", "depth_std", "points_in_recon", "reason"},
 }  # fmt: skip
 
 
@@ -565,6 +570,8 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     assert set(about) == {
         "format", "backend", "is_metric", "metric_std", "notes", "warnings", "intrinsics", "pointmap_intrinsics"
     }  # fmt: skip
+    with np.load(done / "depth.npz") as file:
+        assert ARRAYS[json.loads(str(file["about"]))["format"]] == set(file)
     out = tmp_path / "out"
     shutil.copytree(done, out)
     del about["metric_std"]
@@ -572,7 +579,7 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/5'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/6'; delete it and run again" in said
 
 
 def in_degrees(pose: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from jcr.cli import dispatch, main
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.map_file import load_map
+from jcr.run_folder import RunFolder
 
 pytestmark = pytest.mark.slow
 
@@ -72,6 +73,7 @@ class Run:
 READERS = {
     "calibration.json": read_calibration,
     "reconstruction.npz": read_reconstruction,
+    "depth.npz": lambda path: RunFolder(path.parent).reconstruction(),
     "cloud.ply": read_cloud,
     "map.safetensors": load_map,
     "run.json": lambda path: json.loads(path.read_text()),
@@ -91,8 +93,10 @@ def check_whole(out: Path) -> None:
 
 def results(out: Path) -> dict[str, object]:
     """All that a run found, without the time it took."""
-    with np.load(out / "reconstruction.npz") as arrays:
-        reconstruction = {name: arrays[name].tobytes() for name in arrays.files}
+    reconstruction = {}
+    for file in ("reconstruction.npz", "depth.npz"):
+        with np.load(out / file) as arrays:
+            reconstruction |= {f"{file}: {name}": arrays[name].tobytes() for name in arrays.files}
     calibration = json.loads((out / "calibration.json").read_text())
     del calibration["timings_s"]
     for attempt in calibration["attempts"]:

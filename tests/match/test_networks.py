@@ -80,7 +80,7 @@ def test_a_chessboard_before_a_plain_background(real_captures: Path):
 
     assert LIGHTERGLUE.found()
     capture = read_capture(real_captures / "franka_plain_background")
-    made = reconstruct(capture, ColmapOptions(dense=False, features="xfeat"))
+    made = reconstruct(capture, ColmapOptions(features="xfeat"))
     assert len(made.image_index) == 8
     hand_eye = calibrate(capture, made)
     reference = np.array(json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"])

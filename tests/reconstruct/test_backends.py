@@ -194,7 +194,8 @@ def test_the_captures_own_cameras_are_taken_where_nothing_else_is_asked_for(tmp_
 def test_options_survive_a_run_folder(tmp_path: Path) -> None:
     options = ReconstructOptions(predictions=tmp_path / "p.npz", seed=2)
     state = run_folder.state_of(
-        Capture(tmp_path, (), np.zeros((0, 4, 4)), (64, 48)), options, CalibrateOptions()
+        Capture(tmp_path, (), np.zeros((0, 4, 4)), (64, 48)),
+        run_folder.MadeWith(reconstruct=options, calibrate=CalibrateOptions()),
     )
     folder = run_folder.RunFolder(tmp_path)
     folder.keep_state(state)

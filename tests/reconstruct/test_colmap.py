@@ -13,6 +13,8 @@ from PIL import Image
 
 from jcr.camera import project
 from jcr.capture.read import read_capture
+from jcr.depth.densify import densify, undistorted
+from jcr.depth.options import DepthOptions
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
@@ -20,9 +22,6 @@ from jcr.records import Capture, Reconstruction
 from jcr.simulate.truth import read_truth
 
 pytestmark = pytest.mark.slow
-
-SMALL = ColmapOptions(pointmap_size_px=80)
-"""For tests that ask for poses only."""
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +31,13 @@ def capture(tabletop: Path) -> Capture:
 
 @pytest.fixture(scope="module")
 def found(capture: Capture) -> Reconstruction:
-    return reconstruct(_first(capture, 7), ColmapOptions(pointmap_size_px=240))
+    first = _first(capture, 7)
+    return densify(first, reconstruct(first), DepthOptions(pointmap_size_px=240))
 
 
 @pytest.fixture(scope="module")
 def four(capture: Capture) -> Reconstruction:
-    return reconstruct(_first(capture, 4), SMALL)
+    return reconstruct(_first(capture, 4))
 
 
 def _first(capture: Capture, count: int) -> Capture:
@@ -87,11 +87,13 @@ def test_tracks_reproject_without_half_a_pixel(found: Reconstruction) -> None:
 
 
 def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
-    assert np.isfinite(found.points_in_recon).all()
-    assert (found.confidence > 0).mean() > 0.5
+    assert np.isfinite(found.dense.points_in_recon).all()
+    assert (found.dense.confidence > 0).mean() > 0.5
     centers = _true_base_from_camera(capture, found)[:, :3, 3]
     base_from_recon, scale = fit_similarity(centers, found.recon_from_camera[:, :3, 3])
-    x_in_base = apply_similarity(base_from_recon, scale, found.points_in_recon[found.confidence > 0])
+    x_in_base = apply_similarity(
+        base_from_recon, scale, found.dense.points_in_recon[found.dense.confidence > 0]
+    )
     truth = read_truth(capture.folder)
     low, high = truth.workspace_in_base
     inside = ((x_in_base > low) & (x_in_base < high))[:, :2].all(-1)
@@ -115,21 +117,20 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
     shares = []
     again = reconstruct(
         replace(turned, folder=tmp_path, images=tuple(names)),
-        SMALL,
-        lambda stage, share: shares.append(share) if stage == "mapping" else None,
+        progress=lambda stage, share: shares.append(share) if stage == "mapping" else None,
     )
     assert shares == [0.0, 0.5, 0.75, 1.0, 1.0]  # a pair first, then image by image
     np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
     np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
     np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
-    np.testing.assert_array_equal(again.points_in_recon, four.points_in_recon)
-    np.testing.assert_array_equal(again.confidence, four.confidence)
+    _, upright = undistorted(capture.folder, turned.images, four.intrinsics)
+    np.testing.assert_array_equal(undistorted(tmp_path, names, again.intrinsics)[1], upright)
 
 
 def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstruction) -> None:
     assert capture.intrinsics is not None
     folding = replace(capture.intrinsics, distortion=(0.01, 0.7, 0.0, 0.0, -9.0))
-    result = reconstruct(replace(_first(capture, 4), intrinsics=folding), SMALL)
+    result = reconstruct(replace(_first(capture, 4), intrinsics=folding))
     (warning,) = result.warnings
     assert "folds over at" in warning and "not used" in warning and not result.notes
     assert result.intrinsics == capture.intrinsics
@@ -138,7 +139,7 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
 
 def test_unknown_lens_is_found(capture: Capture) -> None:
     assert capture.intrinsics is not None
-    result = reconstruct(replace(_first(capture, 5), intrinsics=None), SMALL)
+    result = reconstruct(replace(_first(capture, 5), intrinsics=None))
     assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
     corner = np.array([[0.4, 0.3, 1.0]])
     np.testing.assert_allclose(
@@ -148,7 +149,7 @@ def test_unknown_lens_is_found(capture: Capture) -> None:
 
 
 def test_tracks_are_in_pixels_of_the_original(capture: Capture) -> None:
-    result = reconstruct(_first(capture, 4), replace(SMALL, working_size_px=480))
+    result = reconstruct(_first(capture, 4), ColmapOptions(working_size_px=480))
     assert result.intrinsics == capture.intrinsics
     error = _reprojection_errors(result)
     assert np.abs(np.median(error, axis=0)).max() < 0.1
@@ -162,7 +163,7 @@ def test_image_that_shows_something_else_is_named(capture: Capture, tmp_path: Pa
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "elsewhere.png")
     images = (*(Path(name).name for name in three.images[:2]), "elsewhere.png", Path(three.images[2]).name)
-    result = reconstruct(replace(three, folder=tmp_path, images=images), SMALL)
+    result = reconstruct(replace(three, folder=tmp_path, images=images))
     assert result.image_index.tolist() == [0, 1, 3]
     assert result.notes == ("3 of 4 images registered; not elsewhere.png",)
     assert result.tracks.image.max() == 2
@@ -175,7 +176,7 @@ def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_pa
         shade = np.linspace(90, 150 + k, 640)[None, :, None] * np.ones((480, 1, 3))
         Image.fromarray(shade.astype(np.uint8)).save(tmp_path / name)
     with pytest.raises(NotTrustedError) as refusal:
-        reconstruct(replace(bare, folder=tmp_path), SMALL)
+        reconstruct(replace(bare, folder=tmp_path))
     message = str(refusal.value)
     assert "\n" not in message
     assert "0 of 4 images" in message and "0 features" in message and "textured objects" in message

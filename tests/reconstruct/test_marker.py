@@ -13,10 +13,11 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
+from jcr.depth.densify import densify
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruct.board import boards
-from jcr.reconstruct.marker import MarkerOptions, reconstruct
+from jcr.reconstruct.marker import reconstruct
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics
 from jcr.simulate.problem import TARGET_IN_BASE, hand_eye_problem
@@ -116,7 +117,7 @@ BOARDS = {
 @pytest.mark.parametrize("spec", BOARDS)
 def test_calibrates_from_every_kind_of_board(tmp_path, spec):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", BOARDS[spec]())
-    reconstruction = reconstruct(capture, MarkerOptions(spec, dense=False))
+    reconstruction = reconstruct(capture, spec)
     assert len(reconstruction.image_index) == len(capture)
     hand_eye = calibrate(capture, reconstruction)
     found = hand_eye.gripper_from_camera
@@ -128,7 +129,7 @@ def test_calibrates_from_every_kind_of_board(tmp_path, spec):
 
 def test_an_unknown_lens_comes_from_the_board(tmp_path):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco(), known_lens=False)
-    reconstruction = reconstruct(capture, MarkerOptions("charuco:7x6:0.030:0.022:DICT_4X4_50", dense=False))
+    reconstruction = reconstruct(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
     assert abs(reconstruction.intrinsics.fx / LENS.fx - 1) < 0.01
     hand_eye = calibrate(capture, reconstruction)
     assert np.linalg.norm(hand_eye.gripper_from_camera - gripper_from_camera) < 0.01
@@ -143,7 +144,7 @@ def test_an_unknown_lens_comes_from_the_board(tmp_path):
 )
 def test_other_readings_of_a_charuco_board_are_tried_and_named(tmp_path, spec, legacy, read_as):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco(legacy), count=5)
-    reconstruction = reconstruct(capture, MarkerOptions(spec, dense=False))
+    reconstruction = reconstruct(capture, spec)
     assert any(read_as in note for note in reconstruction.notes)
     found = calibrate(capture, reconstruction).gripper_from_camera
     assert np.linalg.norm(found - gripper_from_camera) < 0.01
@@ -174,7 +175,7 @@ def test_lines_that_a_detector_drew_over_a_board_are_no_hindrance(tmp_path):
         assert detector.detectMarkers(image)[1] is None or len(detector.detectMarkers(image)[1]) < len(ids)
         cv2.imwrite(str(capture.folder / name), image)
     spec = "charuco:7x6:0.030:0.022:DICT_4X4_50"
-    hand_eye = calibrate(capture, reconstruct(capture, MarkerOptions(spec, dense=False)))
+    hand_eye = calibrate(capture, reconstruct(capture, spec))
     found = hand_eye.gripper_from_camera
     assert 1e3 * np.linalg.norm(found[:3, 3] - gripper_from_camera[:3, 3]) < 3.0
 
@@ -186,10 +187,12 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
     sheet[140:560, 180:720] = 255
     sheet[170:530, 240:660] = charuco()
     capture, _ = capture_of(tmp_path / "capture", sheet, count=5)
-    reconstruction = reconstruct(capture, MarkerOptions("charuco:7x6:0.030:0.022:DICT_4X4_50"))
+    reconstruction = reconstruct(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
     write_reconstruction(tmp_path / "reconstruction.npz", reconstruction)
-    assert read_reconstruction(tmp_path / "reconstruction.npz").metric_std == reconstruction.metric_std
-    height = reconstruction.points_in_recon[reconstruction.confidence > 0][:, 2]
+    read = read_reconstruction(tmp_path / "reconstruction.npz")
+    assert read.metric_std == reconstruction.metric_std and read.tracks.from_board
+    dense = densify(capture, read).dense
+    height = dense.points_in_recon[dense.confidence > 0][:, 2]
     assert len(height) > 1000
     assert np.median(np.abs(height)) < 0.002
 
@@ -213,7 +216,7 @@ def test_a_board_that_is_none_is_refused_with_the_cure(spec, says):
 def test_pictures_without_the_board_say_so(tmp_path):
     capture, _ = capture_of(tmp_path / "capture", charuco(), count=3)
     with pytest.raises(NotTrustedError, match="0 of 3 images show chessboard:8x5:0.025"):
-        reconstruct(capture, MarkerOptions("chessboard:8x5:0.025", dense=False))
+        reconstruct(capture, "chessboard:8x5:0.025")
 
 
 DATA = SHARED / "data"
@@ -232,7 +235,7 @@ DATA = SHARED / "data"
 )
 def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg, trusted):
     capture = read_capture(DATA / name)
-    hand_eye = calibrate(capture, reconstruct(capture, MarkerOptions(spec, dense=False)))
+    hand_eye = calibrate(capture, reconstruct(capture, spec))
     reference = json.loads((DATA / name / "reference.json").read_text())
     true = np.array(reference["gripper_from_camera"])
     found = hand_eye.gripper_from_camera
@@ -245,7 +248,7 @@ def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg,
 def test_a_sheet_of_paper_tells_the_size_that_the_robot_asks_for():
     """The sheet of franka_plain_background has sides of 11.388 and 8.056 squares: A4, with squares of 26.07 mm."""
     capture = read_capture(DATA / "franka_plain_background")
-    hand_eye = calibrate(capture, reconstruct(capture, MarkerOptions("chessboard:9x6:0.02607", dense=False)))
+    hand_eye = calibrate(capture, reconstruct(capture, "chessboard:9x6:0.02607"))
     assert hand_eye.converged and hand_eye.warnings == ()
 
 

@@ -114,9 +114,9 @@ def test_pairwise_pointmaps_give_poses_and_tracks(capture: Capture, truth: dict[
     result = reconstructed(capture, pair_arrays(truth))
     assert result.backend == "predictions" and result.image_index.tolist() == list(range(COUNT))
     assert result.intrinsics == capture.intrinsics
-    assert result.points_in_recon.shape == (COUNT, HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(result.pointmap_intrinsics.cx, WIDTH / 2, atol=1e-9)
-    assert (result.colors[:, 0, 0, 0] == 40 * np.arange(COUNT)).all()
+    assert result.dense.points_in_recon.shape == (COUNT, HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(result.dense.intrinsics.cx, WIDTH / 2, atol=1e-9)
+    assert (result.dense.colors[:, 0, 0, 0] == 40 * np.arange(COUNT)).all()
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
     assert_tracks(result, median_px=2.5)
 
@@ -130,7 +130,7 @@ def test_images_are_found_by_name_in_any_order(capture: Capture, truth: dict[str
     arrays |= {"edges": new[arrays["edges"]], "images": np.array([capture.images[k] for k in order])}
     result = reconstructed(capture, arrays)
     assert result.image_index.tolist() == [0, 1, 3, 4]
-    assert (result.colors[:, 0, 0, 0] == [0, 40, 120, 160]).all()
+    assert (result.dense.colors[:, 0, 0, 0] == [0, 40, 120, 160]).all()
     assert_poses(result, truth["gt_poses"][[0, 1, 3, 4]], millimetres=4, degrees=0.4)
 
     pointmaps = {name: values[order] for name, values in pointmap_arrays(truth).items()}
@@ -281,7 +281,7 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     assert result.is_metric and result.intrinsics == capture.intrinsics
     assert_poses(result, truth["gt_poses"], millimetres=1e-2, degrees=1e-3)
     assert_tracks(result, median_px=0.3)
-    assert (result.confidence == 0).any()
+    assert (result.dense.confidence == 0).any()
     # One colour an image: no match confirms the cameras, which keep the errors that such models are known for.
     assert any("too few matches by colour" in note for note in result.notes)
     assert result.evidence is not None

@@ -27,7 +27,7 @@ from jcr.cli.result import show
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
-from jcr.records import Capture, CellCamera, Intrinsics, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Intrinsics, Pointmaps, Reconstruction, Tracks
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -128,13 +128,18 @@ def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
         image_index=rows,
         recon_from_camera=cameras,
         intrinsics=lens,
-        pointmap_intrinsics=grid,
-        points_in_recon=np.stack(
-            [apply(cameras[k], depth[k][..., None] * rays / scale) for k in range(len(rows))]
-        ),
-        confidence=(depth > 0).astype(float),
-        colors=np.stack(
-            [read_image(tabletop / truth.images[row])[step // 2 :: step, step // 2 :: step] for row in rows]
+        pointmaps=Pointmaps(
+            intrinsics=grid,
+            points_in_recon=np.stack(
+                [apply(cameras[k], depth[k][..., None] * rays / scale) for k in range(len(rows))]
+            ),
+            confidence=(depth > 0).astype(float),
+            colors=np.stack(
+                [
+                    read_image(tabletop / truth.images[row])[step // 2 :: step, step // 2 :: step]
+                    for row in rows
+                ]
+            ),
         ),
         tracks=Tracks(
             np.concatenate(image),

@@ -12,9 +12,9 @@ import pytest
 from jcr.camera import rays, resized, undistort_image
 from jcr.capture.added import read_added, read_pose, with_images, write_added
 from jcr.capture.read import read_capture
+from jcr.depth.added import extend
 from jcr.errors import InputError
 from jcr.geometry import inverse, scale_translation, transform
-from jcr.reconstruct.added import extend
 from jcr.records import (
     BOTH,
     MATCHED,
@@ -24,6 +24,7 @@ from jcr.records import (
     HandEye,
     ImageResiduals,
     PaperResiduals,
+    Pointmaps,
     Reconstruction,
     RobotExamined,
     RobotNoise,
@@ -100,10 +101,12 @@ def known_reconstruction(
         image_index=np.arange(views),
         recon_from_camera=recon_from_camera,
         intrinsics=truth.intrinsics,
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points_in_recon,
-        confidence=np.stack(confidence),
-        colors=np.stack(colors),
+        pointmaps=Pointmaps(
+            intrinsics=pinhole,
+            points_in_recon=points_in_recon,
+            confidence=np.stack(confidence),
+            colors=np.stack(colors),
+        ),
         tracks=tracks,
         backend="truth",
     )
@@ -164,10 +167,15 @@ def within(truth: Truth, name: str, count: int = 4000) -> np.ndarray:
 def test_the_least_sure_matches_clear_nothing_but_in_added_images(truth: Truth, capture: Capture):
     made, hand_eye = known_reconstruction(truth, capture, scene_of(truth), 3)
     draw = np.random.default_rng(0)
+    confidence = made.dense.confidence
+    pointmaps = replace(
+        made.dense,
+        reason=draw.choice(np.array([MATCHED, BOTH, PRIOR], np.uint8), confidence.shape),
+        confidence=confidence * draw.uniform(1, 2, confidence.shape),
+    )
     made = replace(
         made,
-        reason=draw.choice(np.array([MATCHED, BOTH, PRIOR], np.uint8), made.confidence.shape),
-        confidence=made.confidence * draw.uniform(1, 2, made.confidence.shape),
+        pointmaps=pointmaps,
         image_index=np.array([0, 1, len(capture)]),
     )
     cloud = point_cloud(capture, made, hand_eye, options=CloudOptions(confidence_percentile=0.0))
@@ -219,7 +227,8 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
     assert (after.confidence[:8][known] > 0).mean() > 0.98
     camera_from_recon = inverse(after.recon_from_camera[8])
     depth = (
-        SCALE * (after.points_in_recon[8] @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3])[..., 2]
+        SCALE
+        * (after.dense.points_in_recon[8] @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3])[..., 2]
     )
     true = cv2.resize(true_depth(truth, 8), SIZE, interpolation=cv2.INTER_NEAREST)
     found = (after.confidence[8] > 0) & (true > 0)

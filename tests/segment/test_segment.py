@@ -25,6 +25,7 @@ from jcr.records import (
     Intrinsics,
     PaperResiduals,
     PointCloud,
+    Pointmaps,
     Reconstruction,
     RobotExamined,
     RobotNoise,
@@ -300,15 +301,17 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
     points = np.concatenate([grid, np.full((30, 40, 1), 0.5)], -1)
     reconstruction = Reconstruction(
-        np.array(rows),
-        np.stack([np.eye(4)] * m),
-        LENS,
-        PINHOLE,
-        np.stack([points] * m),
-        np.ones((m, 30, 40)),
-        np.zeros((m, 30, 40, 3), np.uint8),
-        Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
-        "colmap",
+        image_index=np.array(rows),
+        recon_from_camera=np.stack([np.eye(4)] * m),
+        intrinsics=LENS,
+        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        backend="colmap",
+        pointmaps=Pointmaps(
+            intrinsics=PINHOLE,
+            points_in_recon=np.stack([points] * m),
+            confidence=np.ones((m, 30, 40)),
+            colors=np.zeros((m, 30, 40, 3), np.uint8),
+        ),
     )
     (folder / "labels").mkdir(exist_ok=True)
     return capture, reconstruction
@@ -345,7 +348,8 @@ def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_pa
     labels = read_labels(capture, reconstruction)
     assert labels is not None and labels.labels[0, 15, 35] == 9
     assert (labels.labels == 9).sum() <= 2 * 4
-    wide = replace(reconstruction, pointmap_intrinsics=replace(PINHOLE, fx=10.0, fy=10.0))
+    pointmaps = replace(reconstruction.dense, intrinsics=replace(PINHOLE, fx=10.0, fy=10.0))
+    wide = replace(reconstruction, pointmaps=pointmaps)
     for name in "ab":
         write_label(tmp_path, name, np.full((60, 80), 2, np.uint8))
     labels = read_labels(capture, wide)

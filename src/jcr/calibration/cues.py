@@ -63,13 +63,17 @@ def surface_at(
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
         raise InputError(f"{asked_by}: {image} is not among the registered images; choose another")
-    x_px = project(reconstruction.pointmap_intrinsics, unproject(reconstruction.intrinsics, x_px))
+    if (dense := reconstruction.pointmaps) is None:
+        raise InputError(
+            f"{asked_by}: there is no dense depth to read a surface from; make it with `jcr map`"
+        )
+    x_px = project(dense.intrinsics, unproject(reconstruction.intrinsics, x_px))
     column, row = np.round(x_px).astype(int)
-    height, width = reconstruction.confidence.shape[1:]
+    height, width = dense.confidence.shape[1:]
     inside = 0 <= column < width and 0 <= row < height
-    if not inside or not reconstruction.confidence[rows[0], row, column] > 0:
+    if not inside or not dense.confidence[rows[0], row, column] > 0:
         raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
-    return reconstruction.points_in_recon[rows[0], row, column].astype(np.float64)
+    return dense.points_in_recon[rows[0], row, column].astype(np.float64)
 
 
 def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:

@@ -154,7 +154,7 @@ class _Matched:
     row_x_px: Float[ndarray, "c 2"]
 
     def and_those(
-        self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]
+        self, x_px: Float[ndarray, "k 2"], pairs: Sequence[tuple[Int[ndarray, " _"], Float[ndarray, "_ 2"]]]
     ) -> "_Matched":
         """With the keypoints and matches of another kind of features."""
         return _Matched(

@@ -10,6 +10,7 @@ from jcr.batch import BatchOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
+from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.options import CloudOptions, MapOptions
 
@@ -36,6 +37,7 @@ class Arguments:
     batch: BatchOptions = field(default_factory=BatchOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     output: Output = field(default_factory=Output)
@@ -50,7 +52,13 @@ def main(arguments: Arguments) -> int:
 
     if len(arguments.paths) < 2:
         raise InputError("batch: name one capture or more, then the folder for the results")
-    options = RunOptions(arguments.reconstruct, arguments.calibrate, arguments.cloud, arguments.map)
+    options = RunOptions(
+        reconstruct=arguments.reconstruct,
+        calibrate=arguments.calibrate,
+        depth=arguments.depth,
+        cloud=arguments.cloud,
+        map=arguments.map,
+    )
     *captures, out = arguments.paths
     with progress_bars() as progress:
         rows = batch(captures, out, options, arguments.batch, progress, arguments.read)

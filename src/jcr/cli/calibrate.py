@@ -11,6 +11,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.cli.source import source
+from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 
 
@@ -33,6 +34,7 @@ class Arguments:
     read: ReadOptions = field(default_factory=ReadOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
     output: Output = field(default_factory=Output)
 
 
@@ -42,7 +44,9 @@ def main(arguments: Arguments) -> int:
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
-    options = RunOptions(arguments.reconstruct, arguments.calibrate)
+    options = RunOptions(
+        reconstruct=arguments.reconstruct, calibrate=arguments.calibrate, depth=arguments.depth
+    )
     with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):

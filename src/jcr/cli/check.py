@@ -60,8 +60,8 @@ def main(arguments: Arguments) -> int:
 
     if arguments.suggest < 0:
         raise InputError(f"--suggest {arguments.suggest}: give how many poses to propose, 0 or more")
-    noise = arguments.robot_noise
-    check_options(CalibrateOptions(robot_noise=noise))
+    options = CalibrateOptions(robot_noise=arguments.robot_noise)
+    check_options(options)
     with (
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress) as capture,
@@ -70,7 +70,7 @@ def main(arguments: Arguments) -> int:
             capture,
             arguments.suggest,
             not arguments.poses_only,
-            None if noise is None else (noise[0] / 1e3, float(np.radians(noise[1]))),
+            options.robot_noise_m_rad,
             None if arguments.reach is None else np.array(arguments.reach).reshape(2, 3),
             arguments.seed,
             progress,

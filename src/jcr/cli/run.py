@@ -11,6 +11,7 @@ from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.cli.source import source
+from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
@@ -21,8 +22,8 @@ class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
     CAPTURE is a folder with capture.json and images, or any format that `jcr docs captures` lists: images and a table
-    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, cloud.ply,
-    map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
+    of poses, bags, LeRobot data sets, COLMAP models … The run writes calibration.json, reconstruction.npz, depth.npz,
+    cloud.ply, map.safetensors, report.html and log.txt to OUT. The same command resumes an interrupted run.
 
     examples:
       jcr run examples/tabletop out/tabletop
@@ -39,6 +40,7 @@ class Arguments:
     read: ReadOptions = field(default_factory=ReadOptions)
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -57,9 +59,14 @@ def main(arguments: Arguments) -> int:
 
     map_options = None if arguments.no_map else arguments.map
     if map_options is not None:
-        require_map(arguments.reconstruct)  # before a recording is read
+        require_map(arguments.depth)  # before a recording is read
     options = RunOptions(
-        arguments.reconstruct, arguments.calibrate, arguments.cloud, map_options, arguments.segment
+        reconstruct=arguments.reconstruct,
+        calibrate=arguments.calibrate,
+        depth=arguments.depth,
+        cloud=arguments.cloud,
+        map=map_options,
+        segment=arguments.segment,
     )
     with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)

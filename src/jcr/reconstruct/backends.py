@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
-from jcr.progress import Progress, silent
+from jcr.progress import Progress
 from jcr.reconstruct.hub import HUB_FILES, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
@@ -29,14 +29,14 @@ def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
         extra("torch", "match", f"--features {features}")
-    made = ColmapOptions(seed=options.seed, features=features, **_dense(options))
+    made = ColmapOptions(seed=options.seed, features=features, memory_gb=options.memory_gb)
     return reconstruct(capture, made, progress)
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct.direct import DirectOptions, reconstruct
+    from jcr.reconstruct.direct.direct import reconstruct
 
-    return reconstruct(capture, DirectOptions(**_dense(options)), progress)
+    return reconstruct(capture, progress, memory_gb=options.memory_gb)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
@@ -81,7 +81,7 @@ def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | 
     from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
 
     def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
-        return _colmap(capture, replace(options, backend="colmap", dense=False), progress)
+        return _colmap(capture, replace(options, backend="colmap"), progress)
 
     weights, licence = weights_folder(options), weights_of(options)[1]
     made = SingleViewsOptions("moge", moge.load, weights, licence, cameras, device_of(options))
@@ -89,11 +89,11 @@ def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | 
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.marker import MarkerOptions, reconstruct
+    from jcr.reconstruct.marker import reconstruct
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct(capture, MarkerOptions(options.board, **_dense(options)), progress)
+    return reconstruct(capture, options.board, progress, memory_gb=options.memory_gb)
 
 
 def _predictions(
@@ -114,13 +114,8 @@ def _given(capture: Capture, options: "ReconstructOptions", progress: Progress |
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
-    made = ColmapOptions(seed=options.seed, **_dense(options))
+    made = ColmapOptions(seed=options.seed, memory_gb=options.memory_gb)
     return reconstruct(capture, options.cameras, made, progress)
-
-
-def _dense(options: "ReconstructOptions") -> dict[str, Any]:
-    """What the options say of dense depth, for the back ends that estimate it without a network."""
-    return {"dense": options.dense, "priors": options.priors, "memory_gb": options.memory_gb}
 
 
 @dataclass(frozen=True)
@@ -166,6 +161,11 @@ class Backend:
     def sees_all_views(self) -> bool:
         """Whether it is a network that is shown all views at once."""
         return any(self.cost)
+
+    @property
+    def predicts_depth(self) -> bool:
+        """Whether its reconstructions come with pointmaps, a network's."""
+        return bool(self.hub_id) or "predictions" in self.options
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there, without importing it."""
@@ -347,7 +347,7 @@ else:
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """What turns images into camera poses and pointmaps."""
+    """What turns images into camera poses."""
 
     backend: BackendName = "auto"
     """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
@@ -365,19 +365,6 @@ class ReconstructOptions:
     memory_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 8.0
     """Memory limit of the process (peak resident set, the program included), and of a network on a GPU. The expected
     use is printed beforehand; what does not fit is done in smaller parts, or refused."""
-    dense: Annotated[
-        bool,
-        tyro.conf.arg(help="Estimate no dense depth, which only the map needs; networks predict it anyway."),
-    ] = True
-    """Estimate the dense depth that the map needs."""
-    priors: Annotated[
-        bool,
-        tyro.conf.arg(
-            help="Leave plain surfaces without depth. By default they are filled with planes where their colour and "
-            "the matched depth around them support it; the map uses these as surfaces, never as evidence of free space."
-        ),
-    ] = True
-    """Fill plain surfaces with planes. Networks predict them anyway."""
     weights: Annotated[str | None, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = None
     """A network's weights, as path or hub id; unset: the published ones. With --backend auto they must be DUSt3R's or
     MASt3R's."""
@@ -417,7 +404,8 @@ def reconstruct(
                 else ", or choose another"
             )
         )
-    order = _by_name(capture)
+    # By name, so that the order of the frames changes nothing.
+    order = np.argsort(np.array(capture.images), kind="stable")
     if row.keeps_order:
         order = np.arange(len(capture))
     by_name = replace(
@@ -426,43 +414,6 @@ def reconstruct(
         base_from_gripper=capture.base_from_gripper[order],
     )
     return _of_capture(row.reconstruct(by_name, replace(options, backend=row.name), progress), order)
-
-
-def plan_depth(capture: Capture, options: ReconstructOptions) -> None:
-    """Say what memory a reconstruction with dense depth will take, and see that it can be made, before anything is.
-
-    Raises InputError where it cannot.
-    """
-    from jcr.reconstruct.depth.dense import DenseOptions, plan_memory
-
-    plan_memory(len(capture), capture.image_size, DenseOptions(**_dense(options)))
-
-
-def with_depth_of(
-    capture: Capture,
-    reconstruction: Reconstruction,
-    options: ReconstructOptions,
-    progress: Progress | None = None,
-) -> Reconstruction:
-    """A reconstruction made with `dense` off, with the dense depth that `reconstruct` would have given it.
-
-    What a network predicted is as it was.
-    """
-    if reconstruction.reason is None or reconstruction.reason.any():
-        return reconstruction
-    from jcr.reconstruct.depth.dense import DenseOptions, with_depth
-
-    place = np.argsort(_by_name(capture))
-    by_name = np.argsort(place[reconstruction.image_index])
-    rows = np.argsort(by_name)
-    turned = _of_capture(replace(reconstruction, image_index=rows), np.arange(len(rows)))
-    made = with_depth(turned, DenseOptions(**_dense(options)), progress or silent)
-    return replace(_of_capture(made, by_name), image_index=reconstruction.image_index)
-
-
-def _by_name(capture: Capture) -> Int[ndarray, " n"]:
-    """Rows of the capture in the order of their names, so that the order of the frames changes nothing."""
-    return np.argsort(np.array(capture.images), kind="stable")
 
 
 def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Reconstruction:
@@ -480,11 +431,7 @@ def _of_capture(reconstruction: Reconstruction, order: Int[ndarray, " n"]) -> Re
         reconstruction,
         image_index=image_index[rows],
         recon_from_camera=reconstruction.recon_from_camera[rows],
-        points_in_recon=reconstruction.points_in_recon[rows],
-        confidence=reconstruction.confidence[rows],
-        colors=reconstruction.colors[rows],
-        reason=None if reconstruction.reason is None else reconstruction.reason[rows],
-        depth_std=None if reconstruction.depth_std is None else reconstruction.depth_std[rows],
+        pointmaps=None if reconstruction.pointmaps is None else reconstruction.pointmaps.of_rows(rows),
         tracks=replace(tracks, image=row_of[tracks.image]),
         evidence=evidence,
     )

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from jcr.capture.images import read_image
 from jcr.reconstruct.board import boards
-from jcr.records import Finding, Kind
+from jcr.records import Capture, Finding, Kind
 
 LOOKED_AT = 3
 """Images; a board that helps is in most of them."""
@@ -89,6 +90,13 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
     # Where the border of a board leaves the frame, it is found smaller.
     across, down = max(set(sizes), key=lambda size: (sizes.count(size), size))
     return f"chessboard:{across}x{down}:SIDE"
+
+
+def proposed_for(capture: Capture, board: str | None) -> Finding | None:
+    """That a board is in its images, and the --board that would use it; None where one was given, and where the camera watches the gripper."""
+    if board is not None or capture.mount == "base":
+        return None
+    return proposed([read_image(capture.folder / name) for name in capture.images])
 
 
 def proposed(images: Sequence[UInt8[ndarray, "h w 3"]]) -> Finding | None:

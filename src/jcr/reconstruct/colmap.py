@@ -1,4 +1,4 @@
-"""The COLMAP back end: structure from motion, then dense pointmaps; no network, no weights."""
+"""The COLMAP back end: structure from motion; no network, no weights."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,8 +9,8 @@ from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.match.matchers import FeatureName
+from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.depth.dense import DenseOptions, plan_memory, with_pointmaps
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
@@ -21,8 +21,8 @@ cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapOptions(DenseOptions):
-    """Structure from motion and dense pointmaps without a network."""
+class ColmapOptions:
+    """Structure from motion without a network."""
 
     working_size_px: int = 1600
     """Images whose long side is larger are reduced to this before features are extracted."""
@@ -34,12 +34,14 @@ class ColmapOptions(DenseOptions):
     """What is matched between images."""
     robot_checks: bool = True
     """Let the gripper poses check the matches; off, images alone decide."""
+    memory_gb: float = 8.0
+    """Peak resident set of the process, the program itself included."""
 
 
 def reconstruct(
     capture: Capture, options: ColmapOptions | None = None, progress: Progress | None = None
 ) -> Reconstruction:
-    """Camera poses, tracks and dense pointmaps of a capture, up to one similarity.
+    """Camera poses and tracks of a capture, up to one similarity.
 
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
@@ -50,7 +52,7 @@ def reconstruct(
     report = progress or silent
     width, height = capture.image_size
     working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
-    plan_memory(len(capture), (width, height), options, working_px * BYTES_OF_FEATURES)
+    plan(len(capture), (width, height), options.memory_gb, features=working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_lens(capture.intrinsics)
     lenses = [given] if given else _guessed_lenses(capture)
@@ -70,16 +72,10 @@ def reconstruct(
         )
     except NotTrustedError as error:
         raise error.with_more(*warnings) from None
-    notes = sparse.notes
-    if missing := [name for row, name in enumerate(capture.images) if row not in sparse.rows]:
-        notes += (f"{len(sparse.rows)} of {len(capture)} images registered; not {', '.join(missing)}",)
-    return with_pointmaps(
-        replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings)),
-        [images[row] for row in sparse.rows],
-        options,
-        report,
-        backend="colmap",
-    )
+    notes, registered = sparse.notes, sparse.image_index
+    if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
+        notes += (f"{len(registered)} of {len(capture)} images registered; not {', '.join(missing)}",)
+    return replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings))
 
 
 def _guessed_lenses(capture: Capture) -> list[Intrinsics]:

@@ -12,7 +12,7 @@ from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.reconstruct.pointmap_matches import tracks_from_pairs
 from jcr.reconstruct.preprocess import PreparedImages
-from jcr.records import Intrinsics, Reconstruction
+from jcr.records import Intrinsics, Pointmaps, Reconstruction
 
 OBSERVED, RECORDED = 80, 60
 """Bytes per pixel, when the network has gone: of a pointmap in alignment, and of an image in the reconstruction."""
@@ -53,10 +53,12 @@ def reconstruction_from_pairs(
         image_index=image_index,
         recon_from_camera=alignment.recon_from_camera,
         intrinsics=images.lens or images.grid.original_intrinsics(pinhole),
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points_in_recon,
-        confidence=alignment.confidence,
-        colors=images.colors,
+        pointmaps=Pointmaps(
+            intrinsics=pinhole,
+            points_in_recon=points_in_recon,
+            confidence=alignment.confidence,
+            colors=images.colors,
+        ),
         tracks=tracks,
         backend=backend,
         is_metric=predictions.is_metric,

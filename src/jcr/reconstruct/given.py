@@ -1,7 +1,7 @@
 """The `given` back end: camera poses that somebody else found, a COLMAP model or a transforms.json.
 
 The model's own points are its tracks; where it has none (transforms.json), features are matched and triangulated
-with the cameras held. Dense pointmaps are made as for the COLMAP back end.
+with the cameras held.
 """
 
 import tempfile
@@ -18,9 +18,9 @@ from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
+from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.depth.dense import SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
@@ -30,7 +30,7 @@ MIN_POINTS = 50
 def reconstruct(
     capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
 ) -> Reconstruction:
-    """The capture's images that the model at `cameras` knows, with its poses held, and pointmaps.
+    """The capture's images that the model at `cameras` knows, with its poses held.
 
     Raises InputError when the model knows fewer than three, NotTrustedError when nothing can be triangulated.
     """
@@ -46,10 +46,10 @@ def reconstruct(
     rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
     lens = capture.intrinsics or reader.read_lens(cameras, capture.image_size)
-    plan_memory(len(known), capture.image_size, options)
-    images = [read_image(capture.folder / capture.images[k]) for k in known]
+    plan(len(known), capture.image_size, options.memory_gb)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
+        images = [read_image(capture.folder / capture.images[k]) for k in known]
         tracks = _triangulated(images, lens, recon_from_camera, options, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
         raise NotTrustedError(
@@ -58,8 +58,14 @@ def reconstruct(
         )
     missing = [name for k, name in enumerate(capture.images) if k not in known]
     notes = (f"no camera pose is given for {', '.join(missing)}",) if missing else ()
-    sparse = SparseModel(np.array(known), recon_from_camera, lens, tracks, notes)
-    return with_pointmaps(sparse, images, options, report, backend="given")
+    return Reconstruction(
+        image_index=np.array(known),
+        recon_from_camera=recon_from_camera,
+        intrinsics=lens,
+        tracks=tracks,
+        backend="given",
+        notes=notes,
+    )
 
 
 def _rows(names: Sequence[str]) -> Callable[[str], int | None]:

@@ -4,7 +4,7 @@ Pose of a plane from its points: IPPE (Collins and Bartoli, IJCV 2014), then lea
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,10 +16,9 @@ from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
 from jcr.least_squares import minimise
+from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.board import Board, Sighting, boards, most_seen
-from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
-from jcr.reconstruct.depth.views import sweep_planes
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 PRINTED = 0.002
@@ -31,16 +30,6 @@ AMBIGUOUS = 1.5
 """A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
 LENS_IMAGES = 4
 """Fewest images of a board that determine intrinsics."""
-RISE = 0.4
-"""Share of a camera's distance to the board that things beside it may rise towards the camera."""
-
-
-@dataclass(frozen=True)
-class MarkerOptions(DenseOptions):
-    """Camera poses from a board."""
-
-    board: str
-    """What to look for, as `board.KINDS` has it."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +40,17 @@ class Pose:
     rms_px: float
 
 
-def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | None = None) -> Reconstruction:
-    """Cameras and pointmaps in metres; the recon frame is the board's, or that of the tag seen most often.
+def reconstruct(
+    capture: Capture, look_for: str, progress: Progress | None = None, *, memory_gb: float = 8.0
+) -> Reconstruction:
+    """Cameras in metres; the recon frame is the board's, or that of the tag seen most often.
 
-    Unknown intrinsics are calibrated from the board. Raises InputError for a board that is none, and
-    NotTrustedError when fewer than three images show it.
+    `look_for` names the board as `board.KINDS` has it. Unknown intrinsics are calibrated from the board. Raises
+    InputError for a board that is none, and NotTrustedError when fewer than three images show it.
     """
     report = progress or silent
-    readings = boards(options.board)
-    plan_memory(len(capture), capture.image_size, options)
+    readings = boards(look_for)
+    plan(len(capture), capture.image_size, memory_gb)
     images = [read_image(capture.folder / name) for name in capture.images]
     report("board", 0.0)
     board, seen = most_seen(readings, images)
@@ -76,7 +67,7 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
         raise NotTrustedError(
-            f"{len(rows)} of {len(capture)} images show {options.board} well enough",
+            f"{len(rows)} of {len(capture)} images show {look_for} well enough",
             "check its size and kind, that it lies flat and wholly in view, or use a back end that needs no marker",
         )
     if missing := [name for row, name in enumerate(capture.images) if row not in recon_from_camera]:
@@ -86,15 +77,16 @@ def reconstruct(capture: Capture, options: MarkerOptions, progress: Progress | N
     if len(recon_from_body) > 1:
         cameras, recon_from_body = _refined(cameras, recon_from_body, sightings, lens)
     tracks = _tracks(sightings, recon_from_body)
-    reconstruction = with_pointmaps(
-        SparseModel(rows, cameras, lens, tracks, tuple(notes)),
-        [images[row] for row in rows],
-        options,
-        report,
+    return Reconstruction(
+        image_index=rows,
+        recon_from_camera=cameras,
+        intrinsics=lens,
+        tracks=tracks,
         backend="marker",
-        planes=sweep_planes(_raised(tracks, cameras), cameras, count=96),
+        is_metric=True,
+        metric_std=PRINTED,
+        notes=tuple(notes),
     )
-    return replace(reconstruction, is_metric=True, metric_std=PRINTED)
 
 
 def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) -> tuple[Intrinsics, list[str]]:
@@ -247,18 +239,4 @@ def _tracks(sightings: Sequence[Sequence[Sighting]], bodies: dict[int, Float[nda
                 image.append(row)
                 x_px.append(s.x_px[k])
                 point.append(place[s.body, index])
-    return Tracks(np.array(image), np.array(x_px), np.array(point), np.array(points))
-
-
-def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
-    """The points, and the same ones as near to the cameras as things beside the board may come."""
-    on_board = tracks.points_in_recon
-    middle = recon_from_camera[:, :3, 3].mean(0)
-    raised = on_board + RISE * (middle - on_board)
-    return replace(
-        tracks,
-        image=np.tile(tracks.image, 2),
-        x_px=np.tile(tracks.x_px, (2, 1)),
-        point=np.concatenate([tracks.point, tracks.point + len(on_board)]),
-        points_in_recon=np.concatenate([on_board, raised]),
-    )
+    return Tracks(np.array(image), np.array(x_px), np.array(point), np.array(points), from_board=True)

@@ -8,7 +8,7 @@ from jcr.errors import InputError
 from jcr.geometry import apply, inverse
 from jcr.reconstruct.pointmap_matches import tracks_from_pointmaps
 from jcr.reconstruct.preprocess import PreparedImages
-from jcr.records import Intrinsics, Reconstruction
+from jcr.records import Intrinsics, Pointmaps, Reconstruction
 
 LARGEST_MISFIT = 0.02
 """Median distance of points' projections from their own pixels, over the width, at which poses are wrong."""
@@ -46,10 +46,12 @@ def reconstruction_from_pointmaps(
         image_index=image_index,
         recon_from_camera=recon_from_camera,
         intrinsics=images.lens or images.grid.original_intrinsics(pinhole),
-        pointmap_intrinsics=pinhole,
-        points_in_recon=points_in_recon,
-        confidence=confidence,
-        colors=images.colors,
+        pointmaps=Pointmaps(
+            intrinsics=pinhole,
+            points_in_recon=points_in_recon,
+            confidence=confidence,
+            colors=images.colors,
+        ),
         tracks=tracks_from_pointmaps(recon_from_camera, points_in_recon, confidence, images.original_px),
         backend=backend,
         is_metric=is_metric,

@@ -1,9 +1,11 @@
 """reconstruction.npz: a Reconstruction on disk, from which calibration and map can be made again."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -13,12 +15,16 @@ from jcr.errors import InputError
 from jcr.files import require_file, written_whole
 from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
-from jcr.records import CameraEvidence, Reconstruction, Tracks
+from jcr.records import CameraEvidence, Pointmaps, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/5"
+FORMAT = "jcr.reconstruction/6"
 """Changes with what the file holds."""
-OLD = ("jcr.reconstruction/3", "jcr.reconstruction/4")
-"""Without warnings, which were among the notes; 3 without reasons and sigmas of depths, which were all matched, too."""
+WITH_DEPTH = "jcr.reconstruction/5"
+"""The last in which the pointmaps were in the file whoever made them, without confidence where nobody had."""
+OLD = ("jcr.reconstruction/3", "jcr.reconstruction/4", WITH_DEPTH)
+"""Up to 4 without warnings, which were among the notes; 3 without reasons and sigmas of depths, which were all matched,
+too."""
+OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
 
 
 class About(BaseModel):
@@ -32,11 +38,12 @@ class About(BaseModel):
     notes: list[str]
     warnings: list[str] = []
     intrinsics: IntrinsicsJson
-    pointmap_intrinsics: IntrinsicsJson
+    pointmap_intrinsics: IntrinsicsJson | None = None
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
     """Write the record whole or not at all."""
+    pointmaps = reconstruction.pointmaps
     about = {
         "format": FORMAT,
         "backend": reconstruction.backend,
@@ -45,70 +52,73 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "notes": list(reconstruction.notes),
         "warnings": list(reconstruction.warnings),
         "intrinsics": asdict(reconstruction.intrinsics),
-        "pointmap_intrinsics": asdict(reconstruction.pointmap_intrinsics),
+        "pointmap_intrinsics": None if pointmaps is None else asdict(pointmaps.intrinsics),
     }
     arrays = {
         "image_index": reconstruction.image_index,
         "recon_from_camera": reconstruction.recon_from_camera,
-        "points_in_recon": reconstruction.points_in_recon,
-        "confidence": reconstruction.confidence,
-        "colors": reconstruction.colors,
         "track_image": reconstruction.tracks.image,
         "track_x_px": reconstruction.tracks.x_px,
         "track_point": reconstruction.tracks.point,
         "track_points_in_recon": reconstruction.tracks.points_in_recon,
         "tracks_from_pointmaps": np.array(reconstruction.tracks.from_pointmaps),
+        "tracks_from_board": np.array(reconstruction.tracks.from_board),
     }
     if (evidence := reconstruction.evidence) is not None:
         arrays |= {
             "evidence_recon_from_camera": evidence.recon_from_camera,
             "evidence_covariance": evidence.covariance,
         }
-    if reconstruction.reason is not None:
-        arrays["reason"] = reconstruction.reason
-    if reconstruction.depth_std is not None:
-        arrays["depth_std"] = reconstruction.depth_std
+    if pointmaps is not None:
+        arrays |= arrays_of(pointmaps)
+    write_npz(path, about, arrays)
+
+
+def arrays_of(pointmaps: Pointmaps) -> dict[str, np.ndarray]:
+    """The arrays of pointmaps by the names that they have in a file; `pointmaps_in` reads them."""
+    return {name: array for name in OF_POINTMAPS if (array := getattr(pointmaps, name)) is not None}
+
+
+def pointmaps_in(file: Mapping[str, np.ndarray], intrinsics: IntrinsicsJson, images: int) -> Pointmaps:
+    """The pointmaps of this many images in a file; KeyError or ValueError where they are not whole."""
+    found = Pointmaps(
+        intrinsics=intrinsics.record(),
+        points_in_recon=file["points_in_recon"],
+        confidence=file["confidence"],
+        colors=file["colors"],
+        reason=file.get("reason"),
+        depth_std=file.get("depth_std"),
+    )
+    size = images, found.intrinsics.height, found.intrinsics.width
+    shapes = {
+        name: (array, (*size, 3) if name in ("points_in_recon", "colors") else size)
+        for name, array in arrays_of(found).items()
+    }
+    check_arrays(shapes)
+    return found
+
+
+def write_npz(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays, and what is none as JSON, whole or not at all."""
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, about=np.array(json.dumps(about)), allow_pickle=False, **arrays)
 
 
-def read_reconstruction(path: Path) -> Reconstruction:
-    """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
+@contextmanager
+def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[str, np.ndarray]]]:
+    """What `write_npz` wrote: the JSON, whose `format` is one of `formats`, and the arrays.
+
+    What goes wrong in reading them raises InputError: no such file, damaged, or of another format.
+    """
     require_file(path)
     try:
         # NumPy leaves a file open that it cannot read.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             text = str(file["about"])
             kind = json.loads(text)["format"]
-            if kind not in (FORMAT, *OLD):
-                raise InputError(f"{path}: format {shown(kind)}, not {FORMAT!r}; delete it and run again")
-            about = About.model_validate_json(text, strict=True)
-            found = Reconstruction(
-                image_index=file["image_index"],
-                recon_from_camera=file["recon_from_camera"],
-                intrinsics=about.intrinsics.record(),
-                pointmap_intrinsics=about.pointmap_intrinsics.record(),
-                points_in_recon=file["points_in_recon"],
-                confidence=file["confidence"],
-                colors=file["colors"],
-                tracks=Tracks(
-                    file["track_image"],
-                    file["track_x_px"],
-                    file["track_point"],
-                    file["track_points_in_recon"],
-                    bool(file["tracks_from_pointmaps"]),
-                ),
-                backend=about.backend,
-                is_metric=about.is_metric,
-                metric_std=about.metric_std,
-                notes=tuple(about.notes),
-                warnings=tuple(about.warnings),
-                reason=file.get("reason"),
-                depth_std=file.get("depth_std"),
-                evidence=_evidence(file),
-            )
-            _check(found)
-            return found
+            if kind not in formats:
+                raise InputError(f"{path}: format {shown(kind)}, not {formats[0]!r}; delete it and run again")
+            yield text, file
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; run `jcr calibrate` or `jcr run` first") from None
     except ValidationError as error:
@@ -119,24 +129,65 @@ def read_reconstruction(path: Path) -> Reconstruction:
         raise InputError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
+def read_reconstruction(path: Path) -> Reconstruction:
+    """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
+    with read_npz(path, (FORMAT, *OLD)) as (text, file):
+        about = About.model_validate_json(text, strict=True)
+        found = Reconstruction(
+            image_index=file["image_index"],
+            recon_from_camera=file["recon_from_camera"],
+            intrinsics=about.intrinsics.record(),
+            tracks=Tracks(
+                file["track_image"],
+                file["track_x_px"],
+                file["track_point"],
+                file["track_points_in_recon"],
+                bool(file["tracks_from_pointmaps"]),
+                about.backend == "marker" if about.format in OLD else bool(file["tracks_from_board"]),
+            ),
+            backend=about.backend,
+            pointmaps=_pointmaps(file, about),
+            is_metric=about.is_metric,
+            metric_std=about.metric_std,
+            notes=tuple(about.notes),
+            warnings=tuple(about.warnings),
+            evidence=_evidence(file),
+        )
+        _check(found)
+    return found
+
+
+def _pointmaps(file: Mapping[str, np.ndarray], about: About) -> Pointmaps | None:
+    if about.pointmap_intrinsics is None:
+        return None
+    estimated = about.format in OLD and "reason" in file
+    if estimated and not file["confidence"].any():
+        return None
+    return pointmaps_in(file, about.pointmap_intrinsics, len(file["image_index"]))
+
+
 def _evidence(file: Mapping[str, np.ndarray]) -> CameraEvidence | None:
     if "evidence_covariance" not in file:
         return None
     return CameraEvidence(file["evidence_recon_from_camera"], file["evidence_covariance"])
 
 
+def check_arrays(shapes: Mapping[str, tuple[np.ndarray, tuple[int, ...]]]) -> None:
+    """ValueError where an array, by name, has another shape than it should, or is not finite."""
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+
+
 def _check(found: Reconstruction) -> None:
     """ValueError where the arrays do not belong together, or hold what cannot be."""
     m, tracks, evidence = len(found.image_index), found.tracks, found.evidence
-    height, width = found.pointmap_intrinsics.height, found.pointmap_intrinsics.width
     k, p = len(tracks.image), len(tracks.points_in_recon)
-    maps = found.points_in_recon.shape[1:3]  # none at all where no depth was made
     shapes = {
         "recon_from_camera": (found.recon_from_camera, (m, 4, 4)),
         "image_index": (found.image_index, (m,)),
-        "points_in_recon": (found.points_in_recon, (m, *maps, 3)),
-        "confidence": (found.confidence, (m, *maps)),
-        "colors": (found.colors, (m, *maps, 3)),
         "track_image": (tracks.image, (k,)),
         "track_x_px": (tracks.x_px, (k, 2)),
         "track_point": (tracks.point, (k,)),
@@ -145,17 +196,7 @@ def _check(found: Reconstruction) -> None:
     if evidence is not None:
         shapes["evidence_recon_from_camera"] = evidence.recon_from_camera, (m, 4, 4)
         shapes["evidence_covariance"] = evidence.covariance, (6 * m, 6 * m)
-    if found.reason is not None:
-        shapes["reason"] = found.reason, (m, *maps)
-    if found.depth_std is not None:
-        shapes["depth_std"] = found.depth_std, (m, *maps)
-    for name, (array, shape) in shapes.items():
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}, not {shape}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError(f"{name} holds NaN or infinity")
-    if maps not in ((height, width), (0, 0)):
-        raise ValueError(f"pointmaps of {maps}, their intrinsics of {(height, width)} pixels")
+    check_arrays(shapes)
     for name, index, end in (
         ("image_index", found.image_index, np.inf),
         ("track_image", tracks.image, m),

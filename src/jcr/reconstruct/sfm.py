@@ -32,7 +32,6 @@ from jcr.match.stage import Matched, Matcher, match_with_robot
 from jcr.match.verify import View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
-from jcr.reconstruct.depth.dense import SparseModel
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
     joined,
@@ -42,7 +41,7 @@ from jcr.reconstruct.placed import (
     retriangulated,
     shared_points,
 )
-from jcr.records import Intrinsics, Tracks
+from jcr.records import Intrinsics, Reconstruction, Tracks
 
 BYTES_OF_FEATURES = 330
 """Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
@@ -72,7 +71,7 @@ def structure_from_motion(
     features: FeatureName = "sift",
     base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
     names: Sequence[str] = (),
-) -> SparseModel:
+) -> Reconstruction:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
     With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes.
@@ -109,8 +108,14 @@ def structure_from_motion(
     motions = [model.image(row + 1).cam_from_world() for row in rows]
     camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
     tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
-    return SparseModel(
-        np.array(rows), inverse(camera_from_recon), lens, tracks, tuple(notes), matched.warnings
+    return Reconstruction(
+        image_index=np.array(rows),
+        recon_from_camera=inverse(camera_from_recon),
+        intrinsics=lens,
+        tracks=tracks,
+        backend="colmap",
+        notes=tuple(notes),
+        warnings=matched.warnings,
     )
 
 

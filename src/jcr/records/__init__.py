@@ -40,7 +40,16 @@ from jcr.records.capture import (
 )
 from jcr.records.cloud import PointCloud
 from jcr.records.findings import CAMERA, Finding, Kind, Mend, Severity, Verdict, strongest_first, verdict_of
-from jcr.records.reconstruction import BOTH, MATCHED, NO_DEPTH, PRIOR, CameraEvidence, Reconstruction, Tracks
+from jcr.records.reconstruction import (
+    BOTH,
+    MATCHED,
+    NO_DEPTH,
+    PRIOR,
+    CameraEvidence,
+    Pointmaps,
+    Reconstruction,
+    Tracks,
+)
 
 __all__ = [
     "AngleRatio",
@@ -76,6 +85,7 @@ __all__ = [
     "PaperResiduals",
     "Plan",
     "PointCloud",
+    "Pointmaps",
     "PosePairs",
     "Reconstruction",
     "Requirement",

@@ -1,6 +1,6 @@
 """What images alone give: camera poses, points, and pointmaps, up to one similarity."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
@@ -21,6 +21,8 @@ class Tracks:
     points_in_recon: Float[ndarray, "p 3"]
     from_pointmaps: bool = False
     """Matched between pointmaps, with errors that neighbours share, instead of found in the images."""
+    from_board: bool = False
+    """All on a board or tags: the scene rises above them."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +40,65 @@ NO_DEPTH, MATCHED, PRIOR, BOTH = 0, 1, 2, 3
 and the matched depths around it speak for; both."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Pointmaps:
+    """A surface point for every pixel of the registered images, a row an image."""
+
+    intrinsics: Intrinsics
+    """The undistorted pinhole grid of the pixels (size W x H)."""
+    points_in_recon: Float[ndarray, "m h w 3"]
+    confidence: Float[ndarray, "m h w"]
+    """At least 0; 0 means no estimate (the point may be anything, finite)."""
+    colors: UInt8[ndarray, "m h w 3"]
+    """RGB at the pixels."""
+    reason: UInt8[ndarray, "m h w"] | None = None
+    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: a network predicted all of them."""
+    depth_std: Float[ndarray, "m h w"] | None = None
+    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: unknown."""
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether a network predicted them, as part of the reconstruction."""
+        return self.reason is None
+
+    def of_rows(self, rows: Int[ndarray, " k"]) -> "Pointmaps":
+        """Those of some images, in the order of `rows`."""
+        return replace(
+            self,
+            points_in_recon=self.points_in_recon[rows],
+            confidence=self.confidence[rows],
+            colors=self.colors[rows],
+            reason=None if self.reason is None else self.reason[rows],
+            depth_std=None if self.depth_std is None else self.depth_std[rows],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Reconstruction:
-    """Camera poses and dense pointmaps in one frame, up to a similarity unless `is_metric`."""
+    """Camera poses, tracks and pointmaps in one frame, up to a similarity unless `is_metric`."""
 
     image_index: Int[ndarray, " m"]
     """Rows of the capture that were registered, ascending."""
     recon_from_camera: Float[ndarray, "m 4 4"]
     intrinsics: Intrinsics
     """Of the capture's original images: given, or estimated by the back end."""
-    pointmap_intrinsics: Intrinsics
-    """The undistorted pinhole grid in which the pointmaps live (size W x H)."""
-    points_in_recon: Float[ndarray, "m h w 3"]
-    confidence: Float[ndarray, "m h w"]
-    """At least 0; 0 means no estimate (the point may be anything, finite)."""
-    colors: UInt8[ndarray, "m h w 3"]
-    """RGB at the pointmap's pixels."""
     tracks: Tracks
     backend: str
+    pointmaps: Pointmaps | None = None
+    """Predicted by the back end's network, or estimated by the stage densify; None before it."""
     is_metric: bool = False
     """Whether the unit is meant to be the metre."""
     metric_std: float | None = None
-    """How well its unit is known to be a metre, relative one sigma; None: nobody vouches for it."""
+    """How well its unit is known to be a metre, relative one sigma; None: no standard deviation is given."""
     notes: tuple[str, ...] = ()
     """What was done: images not registered, matches left out."""
     warnings: tuple[str, ...] = ()
     """What the user must act on: intrinsics that cannot be used, a gripper pose that the images contradict."""
-    reason: UInt8[ndarray, "m h w"] | None = None
-    """NO_DEPTH, MATCHED, PRIOR or BOTH; None: all that is known was matched or predicted."""
-    depth_std: Float[ndarray, "m h w"] | None = None
-    """One sigma of the depth (z) at the pixels, in recon units, 0 without depth; None: not known."""
     evidence: CameraEvidence | None = None
     """In the same frame, where the robot's poses were used for `recon_from_camera` or cameras err beside them."""
+
+    @property
+    def dense(self) -> Pointmaps:
+        """The pointmaps, for what comes after densify."""
+        assert self.pointmaps is not None, "the stage densify comes first"
+        return self.pointmaps

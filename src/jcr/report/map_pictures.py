@@ -53,7 +53,7 @@ def _overlaid(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> s
     if cloud is None or len(tracked) == 0:
         return ""
     tracked = apply_similarity(hand_eye.base_from_recon, hand_eye.scale, tracked)
-    lens, side = reconstruction.pointmap_intrinsics, point_size(cloud.points_in_base)
+    lens, side = reconstruction.dense.intrinsics, point_size(cloud.points_in_base)
     red = np.tile(np.array(TRACK_COLOR, np.uint8), (len(tracked), 1))
     names = shown_names(result.calibration.images)
     figures = []
@@ -79,8 +79,8 @@ def _pairs(
     surface: SurfacePoints,
     base_from_camera: Float[ndarray, "m 4 4"],
 ) -> str:
-    reconstruction = result.reconstruction
-    lens = reconstruction.pointmap_intrinsics
+    reconstruction, dense = result.reconstruction, result.reconstruction.dense
+    lens = dense.intrinsics
     size = (THUMBNAIL, round(THUMBNAIL * lens.height / lens.width))
     used = np.flatnonzero(result.hand_eye.inliers)
     chosen = used[np.linspace(0, len(used) - 1, min(PAIRS, len(used))).round().astype(int)]
@@ -92,7 +92,7 @@ def _pairs(
         caption += "; the same by predicted label"
     figures = []
     for k in chosen:
-        photograph = cv2.resize(reconstruction.colors[k], size, interpolation=cv2.INTER_AREA)
+        photograph = cv2.resize(dense.colors[k], size, interpolation=cv2.INTER_AREA)
         x_in_camera = apply(inverse(base_from_camera[k]), surface.points_in_base)
         urls = [picture_url(photograph, "JPEG")]
         urls += [picture_url(rendered_points(x_in_camera, c, side, lens, THUMBNAIL), "WEBP") for c in colors]

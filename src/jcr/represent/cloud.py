@@ -28,10 +28,11 @@ def point_cloud(
     Raises InputError when no point passes the threshold.
     """
     options = options or CloudOptions()
-    confidence = reconstruction.confidence
+    dense = reconstruction.dense
+    confidence = dense.confidence
     keep = confidence > 0
     # Depths on a plane have passed tests of their own, and hardly any is wrong.
-    alone = keep if reconstruction.reason is None else keep & (reconstruction.reason == MATCHED)
+    alone = keep if dense.reason is None else keep & (dense.reason == MATCHED)
     if options.confidence_threshold is not None:
         keep &= confidence >= options.confidence_threshold
     elif alone.any():
@@ -49,12 +50,12 @@ def point_cloud(
 
     image = pixel // confidence[0].size
     confident = confidence.reshape(-1)[pixel].astype(np.float64)
-    reason = None if reconstruction.reason is None else reconstruction.reason.reshape(-1)[pixel]
-    x_in_recon = reconstruction.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
+    reason = None if dense.reason is None else dense.reason.reshape(-1)[pixel]
+    x_in_recon = dense.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
     recon_from_camera = scale_translation(reconstruction.recon_from_camera, hand_eye.scale)
     return PointCloud(
         points_in_base=apply_similarity(hand_eye.base_from_recon, hand_eye.scale, x_in_recon),
-        color=reconstruction.colors.reshape(-1, 3)[pixel],
+        color=dense.colors.reshape(-1, 3)[pixel],
         confidence=confident,
         margin=position_std(hand_eye, recon_from_camera, image, hand_eye.scale * x_in_recon),
         label=np.zeros(len(pixel), int) if labels is None else labels.reshape(-1)[pixel].astype(int),
@@ -63,8 +64,8 @@ def point_cloud(
         label_names=label_names,
         reason=reason,
         depth_std=None
-        if reconstruction.depth_std is None
-        else hand_eye.scale * reconstruction.depth_std.reshape(-1)[pixel].astype(np.float64),
+        if dense.depth_std is None
+        else hand_eye.scale * dense.depth_std.reshape(-1)[pixel].astype(np.float64),
         clears=None
         if reason is None
         else _clears(reason, confident, reconstruction.image_index[image] >= len(capture)),

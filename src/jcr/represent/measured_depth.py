@@ -41,25 +41,14 @@ def with_measured_depth(
             f"the depth images are not used: their lengths are {check.off_percent:+.0f} % off by the robot; they must "
             "be in mm and aligned with the colour images",
         )
-    std = (
-        np.zeros_like(reconstruction.confidence)
-        if reconstruction.depth_std is None
-        else reconstruction.depth_std
-    )
-    points, confidence, std = (
-        reconstruction.points_in_recon.copy(),
-        reconstruction.confidence.copy(),
-        std.copy(),
-    )
+    dense = reconstruction.dense
+    points, confidence = dense.points_in_recon.copy(), dense.confidence.copy()
+    std = np.zeros_like(confidence) if dense.depth_std is None else dense.depth_std.copy()
     known = confidence > 0
-    reason = (
-        np.where(known, MATCHED, 0).astype(np.uint8)
-        if reconstruction.reason is None
-        else reconstruction.reason.copy()
-    )
+    reason = np.where(known, MATCHED, 0).astype(np.uint8) if dense.reason is None else dense.reason.copy()
     usual = float(np.median(confidence[known])) if known.any() else 1.0
     against = both = 0
-    ray = rays(reconstruction.pointmap_intrinsics)
+    ray = rays(dense.intrinsics)
     at = np.rint(project(reconstruction.intrinsics, ray)).astype(int)
     for k, row in enumerate(reconstruction.image_index):
         if row >= len(capture.depths) or (name := capture.depths[row]) is None:
@@ -89,10 +78,8 @@ def with_measured_depth(
             f"measured and matched depth differ at {100 * against / both:.0f} % of the pixels that have both; there the "
             "matched one is kept",
         )
-    found = replace(
-        reconstruction, points_in_recon=points, confidence=confidence, depth_std=std, reason=reason
-    )
-    return found, notes
+    measured = replace(dense, points_in_recon=points, confidence=confidence, depth_std=std, reason=reason)
+    return replace(reconstruction, pointmaps=measured), notes
 
 
 def _sampled(depth: Float[ndarray, "h w"], at: ndarray) -> tuple[Float[ndarray, "p q"], Bool[ndarray, "p q"]]:

@@ -39,7 +39,7 @@ def read_labels(capture: Capture, reconstruction: Reconstruction) -> LabelImages
     stack = []
     for row in reconstruction.image_index:
         if row >= len(capture):  # added to the run later
-            stack.append(np.zeros(reconstruction.confidence.shape[1:], np.int64))
+            stack.append(np.zeros(reconstruction.dense.confidence.shape[1:], np.int64))
             continue
         label = _read(folder / f"{Path(capture.images[row]).stem}.png", capture, capture.images[row])
         stack.append(_on_pointmap(label, reconstruction))
@@ -71,7 +71,7 @@ def _read(path: Path, capture: Capture, image: str) -> Int[ndarray, "h w"]:
 
 def _on_pointmap(label: Int[ndarray, "h w"], reconstruction: Reconstruction) -> Int[ndarray, "r c"]:
     """The label nearest to where each pixel of the pointmap lies in the capture's image."""
-    camera, grid = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
+    camera, grid = reconstruction.intrinsics, reconstruction.dense.intrinsics
     x_px, y_px = np.moveaxis(project(camera, rays(grid)).astype(np.float32), -1, 0)
     nearest = cv2.remap(label.astype(np.uint16), x_px, y_px, cv2.INTER_NEAREST, borderValue=0)
     return nearest.astype(np.int64)

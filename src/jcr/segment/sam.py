@@ -67,15 +67,15 @@ def sam_labels(
     model: "Sam2Model", reconstruction: Reconstruction, hand_eye: HandEye, progress: Progress | None = None
 ) -> LabelImages:
     """Labels at the pointmaps' pixels: masks of all images, merged into objects by their overlap in space."""
-    masks = []
-    for k, image in enumerate(reconstruction.colors):
+    masks, dense = [], reconstruction.dense
+    for k, image in enumerate(dense.colors):
         if progress:
-            progress("segment anything", k / len(reconstruction.colors))
+            progress("segment anything", k / len(dense.colors))
         masks.append(image_masks(model, image))
     x_in_base = apply_similarity(
-        hand_eye.base_from_recon, hand_eye.scale, reconstruction.points_in_recon.astype(np.float64)
+        hand_eye.base_from_recon, hand_eye.scale, dense.points_in_recon.astype(np.float64)
     )
-    return merged(masks, x_in_base, reconstruction.confidence > 0)
+    return merged(masks, x_in_base, dense.confidence > 0)
 
 
 @torch.no_grad()

@@ -8,14 +8,19 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.calibration.calibration_json import CalibrationFile
+from jcr.camera import pinhole_inside
+from jcr.depth.densify import undistorted
+from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
 from jcr.geometry import apply_similarity, inverse, scale_translation
-from jcr.records import Intrinsics, PointCloud, Reconstruction
+from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
 from jcr.represent.scene import SceneMap
 from jcr.run_folder import RunFolder
 
 CLOUD_POINTS = 200_000
 """Of pointmaps that no map was made of yet, at most."""
+GREY = 128
+"""Of images that are not to be had."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ def read_run(out: Path) -> ViewedRun:
     assert calibration.scale is not None  # wherever there is a transform
     base_from_recon, scale = np.array(calibration.base_from_recon), calibration.scale
     base_from_camera = base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale)
-    notes = []
+    notes, capture = [], None
     try:
         capture = folder.capture()
         base_from_gripper, gripper_image = capture.base_from_gripper, np.arange(len(capture))
@@ -59,6 +64,7 @@ def read_run(out: Path) -> ViewedRun:
         base_from_gripper = base_from_camera @ inverse(np.array(calibration.gripper_from_camera))
         gripper_image = reconstruction.image_index
         notes.append(f"grippers stand where the calibration puts them, not where the robot did: {error}")
+    lens, pictures = _pictures(reconstruction, capture)
     scene = None
     if folder.has_map():
         scene = folder.scene()
@@ -71,8 +77,8 @@ def read_run(out: Path) -> ViewedRun:
         base_from_camera=base_from_camera,
         base_from_gripper=base_from_gripper,
         gripper_image=gripper_image,
-        lens=reconstruction.pointmap_intrinsics,
-        pictures=reconstruction.colors,
+        lens=lens,
+        pictures=pictures,
         tracks_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
         cloud=_pointmap_cloud(reconstruction, base_from_camera, base_from_recon, scale)
         if scene is None
@@ -82,23 +88,48 @@ def read_run(out: Path) -> ViewedRun:
     )
 
 
+def _pictures(
+    reconstruction: Reconstruction, capture: Capture | None
+) -> tuple[Intrinsics, UInt8[ndarray, "m h w 3"]]:
+    """The registered images without distortion, and their camera; grey where neither run nor capture has them."""
+    if (dense := reconstruction.pointmaps) is not None:
+        return dense.intrinsics, dense.colors
+    if capture is not None:
+        names = [capture.images[row] for row in reconstruction.image_index]
+        return undistorted(capture.folder, names, reconstruction.intrinsics)
+    pinhole = pinhole_inside(reconstruction.intrinsics, DepthOptions.pointmap_size_px)
+    shape = len(reconstruction.image_index), pinhole.height, pinhole.width, 3
+    return pinhole, np.full(shape, GREY, np.uint8)
+
+
 def _pointmap_cloud(
     reconstruction: Reconstruction,
     base_from_camera: Float[ndarray, "m 4 4"],
     base_from_recon: Float[ndarray, "4 4"],
     scale: float,
 ) -> PointCloud:
-    """All points with any confidence, thinned; without margins."""
-    pixel = np.flatnonzero(reconstruction.confidence > 0)
+    """All points with any confidence, thinned, without margins; none before there is dense depth."""
+    if (dense := reconstruction.pointmaps) is None:
+        nothing = np.zeros(0)
+        return PointCloud(
+            points_in_base=np.zeros((0, 3)),
+            color=np.zeros((0, 3), np.uint8),
+            confidence=nothing,
+            margin=nothing,
+            label=np.zeros(0, int),
+            image=np.zeros(0, int),
+            camera_centers_in_base=base_from_camera[:, :3, 3],
+        )
+    pixel = np.flatnonzero(dense.confidence > 0)
     if len(pixel) > CLOUD_POINTS:
         pixel = np.random.default_rng(0).choice(pixel, CLOUD_POINTS, replace=False)
-    points = reconstruction.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
+    points = dense.points_in_recon.reshape(-1, 3)[pixel].astype(np.float64)
     return PointCloud(
         points_in_base=apply_similarity(base_from_recon, scale, points),
-        color=reconstruction.colors.reshape(-1, 3)[pixel],
-        confidence=reconstruction.confidence.reshape(-1)[pixel].astype(np.float64),
+        color=dense.colors.reshape(-1, 3)[pixel],
+        confidence=dense.confidence.reshape(-1)[pixel].astype(np.float64),
         margin=np.full(len(pixel), np.nan),
         label=np.zeros(len(pixel), int),
-        image=pixel // max(reconstruction.confidence[0].size, 1) if len(reconstruction.confidence) else pixel,
+        image=pixel // dense.confidence[0].size if len(dense.confidence) else pixel,
         camera_centers_in_base=base_from_camera[:, :3, 3],
     )

@@ -13,7 +13,7 @@ from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
 from jcr.reconstruct.direct.coarse_to_fine import axes_meet, free_directions, moved
-from jcr.reconstruct.direct.direct import DirectOptions, evening, pyramid, reconstruct
+from jcr.reconstruct.direct.direct import evening, pyramid, reconstruct
 from jcr.reconstruct.direct.photometric import (
     Cameras,
     Level,
@@ -30,8 +30,6 @@ from jcr.simulate.truth import read_truth
 
 pytestmark = pytest.mark.slow
 
-SPARSE = DirectOptions(dense=False)
-
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
@@ -45,7 +43,7 @@ def plain(tmp_path_factory):
 
 def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     capture, truth = plain
-    reconstruction = reconstruct(capture, SPARSE)
+    reconstruction = reconstruct(capture)
     hand_eye = calibrate(capture, reconstruction)
     assert hand_eye.converged and hand_eye.inliers.all()
     missed = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
@@ -63,7 +61,7 @@ def test_a_picture_of_another_pose_is_left_out_and_named(plain):
     capture, truth = plain
     poses = capture.base_from_gripper.copy()
     poses[4] = poses[0]
-    reconstruction = reconstruct(replace(capture, base_from_gripper=poses), SPARSE)
+    reconstruction = reconstruct(replace(capture, base_from_gripper=poses))
     assert reconstruction.image_index.tolist() == [0, 1, 2, 3, 5]
     assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
     x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
@@ -78,7 +76,7 @@ def test_pictures_of_other_poses_are_refused(plain):
         intrinsics=truth.intrinsics,
     )
     with pytest.raises(NotTrustedError, match="direct alignment"):
-        reconstruct(mixed, SPARSE)
+        reconstruct(mixed)
 
 
 def test_images_of_different_exposure_are_evened(plain):
@@ -99,14 +97,14 @@ def test_pictures_of_nothing_are_refused(plain, tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.new("RGB", capture.image_size, (120, 110, 100)).save(tmp_path / name)
     with pytest.raises(NotTrustedError, match="one colour"):
-        reconstruct(replace(capture, folder=tmp_path), SPARSE)
+        reconstruct(replace(capture, folder=tmp_path))
 
 
 def test_two_images_are_too_few(plain):
     capture, _ = plain
     two = replace(capture, images=capture.images[:2], base_from_gripper=capture.base_from_gripper[:2])
     with pytest.raises(InputError, match="3 images or more"):
-        reconstruct(two, SPARSE)
+        reconstruct(two)
 
 
 def test_one_start_looks_where_the_camera_does(plain):

@@ -135,7 +135,7 @@ def test_matches_by_colour_put_predicted_cameras_right_and_say_how_surely(captur
     assert 0.3 < scale * np.sqrt((std[1:, :3] ** 2).mean()) / np.sqrt((off**2).mean()) < 4
 
     # The depth is bent back: the plane is one plane.
-    in_base = apply_similarity(base, scale, found.points_in_recon.reshape(-1, 3).astype(float))
+    in_base = apply_similarity(base, scale, found.dense.points_in_recon.reshape(-1, 3).astype(float))
     assert np.abs(in_base[:, 2]).max() < 4e-3, "20 mm as predicted"
 
     hand_eye = calibrate(capture, found)
@@ -218,15 +218,10 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
     image, point = np.nonzero(inside)
     recon_from_camera = truth.copy()
     recon_from_camera[:, :3, 3] *= unit
-    nothing = np.zeros((COUNT, 2, 2))
     sparse = Reconstruction(
         image_index=np.arange(COUNT),
         recon_from_camera=recon_from_camera,
         intrinsics=LENS,
-        pointmap_intrinsics=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 2),
-        points_in_recon=np.zeros((COUNT, 2, 2, 3)),
-        confidence=nothing,
-        colors=np.zeros((COUNT, 2, 2, 3), np.uint8),
         tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
         backend="colmap",
     )
@@ -243,6 +238,6 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
     assert found.is_metric and scale == pytest.approx(1 / 1.1, rel=0.02), (
         "its metre is kept, to be held against the robot's"
     )
-    in_base = apply_similarity(base, float(scale), found.points_in_recon.reshape(-1, 3).astype(float))
+    in_base = apply_similarity(base, float(scale), found.dense.points_in_recon.reshape(-1, 3).astype(float))
     assert np.median(np.abs(in_base[:, 2])) < 1e-3, "10 mm as predicted"
     assert len(found.tracks.image) == len(image)

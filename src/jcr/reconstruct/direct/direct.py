@@ -8,12 +8,11 @@ pixels high.
 From there coarse to fine, with a depth for each of a few thousand pixels; in the end every camera moves by itself, so
 that what disagrees with the robot's motion shows.
 
-Pointmaps are matched near edges; plain surfaces between them are filled with planes (depth/priors.py).
+Pointmaps are matched near edges; plain surfaces between them are filled with planes (jcr/depth/priors.py).
 The page `plain-tables` says when, and what it gives.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -23,8 +22,8 @@ from jcr.camera import pinhole_inside, project, undistort_image, unproject, usab
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, step_axes
+from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.depth.dense import DenseOptions, SparseModel, plan_memory, with_pointmaps
 from jcr.reconstruct.direct.coarse_to_fine import Stage, aligned, free_directions, tied_directions
 from jcr.reconstruct.direct.photometric import (
     Cameras,
@@ -62,13 +61,8 @@ REGION = 0.05
 """m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DirectOptions(DenseOptions):
-    """Alignment by colour."""
-
-
 def reconstruct(
-    capture: Capture, options: DirectOptions | None = None, progress: Progress | None = None
+    capture: Capture, progress: Progress | None = None, *, memory_gb: float = 8.0
 ) -> Reconstruction:
     """Camera poses by the colours of a capture's images, with the robot's poses to start from.
 
@@ -78,8 +72,8 @@ def reconstruct(
     """
     if len(capture) < 3:
         raise InputError(f"direct alignment needs 3 images or more, there are {len(capture)}; take more")
-    options, report = options or DirectOptions(), progress or silent
-    plan_memory(len(capture), capture.image_size, options)
+    report = progress or silent
+    plan(len(capture), capture.image_size, memory_gb)
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_lens(capture.intrinsics)
     notes: tuple[str, ...] = ()
@@ -94,7 +88,6 @@ def reconstruct(
         names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
         notes = (f"direct alignment: left out, for they fit nowhere near their poses: {names}",)
         levels = {height: level.rows(rows) for height, level in levels.items()}
-        images = [images[k] for k in rows]
     for k, stage in enumerate(FREED):
         report("direct alignment", 0.7 + 0.1 * k)
         cameras, _ = aligned(levels[stage.height], cameras, stage, free_directions(cameras, held))
@@ -111,9 +104,16 @@ def reconstruct(
     lens = zoomed(lens, cameras.zoom)
     tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
     recon_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
-    sparse = SparseModel(rows, recon_from_camera, lens, tracks, notes, warnings)
-    reconstruction = with_pointmaps(sparse, images, options, report, backend="direct")
-    return replace(reconstruction, evidence=CameraEvidence(recon_from_camera, covariance))
+    return Reconstruction(
+        image_index=rows,
+        recon_from_camera=recon_from_camera,
+        intrinsics=lens,
+        tracks=tracks,
+        backend="direct",
+        notes=notes,
+        warnings=warnings,
+        evidence=CameraEvidence(recon_from_camera, covariance),
+    )
 
 
 def evening(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:

@@ -19,7 +19,7 @@ from jcr.reconstruct.preprocess import ImageGrid, prepare_images, resize_and_cro
 from jcr.reconstruct.views_at_once.interface import Predict, Views
 from jcr.reconstruct.views_at_once.refine import depth_changes, smooth_factor
 from jcr.reconstruct.views_at_once.views_at_once import loaded, with_known_rays
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, Pointmaps, Reconstruction
 
 LEAST_POINTS = 5
 """Of structure from motion, in a view; with fewer its depth has the unit of the others."""
@@ -85,10 +85,12 @@ def reconstruct(
     return replace(
         sparse,
         recon_from_camera=poses,
-        pointmap_intrinsics=grid.grid_intrinsics(images.pinhole),
-        points_in_recon=np.where(there[..., None], points, 0).astype(np.float32),
-        confidence=predicted.confidence,
-        colors=np.stack([resize_and_crop(image, grid) for image in images.colors]),
+        pointmaps=Pointmaps(
+            intrinsics=grid.grid_intrinsics(images.pinhole),
+            points_in_recon=np.where(there[..., None], points, 0).astype(np.float32),
+            confidence=predicted.confidence,
+            colors=np.stack([resize_and_crop(image, grid) for image in images.colors]),
+        ),
         tracks=replace(sparse.tracks, points_in_recon=unit * sparse.tracks.points_in_recon),
         backend=options.backend,
         is_metric=predicted.is_metric,

@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from jcr.camera import project, rays, unproject
 from jcr.errors import InputError
-from jcr.geometry import ARM, apply, inverse, rotation_angle
+from jcr.geometry import apply, inverse, rotation_angle
 from jcr.handeye.solve import solve_hand_eye
 from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
@@ -28,7 +28,7 @@ from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, prepare_images
 from jcr.reconstruct.views_at_once.cost import Cost
 from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
 from jcr.reconstruct.views_at_once.refine import Refined, refine
-from jcr.records import CameraEvidence, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import CameraEvidence, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 PREDICTED_STD = (0.02, np.radians(1.5))
 """Of a predicted camera that no match confirms: of its distance from the scene, and of its rotation per axis. What Depth
@@ -82,12 +82,10 @@ class _Candidate:
         return self.predicted.x_in_camera * factor
 
     @property
-    def missed_m(self) -> float:
-        """Error on images left out as one length; infinite where there are too few to leave one out."""
+    def leave_one_out_m(self) -> float:
+        """The leave-one-out error as one length; infinite where there are too few to leave one out."""
         held_out = self.hand_eye.held_out
-        if held_out is None:
-            return float("inf")
-        return float(np.hypot(held_out.translation_mm / 1e3, ARM * np.radians(held_out.rotation_deg)))
+        return float("inf") if held_out is None else held_out.length_m
 
     def told(self) -> str:
         held_out = self.hand_eye.held_out
@@ -183,7 +181,9 @@ def _refined(
         return as_predicted, (note,), _contradicted(capture, as_predicted, pinhole)
     adjusted = _candidate("refined", gripper, predicted, refined)
     kept, left = (
-        (adjusted, as_predicted) if adjusted.missed_m < as_predicted.missed_m else (as_predicted, adjusted)
+        (adjusted, as_predicted)
+        if adjusted.leave_one_out_m < as_predicted.leave_one_out_m
+        else (as_predicted, adjusted)
     )
     note = (
         f"leave-one-out error of the cameras {kept.told()} ({left.told()}): the former were kept; "
@@ -393,10 +393,12 @@ def _record(
         image_index=np.arange(len(capture)),
         recon_from_camera=poses,
         intrinsics=images.lens or refined.pinhole,
-        pointmap_intrinsics=grid.grid_intrinsics(pinhole or refined.pinhole),
-        points_in_recon=x_in_recon,
-        confidence=predicted.confidence,
-        colors=shown.colors,
+        pointmaps=Pointmaps(
+            intrinsics=grid.grid_intrinsics(pinhole or refined.pinhole),
+            points_in_recon=x_in_recon,
+            confidence=predicted.confidence,
+            colors=shown.colors,
+        ),
         tracks=refined.tracks,
         backend=options.backend,
         is_metric=predicted.is_metric,

@@ -14,12 +14,12 @@ from numpy import ndarray
 
 from jcr.camera import project, undistort_image
 from jcr.capture.images import read_image
+from jcr.depth.dense import dense_pointmaps
+from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, scale_translation
 from jcr.progress import Progress
-from jcr.reconstruct.depth.dense import dense_pointmaps
-from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
-from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Reconstruction, Tracks
+from jcr.records import MATCHED, NO_DEPTH, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 NEIGHBOURS = 6
 """Images that a new one is compared with; at most half of them are other new ones."""
@@ -45,7 +45,8 @@ def extend(
     an earlier one, the earlier's confidence is 0. Raises InputError for an image that shares no view with the
     others.
     """
-    lens, pinhole = reconstruction.intrinsics, reconstruction.pointmap_intrinsics
+    dense, lens = reconstruction.dense, reconstruction.intrinsics
+    pinhole = dense.intrinsics
     base_from_camera = added.base_from_gripper @ hand_eye.gripper_from_camera
     recon_from_new = scale_translation(
         inverse(hand_eye.base_from_recon) @ base_from_camera, 1 / hand_eye.scale
@@ -53,7 +54,7 @@ def extend(
     old, new = len(reconstruction.recon_from_camera), len(added)
     recon_from_camera = np.concatenate([reconstruction.recon_from_camera, recon_from_new])
     pictures = [undistort_image(read_image(added.folder / name), lens, pinhole) for name in added.images]
-    colors = np.concatenate([reconstruction.colors, np.stack(pictures)])
+    colors = np.concatenate([dense.colors, np.stack(pictures)])
     tracks = _with_projections(reconstruction.tracks, recon_from_new, pinhole, old)
 
     near = choose_neighbours(tracks, recon_from_camera, old + new - 1)
@@ -68,7 +69,7 @@ def extend(
         neighbours[row] = near[row][np.isin(near[row], taken)][:NEIGHBOURS]
     planes = sweep_planes(tracks, recon_from_camera)
     middle = planes.mean(1, keepdims=True)
-    dense = dense_pointmaps(
+    found = dense_pointmaps(
         colors[taken],
         recon_from_camera[taken],
         pinhole,
@@ -78,7 +79,7 @@ def extend(
         changing=True,
         memory_gb=memory_gb,
     )
-    points, confidence = dense.points_in_recon[-new:], dense.confidence[-new:]
+    points, confidence = found.points_in_recon[-new:], found.confidence[-new:]
     for name, of_image in zip(added.images, confidence, strict=True):
         if (of_image > 0).mean() < LEAST_SHARE:
             raise InputError(
@@ -86,14 +87,14 @@ def extend(
                 "that other images show"
             )
     # In the unit of the back end's own confidence, so that one threshold serves both.
-    known = reconstruction.confidence[reconstruction.confidence > 0]
+    known = dense.confidence[dense.confidence > 0]
     if len(known):
         confidence = confidence * (np.median(known) / np.median(confidence[confidence > 0]))
-    reason, std = reconstruction.reason, reconstruction.depth_std
+    reason, std = dense.reason, dense.depth_std
     if reason is None:
-        reason = np.where(reconstruction.confidence > 0, MATCHED, NO_DEPTH).astype(np.uint8)
-    points = np.concatenate([reconstruction.points_in_recon, points])
-    confidence = np.concatenate([reconstruction.confidence, confidence])
+        reason = np.where(dense.confidence > 0, MATCHED, NO_DEPTH).astype(np.uint8)
+    points = np.concatenate([dense.points_in_recon, points])
+    confidence = np.concatenate([dense.confidence, confidence])
     camera_from_recon = inverse(recon_from_camera)
     for later in range(old, old + new):
         for earlier in range(later):
@@ -107,11 +108,14 @@ def extend(
         reconstruction,
         image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
         recon_from_camera=recon_from_camera,
-        points_in_recon=points,
-        confidence=confidence,
-        colors=colors,
-        reason=np.concatenate([reason, dense.reason[-new:]]),
-        depth_std=None if std is None else np.concatenate([std, dense.depth_std[-new:]]),
+        pointmaps=Pointmaps(
+            intrinsics=pinhole,
+            points_in_recon=points,
+            confidence=confidence,
+            colors=colors,
+            reason=np.concatenate([reason, found.reason[-new:]]),
+            depth_std=None if std is None else np.concatenate([std, found.depth_std[-new:]]),
+        ),
     )
 
 

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.reconstruct.depth.consistency import colours_agree
-from jcr.reconstruct.depth.matched import Relative, grid
-from jcr.reconstruct.depth.regions import FEWEST, colour_regions, region_planes
+from jcr.depth.consistency import colours_agree
+from jcr.depth.matched import Relative, grid
+from jcr.depth.regions import FEWEST, colour_regions, region_planes
 from jcr.records import Intrinsics
 
 ON_PLANE = 0.006

@@ -10,8 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.geometry import inverse
-from jcr.reconstruct.depth.patch_match import (
+from jcr.depth.patch_match import (
     PAD,
     best_neighbours,
     inverse_depths,
@@ -21,6 +20,7 @@ from jcr.reconstruct.depth.patch_match import (
     to_the_peak,
     window_weights,
 )
+from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
 COMPARED = 5

@@ -14,13 +14,15 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jcr.camera import rays
+from jcr.capture.images import encode_png
+from jcr.depth.densify import densify
+from jcr.depth.options import DepthOptions
+from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.reconstruct.backends import ReconstructOptions, with_depth_of
-from jcr.reconstruct.depth.views import choose_neighbours, sweep_planes
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
 
 if TYPE_CHECKING:
-    from jcr.reconstruct.depth.dense import DenseDepth
+    from jcr.depth.dense import DenseDepth
 
 pytestmark = pytest.mark.slow
 
@@ -112,7 +114,7 @@ def dense(scene: Scene) -> "DenseDepth":
 
 
 def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: Any) -> "DenseDepth":
-    from jcr.reconstruct.depth.dense import dense_pointmaps
+    from jcr.depth.dense import dense_pointmaps
 
     neighbours = choose_neighbours(tracks, recon_from_camera, 6)
     planes = sweep_planes(tracks, recon_from_camera)
@@ -153,7 +155,7 @@ def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: "
 
 def test_windows_lie_on_slopes() -> None:
     """A plane that falls away at 65 degrees, seen by three cameras side by side; the search starts from others."""
-    from jcr.reconstruct.depth.matched import match_depth
+    from jcr.depth.matched import match_depth
 
     normal = np.array([0.0, -np.sin(np.radians(65)), -np.cos(np.radians(65))])
     rng = np.random.default_rng(0)
@@ -185,7 +187,7 @@ MATCH_NOISE = """
 import hashlib
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from jcr.reconstruct.depth.matched import match_depth
+from jcr.depth.matched import match_depth
 from jcr.records import Intrinsics
 texture = gaussian_filter(np.random.default_rng(0).uniform(0, 255, (60, 120, 3)), (1.5, 1.5, 0))
 images = np.stack([texture[:, 10 * k : 10 * k + 80] for k in range(3)]).astype(np.uint8)
@@ -210,8 +212,8 @@ def test_loops_give_the_same_bits_freshly_compiled_and_from_the_cache(tmp_path: 
 
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
-    from jcr.reconstruct.depth.consistency import agreement
-    from jcr.reconstruct.depth.matched import grid, relative
+    from jcr.depth.consistency import agreement
+    from jcr.depth.matched import grid, relative
 
     poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
     inverse_depth = np.ones((4, PINHOLE.height, PINHOLE.width), np.float32)
@@ -290,33 +292,30 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: "DenseDepth
     assert np.median(np.abs(other.depth_std[both] / scale / dense.depth_std[both] - 1)) < 1e-2
 
 
-def test_depth_made_later_is_what_it_would_have_been(scene: Scene, dense: "DenseDepth") -> None:
-    """Of a record in the capture's order, whose names sort otherwise; and what has depth is left as it is."""
+def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
+    scene: Scene, dense: "DenseDepth", tmp_path: Path
+) -> None:
+    """Of images whose names sort otherwise than the capture's frames; and what has pointmaps is left as it is."""
     order = np.array([3, 0, 6, 1, 5, 2, 4])  # row k of the capture is row order[k] by name
     names = tuple(f"{k}.png" for k in order)
-    capture = Capture(Path(), names, scene.recon_from_camera[order], (PINHOLE.width, PINHOLE.height))
-    nothing = np.zeros(scene.depth.shape, np.float32)
+    for name, image in zip(names, scene.images[order], strict=True):
+        (tmp_path / name).write_bytes(encode_png(image))
+    capture = Capture(tmp_path, names, scene.recon_from_camera[order], (PINHOLE.width, PINHOLE.height))
     by_name = np.argsort(order)
     sparse = Reconstruction(
         image_index=np.arange(7),
         recon_from_camera=scene.recon_from_camera[order],
         intrinsics=PINHOLE,
-        pointmap_intrinsics=PINHOLE,
-        points_in_recon=np.zeros(scene.images.shape, np.float32),
-        confidence=nothing,
-        colors=scene.images[order],
         tracks=replace(scene.tracks, image=by_name[scene.tracks.image]),
         backend="colmap",
-        reason=nothing.astype(np.uint8),
-        depth_std=nothing,
     )
-    made = with_depth_of(capture, sparse, ReconstructOptions())
-    np.testing.assert_array_equal(made.image_index, sparse.image_index)
-    np.testing.assert_array_equal(made.recon_from_camera, sparse.recon_from_camera)
+    made = densify(capture, sparse, DepthOptions(pointmap_size_px=PINHOLE.width))
+    assert made.dense.intrinsics == PINHOLE and not made.dense.is_predicted
+    np.testing.assert_array_equal(made.dense.colors, scene.images[order])
     np.testing.assert_array_equal(made.tracks.image, sparse.tracks.image)
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
-        np.testing.assert_array_equal(getattr(made, name)[by_name], getattr(dense, name))
-    assert with_depth_of(capture, made, ReconstructOptions()) is made
+        np.testing.assert_array_equal(getattr(made.dense, name)[by_name], getattr(dense, name))
+    assert densify(capture, made) is made
 
 
 def test_planes_take_the_slope_of_the_table(scene: Scene) -> None:

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
+from jcr.depth.consistency import agreement
+from jcr.depth.matched import grid, relative
+from jcr.depth.priors import ON_PLANE, Prior, evened, planar_prior, support_plane
 from jcr.geometry import apply
-from jcr.reconstruct.depth.consistency import agreement
-from jcr.reconstruct.depth.matched import grid, relative
-from jcr.reconstruct.depth.priors import ON_PLANE, Prior, evened, planar_prior, support_plane
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
 
 LEAST_CORRELATION = 0.3

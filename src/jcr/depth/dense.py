@@ -1,0 +1,85 @@
+"""Dense pointmaps of images whose cameras are known, whichever back end found them."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.camera import rays
+from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD
+from jcr.extras import extra
+from jcr.memory import ALLOWANCE, GB, relieve, resident
+from jcr.progress import Progress
+from jcr.records import Intrinsics
+
+
+@dataclass(frozen=True)
+class DenseDepth:
+    """Depth of every pixel of undistorted images, and what it rests on."""
+
+    points_in_recon: Float[ndarray, "m h w 3"]
+    confidence: Float[ndarray, "m h w"]
+    """Correlation times the number of images that agree; 0 for no estimate."""
+    reason: UInt8[ndarray, "m h w"]
+    """NO_DEPTH, MATCHED, PRIOR or BOTH of `jcr.records`."""
+    depth_std: Float[ndarray, "m h w"]
+    """One sigma of the depth (z), in recon units."""
+
+
+def dense_pointmaps(
+    colors: UInt8[ndarray, "m h w 3"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    pinhole: Intrinsics,
+    neighbours: Sequence[Int[ndarray, " _"]],
+    planes: Float[ndarray, "m d 3"],
+    report: Progress,
+    *,
+    changing: bool = False,
+    priors: bool = True,
+    memory_gb: float = 8.0,
+) -> DenseDepth:
+    """Points in the recon frame, per pixel of undistorted images, with confidence, reason and sigma.
+
+    `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times, one that sees
+    through a point of another may show what was there before, and nothing is filled by `priors`.
+    """
+    extra("numba", "map", "dense depth")
+    from jcr.depth.fused import fused_depth
+    from jcr.depth.matched import match_depth
+
+    pixels = pinhole.width * pinhole.height
+    room = memory_gb * GB - resident() - ALLOWANCE - len(colors) * pixels * BYTES_OF_RESULT
+    threads = max(1, min(os.cpu_count() or 1, int(room // (pixels * BYTES_OF_THREAD))))
+
+    def progress(start: float, share: float) -> Callable[[float], None]:
+        def told(fraction: float) -> None:
+            relieve(memory_gb * GB)
+            report("dense depth", start + share * fraction)
+
+        return told
+
+    inverse_depth, score = match_depth(
+        colors, recon_from_camera, pinhole, neighbours, planes, threads, progress(0.0, 0.7)
+    )
+    found = fused_depth(
+        colors,
+        recon_from_camera,
+        pinhole,
+        neighbours,
+        inverse_depth,
+        score,
+        changing=changing,
+        priors=priors and not changing,
+        threads=threads,
+        report=progress(0.7, 0.3),
+    )
+    depth = 1 / found.inverse_depth.astype(np.float64)
+    points = np.empty((*depth.shape, 3))
+    for k, pose in enumerate(recon_from_camera):
+        points[k] = np.einsum("ij,hwj->hwi", pose[:3, :3], depth[k, ..., None] * rays(pinhole)) + pose[:3, 3]
+    return DenseDepth(
+        points, found.confidence.astype(np.float64), found.reason, (found.std * depth).astype(np.float32)
+    )

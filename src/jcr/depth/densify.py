@@ -1,0 +1,117 @@
+"""The stage densify: a reconstruction's cameras and tracks to dense pointmaps, whichever back end found them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from jcr.camera import pinhole_inside, undistort_image
+from jcr.capture.images import read_image
+from jcr.depth.dense import dense_pointmaps
+from jcr.depth.options import DepthOptions
+from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD, choose_neighbours, sweep_planes
+from jcr.extras import extra
+from jcr.memory import plan
+from jcr.progress import Progress, silent
+from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+
+RISE = 0.4
+"""Share of a camera's distance to a board that things beside it may rise towards the camera."""
+BOARD_PLANES = 96
+"""Of a sweep through that room."""
+
+
+def densify(
+    capture: Capture,
+    reconstruction: Reconstruction,
+    options: DepthOptions | None = None,
+    progress: Progress | None = None,
+    *,
+    memory_gb: float = 8.0,
+) -> Reconstruction:
+    """The reconstruction with pointmaps of its images; those that it has, predicted by a network, stay as they are.
+
+    Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration. A smaller budget
+    changes the time, and no bit. Raises InputError where an image cannot be read, or numba is not installed.
+    """
+    if reconstruction.pointmaps is not None:
+        return reconstruction
+    options = options or DepthOptions()
+    names = np.array([capture.images[row] for row in reconstruction.image_index])
+    order = np.argsort(names, kind="stable")  # so that the order of the frames changes nothing
+    place = np.argsort(order)
+    cameras = reconstruction.recon_from_camera[order]
+    tracks = replace(reconstruction.tracks, image=place[reconstruction.tracks.image])
+    pinhole, colors = undistorted(
+        capture.folder, names[order].tolist(), reconstruction.intrinsics, options.pointmap_size_px
+    )
+    found = dense_pointmaps(
+        colors,
+        cameras,
+        pinhole,
+        choose_neighbours(tracks, cameras, options.neighbours),
+        _planes(tracks, cameras),
+        progress or silent,
+        priors=options.priors,
+        memory_gb=memory_gb,
+    )
+    pointmaps = Pointmaps(
+        intrinsics=pinhole,
+        points_in_recon=found.points_in_recon,
+        confidence=found.confidence,
+        colors=colors,
+        reason=found.reason,
+        depth_std=found.depth_std,
+    )
+    return replace(reconstruction, pointmaps=pointmaps.of_rows(place))
+
+
+def plan_depth(capture: Capture, options: DepthOptions, memory_gb: float) -> None:
+    """Say what memory the dense depth of a capture, and its map, will take, before anything is made.
+
+    Raises InputError where the budget is too small, or numba is not installed.
+    """
+    extra("numba", "map", "dense depth")  # imported now, for it is a part of the program
+    width, height = capture.image_size
+    pixels = int(width * height * min(1.0, options.pointmap_size_px / max(width, height)) ** 2)
+    plan(
+        len(capture),
+        capture.image_size,
+        memory_gb,
+        result=pixels * BYTES_OF_RESULT,
+        work=pixels * BYTES_OF_THREAD,
+    )
+
+
+def undistorted(
+    folder: Path, names: Sequence[str], intrinsics: Intrinsics, size_px: int = DepthOptions.pointmap_size_px
+) -> tuple[Intrinsics, UInt8[ndarray, "m h w 3"]]:
+    """The pinhole grid of pointmaps whose long side is `size_px` at most, and the images on it."""
+    pinhole = pinhole_inside(intrinsics, size_px)
+    return pinhole, np.stack(
+        [undistort_image(read_image(folder / name), intrinsics, pinhole) for name in names]
+    )
+
+
+def _planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m d 3"]:
+    """For each image the planes that span where its surfaces may lie."""
+    if not tracks.from_board:
+        return sweep_planes(tracks, recon_from_camera)
+    return sweep_planes(_raised(tracks, recon_from_camera), recon_from_camera, count=BOARD_PLANES)
+
+
+def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:
+    """The points, and the same ones as near to the cameras as things beside the board may come."""
+    on_board = tracks.points_in_recon
+    middle = recon_from_camera[:, :3, 3].mean(0)
+    raised = on_board + RISE * (middle - on_board)
+    return replace(
+        tracks,
+        image=np.tile(tracks.image, 2),
+        x_px=np.tile(tracks.x_px, (2, 1)),
+        point=np.concatenate([tracks.point, tracks.point + len(on_board)]),
+        points_in_recon=np.concatenate([on_board, raised]),
+    )

@@ -1,0 +1,29 @@
+"""How dense depth is estimated; apart from the stage, so that the command line's help imports little."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """How the dense depth that the map needs is estimated on the cameras of a reconstruction."""
+
+    dense: Annotated[
+        bool,
+        tyro.conf.arg(help="Estimate no dense depth, which only the map needs; networks predict it anyway."),
+    ] = True
+    """Estimate the dense depth that the map needs."""
+    priors: Annotated[
+        bool,
+        tyro.conf.arg(
+            help="Leave plain surfaces without depth. By default they are filled with planes where their colour and "
+            "the matched depth around them support it; the map uses these as surfaces, never as evidence of free space."
+        ),
+    ] = True
+    """Fill plain surfaces with planes. Networks predict them anyway."""
+    pointmap_size_px: tyro.conf.Suppress[int] = 400
+    """Long side of the pointmaps."""
+    neighbours: tyro.conf.Suppress[int] = 10
+    """Other images that the depth of each is checked against; matched with the best of them."""

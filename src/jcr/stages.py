@@ -1,0 +1,202 @@
+"""The stages on a run folder: each starts from the files of those before it, and adds its own and its time."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+from jcr import __version__
+from jcr.attempts import NothingFoundError, Tried, again, choose, timings_of
+from jcr.calibration.calibration_json import calibration_file, failed_file
+from jcr.capture.added import write_added
+from jcr.cell.added import read_added_cameras
+from jcr.cell.cameras_json import CamerasFile, cameras_file
+from jcr.depth.densify import densify, plan_depth
+from jcr.mapping import make_map
+from jcr.memory import give_back
+from jcr.progress import Progress
+from jcr.reconstruct.backends import BACKENDS, tries
+from jcr.reconstruct.board_in_view import proposed_for
+from jcr.records import Attempt, Capture, CellCamera
+from jcr.records.words import sentence
+from jcr.results import RunOptions, RunResult
+from jcr.run_folder import MOVING, RunFolder, State, state_of
+
+
+def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """The reconstruction that the folder has of the same input, calibrated; else back ends are tried.
+
+    Where the camera watches the gripper, what the gripper carries is the scene.
+    """
+    from jcr.cell.carried import refined
+    from jcr.cell.locate import carried_scene
+
+    watches = capture.mount == "base"
+    seen = carried_scene(capture, folder.path / MOVING) if watches else capture
+    state = state_of(seen, options.made_with).model_copy(update={"capture": str(capture.folder.resolve())})
+    try:
+        tried, attempts = _reused(seen, folder, options, state, progress) or _chosen(
+            seen, folder, options, state, progress
+        )
+    except NothingFoundError as error:
+        raise _failed(capture, folder, options, state, error) from None
+    state = state.model_copy(update={"attempts": attempts})
+    folder.keep_state(state)
+    folder.keep_depth(tried.reconstruction, state)
+    hand_eye = tried.hand_eye
+    if watches:
+        hand_eye = refined(capture, tried.reconstruction, hand_eye, options.calibrate)
+    content = calibration_file(
+        capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts
+    )
+    if not content.converged or content.short is not None:
+        board = proposed_for(capture, options.reconstruct.board)
+        content = content if board is None else content.with_findings(board)
+    folder.keep_calibration(content)
+    return RunResult(folder.path, capture, content, hand_eye, tried.reconstruction)
+
+
+def located(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """With the other cameras of the cell, those of the capture and those added to the run."""
+    start = time.perf_counter()
+    found = cameras(result, read_added_cameras(folder.path, result.capture), folder, options, progress)
+    folder.keep_cameras(found)
+    if found is None:
+        return result
+    result = replace(result, cameras=found).timed("cameras", start)
+    folder.amend_calibration(result.calibration)
+    return result
+
+
+def cameras(
+    result: RunResult,
+    added: Sequence[CellCamera],
+    folder: RunFolder,
+    options: RunOptions,
+    progress: Progress,
+) -> CamerasFile | None:
+    """The other cameras of the cell as cameras.json has them; None where there are none."""
+    from jcr.cell.locate import locate_cameras
+
+    others = (*result.capture.others, *added)
+    if not others:
+        return None
+    found = locate_cameras(
+        result.capture,
+        others,
+        result.reconstruction,
+        result.hand_eye,
+        folder.path / MOVING,
+        options.reconstruct,
+        options.calibrate,
+        progress,
+    )
+    return cameras_file(found, __version__)
+
+
+def densified(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """With the dense depth that the map needs: predicted, in the folder, or estimated now."""
+    start = time.perf_counter()
+    reconstruction = densify(
+        result.capture,
+        result.reconstruction,
+        options.depth,
+        progress,
+        memory_gb=options.reconstruct.memory_gb,
+    )
+    give_back()
+    folder.keep_depth(reconstruction, folder.state())
+    return replace(result, reconstruction=reconstruction).timed("densify", start)
+
+
+def mapped(
+    result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
+) -> RunResult:
+    """With cloud, map, and what stands on the table; `added` are further images for it."""
+    start = time.perf_counter()
+    made = make_map(result, added, options, progress)
+    folder.keep_map(made.cloud, made.scene)
+    if len(added):
+        write_added(added, result.capture)
+    result = replace(result, cloud=made.cloud, scene=made.scene, measured=made.measured)
+    result = result.timed("map", start, made.notes)
+    folder.amend_calibration(result.calibration)
+    return result
+
+
+def reported(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
+    """With the report, and the last of the times."""
+    from jcr.report.html import report_html
+
+    start = time.perf_counter()
+    progress("report", 0.0)
+    folder.keep_report(report_html(result, options.for_report))
+    result = result.timed("report", start)
+    folder.amend_calibration(result.calibration)
+    progress("report", 1.0)
+    return result
+
+
+def _reused(
+    capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
+) -> tuple[Tried, tuple[Attempt, ...]] | None:
+    """What an earlier run chose from the same input, calibrated, and how it was chosen; None where it is to be made."""
+    start = time.perf_counter()
+    if (reused := folder.reuse_reconstruction(capture, state)) is None:
+        return None
+    reconstruction, earlier = reused
+    read_s = time.perf_counter() - start
+    if options.needs_depth and reconstruction.pointmaps is None:
+        plan_depth(capture, options.depth, options.reconstruct.memory_gb)
+    tried = again(
+        capture,
+        reconstruction,
+        read_s,
+        options.calibrate,
+        progress,
+        options.depth,
+        options.reconstruct.memory_gb,
+    )
+    return tried, earlier.attempts or tried.attempts
+
+
+def _chosen(
+    capture: Capture, folder: RunFolder, options: RunOptions, state: State, progress: Progress
+) -> tuple[Tried, tuple[Attempt, ...]]:
+    """What is chosen now, and how; its reconstruction is kept as soon as it is sure."""
+    if options.needs_depth and not BACKENDS[tries(options.reconstruct)[0].backend].predicts_depth:
+        plan_depth(capture, options.depth, options.reconstruct.memory_gb)
+    tried = choose(
+        capture,
+        options.reconstruct,
+        options.calibrate,
+        progress,
+        lambda made: folder.keep_reconstruction(made, state),
+        options.depth,
+    )
+    return tried, tried.attempts
+
+
+def _failed(
+    capture: Capture, folder: RunFolder, options: RunOptions, state: State, error: NothingFoundError
+) -> NothingFoundError:
+    """The error, with the --board that would help where the images show one; its reason is left in the folder.
+
+    Nothing stays there of another capture or of other options.
+    """
+    from jcr.report.html import failed_report_html
+
+    board = proposed_for(capture, options.reconstruct.board)
+    if folder.earlier(capture, state) is None:
+        folder.forget_reconstruction()
+    content = failed_file(
+        capture,
+        error.attempts[-1].backend,
+        error,
+        timings_of(error.attempts),
+        __version__,
+        error.attempts,
+    )
+    content = content if board is None else content.with_findings(board)
+    folder.keep_calibration(content)
+    folder.keep_report(failed_report_html(capture, content, options.for_report))
+    return error if board is None else NothingFoundError(error.with_more(sentence(board)), error.attempts)
