@@ -14,7 +14,8 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import Attempt, Capture, HandEye, HeldOut, Reconstruction
+from jcr.records import CAUSES, Attempt, Capture, Finding, HandEye, HeldOut, Mend, Reconstruction
+from jcr.records.words import text
 
 
 class NothingFoundError(NotTrustedError):
@@ -116,10 +117,25 @@ class Tried:
         return self
 
 
+HELPS: tuple[Mend, ...] = ("reconstruction", "images")
+"""What another reconstruction of the same images may help against: one that is wrong, or of too few of them."""
+
+
+def rejection(tried: Tried) -> Finding | None:
+    """The strongest finding that rejects a calibration; None of one that is accepted, or was not made."""
+    found = () if tried.calibrated is None else tried.calibrated.findings
+    return next((finding for finding in found if finding.severity == "rejects"), None)
+
+
 def needs_another(tried: Tried) -> bool:
-    """Whether another back end is tried: this one failed, or is rejected for something else than the motion."""
-    hand_eye = tried.calibrated
-    return hand_eye is None or (not hand_eye.converged and hand_eye.observability.observable)
+    """Whether another back end is tried: this one failed, or is rejected for what another may not have.
+
+    What was found about camera, robot, mount or motion holds for every reconstruction of the same images.
+    """
+    if tried.calibrated is None:
+        return True
+    rejected = rejection(tried)
+    return rejected is not None and rejected.kind not in CAUSES and rejected.mend in HELPS
 
 
 def choose(
@@ -150,10 +166,19 @@ def choose(
         kept = kept.noted(kept.title)
     for one in others:
         if not needs_another(kept):
+            kept = _alone(kept)
             break
         kept = _better(kept, _tried(capture, one, calibrate_options, depth_options, progress))
     chosen(kept.require_found().reconstruction)
     return kept
+
+
+def _alone(kept: Tried) -> Tried:
+    """With why no other back end was tried, where a rejected one is kept."""
+    rejected = rejection(kept)
+    if rejected is None:
+        return kept
+    return kept.noted(f"no other back end was tried, for none can help: {text(rejected)}")
 
 
 def again(

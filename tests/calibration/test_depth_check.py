@@ -121,7 +121,7 @@ def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured
     z = hand_eye.scale * np.stack(
         [
             apply(inverse(c), p)[..., 2]
-            for c, p in zip(with_depth.recon_from_camera, found.points_in_recon, strict=True)
+            for c, p in zip(mapped.recon_from_camera, found.points_in_recon, strict=True)
         ]
     )
     off, sigma = (z - true)[there], hand_eye.scale * np.asarray(found.depth_std)[there]
@@ -148,8 +148,8 @@ def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(mea
     dense = replace(
         reconstruction.dense, points_in_recon=points, confidence=matched, reason=reason, depth_std=std
     )
-    with_depth, notes = with_measured_depth(capture, replace(reconstruction, pointmaps=dense), hand_eye)
-    found = with_depth.dense
+    mapped, notes = with_measured_depth(capture, replace(reconstruction, pointmaps=dense), hand_eye)
+    found = mapped.dense
     assert notes and "differ" in notes[0]
     left = np.zeros(true.shape, bool)
     left[:, 20:, : WIDTH // 2] = matched[:, 20:, : WIDTH // 2] > 0

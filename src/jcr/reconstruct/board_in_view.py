@@ -93,7 +93,7 @@ def _chessboard(grey: list[UInt8[ndarray, "h w"]]) -> str | None:
 
 
 def proposed_for(capture: Capture, board: str | None) -> Finding | None:
-    """That a board is in its images, and the --board that would use it; None where one was given, and where the camera watches the gripper."""
+    """That a board is in the images of a capture; None where one was given, and where the camera watches the gripper."""
     if board is not None or capture.mount == "base":
         return None
     return proposed([read_image(capture.folder / name) for name in capture.images])

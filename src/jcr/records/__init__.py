@@ -39,7 +39,17 @@ from jcr.records.capture import (
     coefficients_of,
 )
 from jcr.records.cloud import PointCloud
-from jcr.records.findings import CAMERA, Finding, Kind, Mend, Severity, Verdict, strongest_first, verdict_of
+from jcr.records.findings import (
+    CAMERA,
+    CAUSES,
+    Finding,
+    Kind,
+    Mend,
+    Severity,
+    Verdict,
+    strongest_first,
+    verdict_of,
+)
 from jcr.records.reconstruction import (
     BOTH,
     MATCHED,
@@ -57,6 +67,7 @@ __all__ = [
     "BOTH",
     "Budget",
     "CAMERA",
+    "CAUSES",
     "COVARIANCE_ORDER",
     "CameraEvidence",
     "COEFFICIENTS",
