@@ -21,6 +21,8 @@ from jcr.geometry import skew, step_between
 ENOUGH = 1e-5
 """Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
 STEPS = 60
+CENTRE = slice(2, 4)
+"""Of the parameters of a camera."""
 FAINT = 1e-6
 """Information that every column has (1/m², 1/rad²): an image that shows nothing is anywhere within a kilometre."""
 
@@ -236,8 +238,9 @@ def _nuisances_applied(
         return by
     log_focal, shear = scene.nuisances(problem.freedom)[:, problem.observations.image]
     along = np.array([camera.fx / camera.height for camera in scene.cameras])[problem.layout.camera] * shear
+    sheared = along[:, None] * by[:, 1]
     by *= np.exp(log_focal)[:, None, None]
-    by[:, 0] += along[:, None] * by[:, 1]
+    by[:, 0] += sheared
     return by
 
 
@@ -250,15 +253,25 @@ def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarra
     ):
         rows = np.flatnonzero(camera == c)
         out[rows, :, columns] = by_parameters(lens, view.in_camera[rows]) @ prior.directions
-    if len(freedom.nuisance.std):
-        image, about = problem.observations.image, view.from_centre_px
-        log_focal, _ = scene.nuisances(freedom)[:, image]
-        by_shear = np.array([lens.fx / lens.height for lens in scene.cameras])[camera] * about[:, 1]
-        of_focal, of_shear = freedom.nuisance.directions.reshape(2, -1, len(freedom.nuisance.std))[:, image]
-        out[:, :, freedom.nuisance_columns] = (np.exp(log_focal)[:, None] * about)[:, :, None] * of_focal[
-            :, None
-        ]
-        out[:, 0, freedom.nuisance_columns] += by_shear[:, None] * of_shear
+    if len(freedom.nuisance.std) == 0:
+        return out
+    image, about = problem.observations.image, view.from_centre_px
+    log_focal, shear = scene.nuisances(freedom)[:, image]
+    # Nuisances are about the principal point, which they leave where it is; a shear counts in the focal length.
+    beside, of_shear = np.zeros_like(out), np.zeros((len(camera), out.shape[2]))
+    for c, (lens, prior, columns) in enumerate(
+        zip(scene.cameras, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
+    ):
+        rows = np.flatnonzero(camera == c)
+        beside[rows, :, columns] = prior.directions[CENTRE]
+        of_shear[rows, columns] = (shear * about[:, 1])[rows, None] / lens.height * prior.directions[0]
+    out = _nuisances_applied(out - beside, scene, problem) + beside
+    out[:, 0] += of_shear
+    by_shear = np.array([lens.fx / lens.height for lens in scene.cameras])[camera] * about[:, 1]
+    focal, sheared = freedom.nuisance.directions.reshape(2, -1, len(freedom.nuisance.std))[:, image]
+    scaled = np.exp(log_focal)[:, None] * about
+    out[:, :, freedom.nuisance_columns] = scaled[:, :, None] * focal[:, None]
+    out[:, 0, freedom.nuisance_columns] += by_shear[:, None] * sheared
     return out
 
 
@@ -277,22 +290,13 @@ def _cost(
     return cost
 
 
-def _equations(
-    scene: Scene,
-    view: View,
-    problem: ImageProblem,
-    weight: Float[ndarray, " k"],
-    held: list[RigInformation],
-    damping: float,
-) -> Normal:
-    """The normal equations in the order of Freedom's columns, without the points."""
-    freedom, first = problem.freedom, problem.freedom.first_rig
-    root = np.sqrt(weight)[:, None, None]
+def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[ndarray, " k"]) -> Derivatives:
+    """Derivatives of all observations by everything, and their residuals, times the roots of their weights."""
+    freedom, root = problem.freedom, np.sqrt(weight)[:, None, None]
     by_rig = _by_rig(scene, view, problem)
     by_rig *= root
-    shared = np.zeros((len(weight), 2, first))
-    cameras = len(freedom.std)
-    shared[:, :, :cameras] = _by_cameras(scene, view, problem) * root
+    shared = np.zeros((len(weight), 2, freedom.first_rig))
+    shared[:, :, : len(freedom.std)] = _by_cameras(scene, view, problem) * root
     for c, columns in enumerate(freedom.mount_columns):
         if columns is not None:
             mine = np.flatnonzero(problem.layout.camera == c)
@@ -304,7 +308,20 @@ def _equations(
         by_world[rows] = by_rig[rows] @ rotation.T
         own[rows, :, :3] = -by_world[rows]
         own[rows, :, 3:] = np.cross(by_world[rows], (view.from_rig[rows] @ rotation.T)[:, None])
-    weighted = Derivatives(shared, own, by_world, view.residual_px * root[..., 0])
+    return Derivatives(shared, own, by_world, view.residual_px * root[..., 0])
+
+
+def _equations(
+    scene: Scene,
+    view: View,
+    problem: ImageProblem,
+    weight: Float[ndarray, " k"],
+    held: list[RigInformation],
+    damping: float,
+) -> Normal:
+    """The normal equations in the order of Freedom's columns, without the points."""
+    freedom, first, cameras = problem.freedom, problem.freedom.first_rig, len(problem.freedom.std)
+    weighted = derivatives(scene, view, problem, weight)
     hessian, right = with_points_held(weighted, problem.seen)
     hessian[range(cameras), range(cameras)] += freedom.std**-2.0
     right[:cameras] -= scene.camera_steps / freedom.std**2
