@@ -26,11 +26,12 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("export/", "formats of other tools", 1), ("simulate/", "captures with known answers", 1)),
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("cell/", "every camera of the cell: fixed, several on a wrist, two arms, eye-to-hand", 1),),
-    (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
+    (("calibration/", "the stage: fit, adjust, checks, verdict, requirement; calibration.json", 1),),
     (("depth/", "the stage densify: PatchMatch and planes on known cameras", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
     (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
+    (("adjust/", "the one bundle adjustment: what images show, tied to the robots", 1),),
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (
         ("camera.py", "projection, distortion, derivatives", 1),
@@ -38,14 +39,17 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
         ("least_squares.py", "damped Gauss-Newton", 1),
     ),
     (
-        ("geometry.py", "SE(3), one retraction", 1.3),
         ("records/", "what flows", 1),
-        ("files, memory, progress, rounding", "what every stage needs", 2),
+        ("files, memory, progress", "what every stage needs", 2),
+    ),
+    (
+        ("geometry.py", "SE(3), one retraction", 1),
+        ("rounding.py", "digits that mean something", 1),
+        ("pages.py", "the manual", 1),
     ),
     (
         ("errors.py", "bad input, a rejected answer", 1),
         ("extras.py", "optional packages", 1),
-        ("pages.py", "the manual", 1),
         ("deflate.py", "zlib before pycolmap", 1),
     ),
 )
