@@ -13,6 +13,7 @@ import pytest
 
 from jcr import attempts
 from jcr.calibration import stage as calibration_stage
+from jcr.calibration.checks import convention
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
@@ -35,7 +36,7 @@ GARBAGE = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere."""
-    monkeypatch.setattr(calibration_stage, "better_reading", lambda gripper, camera: None)
+    monkeypatch.setattr(convention, "better_reading", lambda gripper, camera: None)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jcr import pipeline
+from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
@@ -154,7 +154,7 @@ def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
 def test_options_that_cannot_be_are_refused_before_any_work(
     options: CalibrateOptions, says: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(pipeline, "choose", lambda *_: pytest.fail("images were reconstructed"))
+    monkeypatch.setattr(stages, "choose", lambda *_: pytest.fail("images were reconstructed"))
     with pytest.raises(InputError, match=says):
         pipeline.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

@@ -499,7 +499,11 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
     np.testing.assert_array_equal(image_masks(model, image), masks)
     # Both images look at the same place: all of their masks agree.
     _, reconstruction = labelled_capture(tmp_path)
-    labels = sam_labels(model, replace(reconstruction, colors=np.stack([image, image])), hand_eye())
+    labels = sam_labels(
+        model,
+        replace(reconstruction, pointmaps=replace(reconstruction.dense, colors=np.stack([image, image]))),
+        hand_eye(),
+    )
     assert labels.labels.max() == len(labels.names) - 1 > 0
     np.testing.assert_array_equal(labels.labels[0], labels.labels[1])
 

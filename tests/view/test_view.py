@@ -211,7 +211,7 @@ def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: 
     from jcr.view.server import open_server
     from jcr.view.viewer import REJECTED, Viewer
 
-    for name in ("calibration.json", "reconstruction.npz"):
+    for name in ("calibration.json", "reconstruction.npz", "depth.npz"):
         shutil.copy(done / name, tmp_path / name)
     run = read_run(tmp_path)
     assert run.scene is None and len(run.notes) == 2 and "jcr map" in run.notes[1]

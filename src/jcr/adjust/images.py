@@ -139,7 +139,7 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
 
 
 def noise_of(scene: Scene, view: View, problem: ImageProblem, before: PixelNoise | None = None) -> PixelNoise:
-    """Of the observations at a scene; several cameras are told apart where an estimate was made before."""
+    """Of the observations at a scene; several cameras are distinguished where an estimate was made before."""
     ratio = np.ones(len(scene.cameras))
     if before is not None:
         by_world = _by_world(_by_rig(scene, view, problem), scene, problem)

@@ -198,7 +198,7 @@ def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
 
 
 def differences(count: int) -> Float[ndarray, "n d"]:
-    """An orthonormal basis of what differs between so many, whose sum is 0."""
+    """An orthonormal basis of what differs between this many, whose sum is 0."""
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
 
 

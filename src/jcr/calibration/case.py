@@ -101,7 +101,7 @@ class Case:
     @property
     def shows_camera(self) -> bool:
         """Whether the images can tell anything against their camera: pointmaps were made with intrinsics of their own,
-        and of motions that show too little what is missing comes first."""
+        and of degenerate motions what is missing comes first."""
         return (
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
         )

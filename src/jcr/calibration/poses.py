@@ -50,7 +50,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
         found = better_reading(gripper, camera)
         if found is None:
             return hand_eye
-        # Of motions that show too little, another convention may fit by chance: what is missing comes first.
+        # Of degenerate motions another convention may fit by chance: what is missing comes first.
         severity = "rejects" if hand_eye.observability.observable else "warns"
         return hand_eye.with_findings(convention_finding(found, severity))
     if pairs.is_metric and not is_one(hand_eye):

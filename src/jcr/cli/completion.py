@@ -13,6 +13,8 @@ from jcr.cli import COMMANDS
 from jcr.errors import InputError
 
 SHELLS = ("bash", "zsh", "fish")
+SUPPRESSED = get_args(tyro.conf.Suppress[int])[1]
+"""Marks what the help does not list."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ def arguments_of(record: type) -> Iterator[Argument]:
         kind, marks = hints[field.name], ()
         if get_origin(kind) is Annotated:
             kind, *marks = get_args(kind)
+        if SUPPRESSED in marks:
+            continue
         if is_dataclass(kind) and isinstance(kind, type):
             yield from arguments_of(kind)
             continue

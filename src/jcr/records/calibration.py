@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import ARM
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdict_of
 from jcr.records.words import remedy, sentence, unobservable
@@ -131,6 +130,8 @@ class HeldOut:
     @property
     def length_m(self) -> float:
         """Both errors as one length, by which calibrations can be compared."""
+        from jcr.geometry import ARM  # SciPy, which help need not wait for
+
         return float(np.hypot(1e-3 * self.translation_mm, ARM * np.radians(self.rotation_deg)))
 
 

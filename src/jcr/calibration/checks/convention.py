@@ -8,7 +8,7 @@ from jcr.handeye.conventions import better_reading, convention_finding
 def check_convention(case: Case) -> Checked:
     """The convention by which the gripper poses fit, where there is one.
 
-    Of motions that show too little another may fit by chance: what is missing comes first.
+    Of degenerate motions another may fit by chance: what is missing comes first.
     """
     found = better_reading(case.base_from_gripper, case.recon_from_camera)
     if found is None:
