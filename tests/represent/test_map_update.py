@@ -224,7 +224,7 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
     new = added_views(tmp_path, truth, capture, scene_of(truth), truth.base_from_camera[8:9])
     after = extend(before, hand_eye, len(capture), new, lambda stage, fraction: None)
     known = before.dense.confidence > 0
-    assert (after.confidence[:8][known] > 0).mean() > 0.98
+    assert (after.dense.confidence[:8][known] > 0).mean() > 0.98
     camera_from_recon = inverse(after.recon_from_camera[8])
     depth = (
         SCALE

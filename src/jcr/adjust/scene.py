@@ -68,7 +68,7 @@ class Freedom:
         images: int,
         mounts: Sequence[bool] | Bool[ndarray, " c"] | None = None,
     ) -> "Freedom":
-        """Cameras about where they are now, each of their images as its camera is; no mount moves but those of `mounts`."""
+        """Cameras about where they are now, each of their images as its camera is; of the mounts only `mounts` move."""
         return Freedom(
             intrinsics=tuple(priors),
             mounts=np.zeros(len(cameras), bool) if mounts is None else np.asarray(mounts, bool),

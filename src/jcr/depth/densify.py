@@ -21,7 +21,7 @@ from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 RISE = 0.4
 """Share of a camera's distance to a board that things beside it may rise towards the camera."""
 BOARD_PLANES = 96
-"""Of a sweep through that room."""
+"""Of a sweep through that space."""
 
 
 def densify(

@@ -112,7 +112,7 @@ class _State:
 
     @staticmethod
     def of(case: Case, found: tuple[_Hypothesis, ...]) -> "_State":
-        """Adjusted anew: with what was found wrong in it the robot pose noise was another one."""
+        """Adjusted again: while what was found distorted the images, the robot pose noise was another one."""
         combinations = np.concatenate([one.both for one in found], axis=1) if found else None
         return _State(case, found, adjust_case(case, combinations=combinations))
 
