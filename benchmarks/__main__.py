@@ -178,7 +178,7 @@ BENCHES = {
     ),
     "memory": Bench(
         "peak memory against the budget by number of images, COLMAP and small networks",
-        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py", "src/jcr/reconstruct/threads.py"),
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py"),
         long="20 and 40 images, too",
     ),
     "bag": Bench(
