@@ -108,13 +108,13 @@ BENCHES = {
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time",
         draws=True,
-        measures=("src/jcr/handeye", "src/jcr/simulate/problem.py"),
+        measures=("src/jcr/handeye", "benchmarks/simulated/problem.py"),
         long="15 draws instead of 4",
     ),
     "robots": Bench(
         "arms with systematic errors: is the result within its sigma, and nearer than others'",
         draws=True,
-        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "src/jcr/simulate/problem.py"),
+        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "benchmarks/simulated/problem.py"),
         long="8 draws of every arm instead of 1",
     ),
     "limits": Bench(
@@ -125,7 +125,7 @@ BENCHES = {
     ),
     "attack": Bench(
         "captures with one silent fault: reported, rejected, or wrong; and false alarms",
-        measures=(*SOLVER, "src/jcr/simulate/observations.py", "src/jcr/simulate/faults.py"),
+        measures=(*SOLVER, "benchmarks/simulated"),
         long="three times as many draws of everything",
     ),
     "table2": Bench(

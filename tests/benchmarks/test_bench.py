@@ -22,11 +22,11 @@ from benchmarks.freshness import (
     says_it_is_old,
 )
 from benchmarks.peers import grid_search
+from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
-from jcr.simulate.problem import hand_eye_problem
 from places import ROOT
 
 RESULTS = ROOT / "docs" / "results"

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import jcr
+from benchmarks.simulated.surface import solid_labels
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
@@ -32,7 +33,7 @@ from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
-from jcr.simulate.scenes import make_scene, solid_labels
+from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
 
 if TYPE_CHECKING:
