@@ -17,8 +17,9 @@ import pytest
 
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.completion import SHELLS, arguments_of, script
-from jcr.cli.export import FORMATS, FormatName
 from jcr.cli.output import Output
+from jcr.export.formats import FORMATS
+from jcr.export.options import FormatName
 
 
 @pytest.fixture(scope="module")

@@ -25,9 +25,9 @@ from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
-from jcr.cli.export import FORMATS
 from jcr.errors import InputError
 from jcr.export import ros
+from jcr.export.formats import FORMATS
 from jcr.export.provenance import Provenance
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
