@@ -1,4 +1,4 @@
-"""`jcr bench align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
+"""`benchmarks align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`jcr bench attack`: captures with one thing wrong that looks like nothing, and captures with nothing wrong.
+"""`benchmarks attack`: captures with one thing wrong that looks like nothing, and captures with nothing wrong.
 
 Without images: gripper poses and image observations of simulated faults (simulate/faults.py), cameras by structure
 from motion of these observations with the intrinsics that the user believes, then the calibration stage as it is.

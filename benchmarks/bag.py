@@ -1,4 +1,4 @@
-"""`jcr bench bag`: frames chosen from a minute of a robot's bag, with time and memory, and the bag itself."""
+"""`benchmarks bag`: frames chosen from a minute of a robot's bag, with time and memory, and the bag itself."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`jcr bench batch`: many small captures by one process and by two, and the memory while they run."""
+"""`benchmarks batch`: many small captures by one process and by two, and the memory while they run."""
 
 import json
 import multiprocessing

@@ -1,4 +1,4 @@
-"""`jcr bench calibrate`: hand-eye solvers on the same simulated poses, for accuracy and time."""
+"""`benchmarks calibrate`: hand-eye solvers on the same simulated poses, for accuracy and time."""
 
 import time
 from collections.abc import Callable

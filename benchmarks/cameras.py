@@ -1,4 +1,4 @@
-"""`jcr bench cameras DIR`: further cameras and arms, simulated against the truth and real images against the robot."""
+"""`benchmarks cameras DIR`: further cameras and arms, simulated against the truth and real images against the robot."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

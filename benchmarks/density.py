@@ -1,4 +1,4 @@
-"""`jcr bench density`: how much of a plain table and what stands on it a cloud covers, beside COLMAP's points."""
+"""`benchmarks density`: how much of a plain table and what stands on it a cloud covers, beside COLMAP's points."""
 
 import tempfile
 from dataclasses import dataclass

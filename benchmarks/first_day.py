@@ -1,4 +1,4 @@
-"""`python -m benchmarks first_day`: what a new user types and sees, from captures as robots and tools write them."""
+"""`benchmarks first_day`: what a new user types and sees, from captures as robots and tools write them."""
 
 import os
 import shlex

@@ -1,4 +1,4 @@
-"""`jcr bench limits`: where it breaks. One thing made worse at a time, until the result is wrong or rejected."""
+"""`benchmarks limits`: where it breaks. One thing made worse at a time, until the result is wrong or rejected."""
 
 import json
 import tempfile

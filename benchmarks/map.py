@@ -1,4 +1,4 @@
-"""`jcr bench map`: how good and how fast the map is, against the truth of a simulated capture."""
+"""`benchmarks map`: how good and how fast the map is, against the truth of a simulated capture."""
 
 import tempfile
 import time

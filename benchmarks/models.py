@@ -1,4 +1,4 @@
-"""`jcr bench models`: any-view models from predictions with errors of a published size, beside other back ends."""
+"""`benchmarks models`: any-view models from predictions with errors of a published size, beside other back ends."""
 
 import shutil
 import tempfile

@@ -1,4 +1,4 @@
-"""`jcr bench predictions`: the whole job from pointmaps with a network's errors, against the truth."""
+"""`benchmarks predictions`: the whole job from pointmaps with a network's errors, against the truth."""
 
 import tempfile
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""`jcr bench robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
+"""`benchmarks robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
 wrong, and is the result nearer?
 """
 

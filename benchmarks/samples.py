@@ -1,4 +1,4 @@
-"""`python -m benchmarks samples`: metric samples of a marker, solved with the scale known and found, beside OpenCV."""
+"""`benchmarks samples`: metric samples of a marker, solved with the scale known and found, beside OpenCV."""
 
 import cv2
 import numpy as np
