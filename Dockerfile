@@ -5,7 +5,7 @@ FROM python:3.11-slim-bookworm
 # cpu: torch without CUDA (0.9 GB installed); cuda: with it (5 GB); none: no maps, calibration and report alone.
 ARG TORCH=cpu
 ARG TORCH_VERSION=2.13.0
-ARG EXTRAS=networks,view,ros,lerobot,planning,realsense,ur,franka,xarm
+ARG EXTRAS=networks,view,ros,lerobot,planning,realsense,franka,xarm
 
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 OMP_NUM_THREADS=4
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
@@ -27,7 +27,7 @@ RUN case "$TORCH" in \
       none) ;; \
       *) echo "TORCH=$TORCH: give cpu, cuda or none" >&2; exit 1 ;; \
     esac \
- && if [ "$TORCH" = none ]; then extras=ros,lerobot,realsense,ur,franka,xarm; else extras="$EXTRAS"; fi \
+ && if [ "$TORCH" = none ]; then extras=ros,lerobot,realsense,franka,xarm; else extras="$EXTRAS"; fi \
  && pip install --constraint constraints.txt ".[$extras]"
 
 RUN useradd --create-home --uid 1000 --groups video,plugdev jcr && mkdir /data && chown jcr /data

@@ -1,4 +1,4 @@
-"""`python -m benchmarks NAME`, or `jcr bench NAME`: the tables and timings that the README quotes."""
+"""`python -m benchmarks NAME`: the tables and timings that the README quotes."""
 
 import os
 import platform
@@ -108,13 +108,13 @@ BENCHES = {
     "calibrate": Bench(
         "hand-eye solvers on the same simulated poses, for accuracy and time",
         draws=True,
-        measures=("src/jcr/handeye", "src/jcr/simulate/problem.py"),
+        measures=("src/jcr/handeye", "benchmarks/simulated/problem.py"),
         long="15 draws instead of 4",
     ),
     "robots": Bench(
         "arms with systematic errors: is the result within its sigma, and nearer than others'",
         draws=True,
-        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "src/jcr/simulate/problem.py"),
+        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "benchmarks/simulated/problem.py"),
         long="8 draws of every arm instead of 1",
     ),
     "limits": Bench(
@@ -125,7 +125,7 @@ BENCHES = {
     ),
     "attack": Bench(
         "captures with one silent fault: reported, rejected, or wrong; and false alarms",
-        measures=(*SOLVER, "src/jcr/simulate/observations.py", "src/jcr/simulate/faults.py"),
+        measures=(*SOLVER, "benchmarks/simulated"),
         long="three times as many draws of everything",
     ),
     "table2": Bench(
@@ -178,7 +178,7 @@ BENCHES = {
     ),
     "memory": Bench(
         "peak memory against the budget by number of images, COLMAP and small networks",
-        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py", "src/jcr/reconstruct/threads.py"),
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py"),
         long="20 and 40 images, too",
     ),
     "bag": Bench(
@@ -215,12 +215,12 @@ class Arguments:
     """Measure, and print a Markdown table with the machine, versions and date.
 
     examples:
-      jcr bench calibrate
-      jcr bench run --out docs/results
-      jcr bench real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
-      jcr bench robots --long --out docs/results
-      jcr bench all captures --out docs/results
-      jcr bench stale --write
+      python -m benchmarks calibrate
+      python -m benchmarks run --out docs/results
+      python -m benchmarks real captures --boards bench=charuco:7x5:0.030:0.022:DICT_4X4_50
+      python -m benchmarks robots --long --out docs/results
+      python -m benchmarks all captures --out docs/results
+      python -m benchmarks stale --write
     """
 
     name: Annotated[
@@ -256,7 +256,7 @@ def main(arguments: Arguments) -> int:
     name = arguments.name
     if BENCHES[name].of_captures and arguments.captures is None:
         raise InputError(
-            f"bench {name}: name the folder that holds the captures, as in jcr bench {name} captures"
+            f"bench {name}: name the folder that holds the captures, as in python -m benchmarks {name} captures"
         )
     if not BENCHES[name].of_captures and arguments.captures is not None:
         raise InputError(f"bench {name}: takes no folder of captures; leave it out")
@@ -280,7 +280,9 @@ def _all(arguments: Arguments) -> int:
     if arguments.long:
         raise InputError("bench all: --long is of one bench at a time; leave it out")
     if arguments.out is None:
-        raise InputError("bench all: name the folder for the tables, as in jcr bench all --out docs/results")
+        raise InputError(
+            "bench all: name the folder for the tables, as in python -m benchmarks all --out docs/results"
+        )
     from benchmarks.suite import Outcome, absent_networks, run, write_index
 
     names: dict[str, bool] = {name: bench.timed for name, bench in BENCHES.items()}
@@ -300,7 +302,9 @@ def _all(arguments: Arguments) -> int:
 
     begun = time.perf_counter()
     outcomes = run(names, arguments.out, given, arguments.resume, report)
-    command = " ".join(["jcr bench all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"])
+    command = " ".join(
+        ["python -m benchmarks all", *(["CAPTURES"] if arguments.captures else []), "--out DIR"]
+    )
     write_index(outcomes, arguments.out, command, machine(), absent, time.perf_counter() - begun)
     index = arguments.out / "README.md"
     facts = {outcome.name: {"seconds": outcome.seconds, "trouble": outcome.trouble} for outcome in outcomes}
@@ -327,7 +331,7 @@ def _stale(arguments: Arguments) -> int:
         elif bool(changed) is not says_it_is_old(text):
             silent += 1
             lines[-1] += (
-                f"; the page does {'not say so' if changed else 'say otherwise'}: jcr bench stale --write"
+                f"; the page does {'not say so' if changed else 'say otherwise'}: python -m benchmarks stale --write"
             )
     if arguments.write:
         write_text(pages / "README.md", with_claims((pages / "README.md").read_text(), pages))
@@ -343,7 +347,7 @@ def paths_of(page: str) -> tuple[str, ...] | None:
 
 def heading(arguments: Arguments) -> str:
     """What a reader needs to judge and repeat the numbers."""
-    command = ["jcr", "bench", arguments.name, *(["--long"] if arguments.long else [])]
+    command = ["python", "-m", "benchmarks", arguments.name, *(["--long"] if arguments.long else [])]
     if arguments.captures is not None:
         # Where they lie is the machine's own affair.
         command += [arguments.captures.name, *(["--boards", *arguments.boards] if arguments.boards else [])]
@@ -351,7 +355,8 @@ def heading(arguments: Arguments) -> str:
 
     measured = f"{date.today().isoformat()}, {commit_now(paths_of(arguments.name) or ())}"
     return (
-        f"# jcr bench {arguments.name}{' --long' if arguments.long else ''}\n\n{BENCHES[arguments.name].what}\n\n"
+        f"# python -m benchmarks {arguments.name}{' --long' if arguments.long else ''}\n\n"
+        f"{BENCHES[arguments.name].what}\n\n"
         f"    {shlex.join(command)}\n\n{measured}. {machine()}\n\n"
     )
 

@@ -1,4 +1,4 @@
-"""`jcr bench align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
+"""`benchmarks align`: global alignment, fast against adam, and kinematic against free, on synthetic pairs."""
 
 import json
 import subprocess
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.problem import HandEyeProblem, disturbed, error
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.geometry import (
     apply_similarity,
@@ -26,7 +27,6 @@ from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.align import AlignOptions, align
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
 from jcr.reconstruct.global_alignment.with_robot import align_with_robot
-from jcr.simulate.problem import HandEyeProblem, disturbed, error
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
 

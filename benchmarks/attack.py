@@ -1,4 +1,4 @@
-"""`jcr bench attack`: captures with one thing wrong that looks like nothing, and captures with nothing wrong.
+"""`benchmarks attack`: captures with one thing wrong that looks like nothing, and captures with nothing wrong.
 
 Without images: gripper poses and image observations of simulated faults (simulate/faults.py), cameras by structure
 from motion of these observations with the intrinsics that the user believes, then the calibration stage as it is.
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.simulated.faults import LENS, Faults, FaultyCapture, faulty_capture
 from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.options import CalibrateOptions
@@ -17,7 +18,6 @@ from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.handeye.equation import predict
 from jcr.records import Capture, HandEye, Kind, Reconstruction
-from jcr.simulate.faults import LENS, Faults, FaultyCapture, faulty_capture
 
 DRAWS, FEW, CLEAN = 7, 2, 70
 LONG_TIMES = 3

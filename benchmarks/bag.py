@@ -1,4 +1,4 @@
-"""`jcr bench bag`: frames chosen from a minute of a robot's bag, with time and memory, and the bag itself."""
+"""`benchmarks bag`: frames chosen from a minute of a robot's bag, with time and memory, and the bag itself."""
 
 import json
 import os
@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.simulated.ros_bag import FPS, TF_HZ, nearest_view, write_bag
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.records import Capture
-from jcr.simulate.ros_bag import FPS, TF_HZ, nearest_view, write_bag
 
 CAPTURE = Path("examples/tabletop")
 SECONDS = 60.0

@@ -1,4 +1,4 @@
-"""`jcr bench batch`: many small captures by one process and by two, and the memory while they run."""
+"""`benchmarks batch`: many small captures by one process and by two, and the memory while they run."""
 
 import json
 import multiprocessing
@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr.batch import BatchOptions, batch
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, scale_translation
 from jcr.pipeline import RunOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.records import Intrinsics
-from jcr.simulate.problem import hand_eye_problem
 
 CAPTURES, MANY, IMAGES = 32, 200, 6
 """MANY with --long."""

@@ -1,4 +1,4 @@
-"""`jcr bench cameras DIR`: further cameras and arms, simulated against the truth and real images against the robot."""
+"""`benchmarks cameras DIR`: further cameras and arms, simulated against the truth and real images against the robot."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
+from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.adjust.robots import Adjusted, Placed, adjust
 from jcr.adjust.scene import Freedom, Scene
@@ -21,7 +22,6 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
-from jcr.simulate.cell import CellProblem, Kind, cell_problem
 from jcr.simulate.robots import PresetName
 
 DRAWS, MANY_DRAWS = 10, 40
@@ -283,7 +283,7 @@ def _page(
 
 
 def _box() -> str:
-    from jcr.simulate.cell import BOX
+    from benchmarks.simulated.cell import BOX
 
     return "x".join(f"{1e3 * side:.0f}" for side in BOX)
 

@@ -1,4 +1,4 @@
-"""`jcr bench density`: how much of a plain table and what stands on it a cloud covers, beside COLMAP's points."""
+"""`benchmarks density`: how much of a plain table and what stands on it a cloud covers, beside COLMAP's points."""
 
 import tempfile
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from benchmarks.figure import blank, png
+from benchmarks.simulated.surface import truth_points
 from benchmarks.synthetic_pairs import pairs_of_capture
 from benchmarks.table1 import PUBLISHED, WEBCAM
 from jcr.calibration.stage import calibrate
@@ -24,7 +25,6 @@ from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.represent.cloud import point_cloud
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import truth_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""`jcr bench depth`: completeness and accuracy of dense depth on simulated scenes, by texture and by reason."""
+"""`benchmarks depth`: completeness and accuracy of dense depth on simulated scenes, by texture and by reason."""
 
 import tempfile
 import time

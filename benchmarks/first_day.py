@@ -1,4 +1,4 @@
-"""`python -m benchmarks first_day`: what a new user types and sees, from captures as robots and tools write them."""
+"""`benchmarks first_day`: what a new user types and sees, from captures as robots and tools write them."""
 
 import os
 import shlex
@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import yaml
 
+from benchmarks.simulated.ros_bag import write_bag
 from jcr.capture.read import read_capture
 from jcr.capture.robot_poses import numbers_from_poses
 from jcr.errors import InputError
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.records import Capture
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.ros_bag import write_bag
 
 TABLETOP = Path("examples/tabletop")
 SHOWN = 16

@@ -1,4 +1,4 @@
-"""`jcr bench gate`: scenes that mislead matching, with the robot's gate and without."""
+"""`benchmarks gate`: scenes that mislead matching, with the robot's gate and without."""
 
 import tempfile
 import time

@@ -1,4 +1,4 @@
-"""`jcr bench limits`: where it breaks. One thing made worse at a time, until the result is wrong or rejected."""
+"""`benchmarks limits`: where it breaks. One thing made worse at a time, until the result is wrong or rejected."""
 
 import json
 import tempfile
@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from benchmarks.figure import blank, png
+from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -23,7 +24,6 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct.colmap import reconstruct
 from jcr.records import HandEye
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.simulate.render import render
 from jcr.simulate.scenes import Scene, make_scene
 from jcr.simulate.truth import Truth, read_truth

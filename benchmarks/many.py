@@ -1,4 +1,4 @@
-"""`jcr bench many`: more and more images of 640x480 pixels, in seconds and peak memory."""
+"""`benchmarks many`: more and more images of 640x480 pixels, in seconds and peak memory."""
 
 import json
 import resource

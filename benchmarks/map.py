@@ -1,4 +1,4 @@
-"""`jcr bench map`: how good and how fast the map is, against the truth of a simulated capture."""
+"""`benchmarks map`: how good and how fast the map is, against the truth of a simulated capture."""
 
 import tempfile
 import time
@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from benchmarks.simulated.surface import solid_labels
 from jcr.calibration.stage import calibrate
 from jcr.camera import project, rays
 from jcr.capture.read import read_capture
@@ -32,7 +33,7 @@ from jcr.represent.options import MapOptions
 from jcr.represent.scene import SceneMap
 from jcr.segment.tabletop import label_tabletop
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.scenes import make_scene, solid_labels
+from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import Truth, read_truth, true_depth, true_labels
 
 VIEWS, POINTS = 12, 200_000

@@ -1,4 +1,4 @@
-"""`jcr bench matching DIR`: SIFT, XFeat and ALIKED on real captures, with the robot's gate and without."""
+"""`benchmarks matching DIR`: SIFT, XFeat and ALIKED on real captures, with the robot's gate and without."""
 
 import time
 from collections.abc import Mapping, Sequence

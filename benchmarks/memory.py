@@ -1,4 +1,4 @@
-"""`jcr bench memory`: peak resident set of the whole job against the budget, and what was said of it before."""
+"""`benchmarks memory`: peak resident set of the whole job against the budget, and what was said of it before."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`jcr bench model_cost`: seconds and memory of a pass of an any-view network with random weights, beside the estimate.
+"""`benchmarks model_cost`: seconds and memory of a pass of an any-view network with random weights, beside the estimate.
 
 Time and memory do not depend on the weights' values. Each network runs in a process of its own, two threads.
 """

@@ -1,4 +1,4 @@
-"""`jcr bench models`: any-view models from predictions with errors of a published size, beside other back ends."""
+"""`benchmarks models`: any-view models from predictions with errors of a published size, beside other back ends."""
 
 import shutil
 import tempfile
@@ -12,6 +12,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from benchmarks.predicted_views import ViewErrors, auc, predicted_views, predictions
+from benchmarks.simulated.surface import truth_points
 from benchmarks.table1 import WEBCAM
 from benchmarks.table2 import matched
 from jcr.calibration.stage import calibrate
@@ -29,7 +30,7 @@ from jcr.segment.labels import read_labels
 from jcr.segment.measure import measure
 from jcr.segment.tabletop import label_tabletop
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import read_truth, truth_points
+from jcr.simulate.truth import read_truth
 
 SEEDS = (3,)
 IMAGES = 10

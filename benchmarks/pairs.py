@@ -1,4 +1,4 @@
-"""`jcr bench pairs`: what it saves to encode every image once instead of both images of every pair."""
+"""`benchmarks pairs`: what it saves to encode every image once instead of both images of every pair."""
 
 import resource
 import time

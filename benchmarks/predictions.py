@@ -1,4 +1,4 @@
-"""`jcr bench predictions`: the whole job from pointmaps with a network's errors, against the truth."""
+"""`benchmarks predictions`: the whole job from pointmaps with a network's errors, against the truth."""
 
 import tempfile
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.simulated.problem import HandEyeProblem, error
+from benchmarks.simulated.surface import truth_points
 from benchmarks.synthetic_pairs import pairs_of_capture
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
@@ -14,8 +16,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.results import RunResult
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.problem import HandEyeProblem, error
-from jcr.simulate.truth import read_truth, truth_points
+from jcr.simulate.truth import read_truth
 
 SEEDS, MANY_SEEDS = 1, 3
 """MANY_SEEDS with --long."""

@@ -1,4 +1,4 @@
-"""`jcr bench real DIR`: real captures against the references stored beside them."""
+"""`benchmarks real DIR`: real captures against the references stored beside them."""
 
 import tempfile
 import time

@@ -1,4 +1,4 @@
-"""`jcr bench robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
+"""`benchmarks robots`: is the reported sigma true of arms that err systematically and of intrinsics that are a little
 wrong, and is the result nearer?
 """
 
@@ -14,6 +14,9 @@ from numpy import ndarray
 
 from benchmarks.figure import blank
 from benchmarks.peers import opencv
+from benchmarks.simulated.bent import BentProblem, bent_problem
+from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.problem import error
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
@@ -21,9 +24,7 @@ from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye, Intrinsics, Tracks
-from jcr.simulate.observations import LENS, observed
-from jcr.simulate.problem import error
-from jcr.simulate.robots import BentProblem, PresetName, bent_problem
+from jcr.simulate.robots import PresetName
 
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)

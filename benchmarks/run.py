@@ -1,4 +1,4 @@
-"""`jcr bench run`: the whole job on a small simulated capture, each run a process of its own."""
+"""`benchmarks run`: the whole job on a small simulated capture, each run a process of its own."""
 
 import json
 import os

@@ -1,12 +1,12 @@
-"""`python -m benchmarks samples`: metric samples of a marker, solved with the scale known and found, beside OpenCV."""
+"""`benchmarks samples`: metric samples of a marker, solved with the scale known and found, beside OpenCV."""
 
 import cv2
 import numpy as np
 
 from benchmarks.peers import OPENCV_METHODS, opencv
+from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.geometry import scale_translation
 from jcr.handeye.solve import SCALE_STD, solve_hand_eye
-from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
 LEVELS = (
     ("0.1 mm 0.02° robot, 0.5 mm 0.1° marker", (1e-4, np.radians(0.02)), (5e-4, np.radians(0.1))),

@@ -1,4 +1,4 @@
-"""`jcr bench all`: every bench in a process of its own, and an index with one line per claim."""
+"""`benchmarks all`: every bench in a process of its own, and an index with one line per claim."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ from jcr.reconstruct.backends import BACKENDS
 CHECKOUT = Path(__file__).parents[1]
 CLAIM = "> "
 """Begins the lines of a bench's page that say in a sentence what was found."""
-MARKS = ("<!-- jcr bench all: begin -->", "<!-- jcr bench all: end -->")
+MARKS = ("<!-- python -m benchmarks all: begin -->", "<!-- python -m benchmarks all: end -->")
 """Lines of the index between which the claims go."""
 
 
@@ -171,9 +171,11 @@ def _cell(text: str) -> str:
 
 
 def _command(page: Path) -> str:
-    lines = (line.strip() for line in page.read_text().splitlines() if line.startswith("    jcr bench"))
-    words = next(lines, f"jcr bench {page.stem}").split()
-    return " ".join([*words[:3], *(word for word in words[3:] if word == "--long")])
+    lines = (
+        line.strip() for line in page.read_text().splitlines() if line.startswith("    python -m benchmarks")
+    )
+    words = next(lines, f"python -m benchmarks {page.stem}").split()
+    return " ".join([*words[:4], *(word for word in words[4:] if word == "--long")])
 
 
 def _commit(page: Path) -> str:

@@ -1,4 +1,4 @@
-"""`jcr bench table1`: hand-eye calibration from few images of three scenes, as in the paper's table I."""
+"""`benchmarks table1`: hand-eye calibration from few images of three scenes, as in the paper's table I."""
 
 import tempfile
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""`jcr bench table2`: heights of tape, box, mug and toolbox from 8 and 10 images, as in the paper's table II."""
+"""`benchmarks table2`: heights of tape, box, mug and toolbox from 8 and 10 images, as in the paper's table II."""
 
 import shutil
 import tempfile

@@ -7,11 +7,16 @@ whatever frame and unit your system has, of the same instants. It needs no image
 that the answer can be held against the truth; put your own arrays in their place.
 """
 
+import sys
+from pathlib import Path
+
 import numpy as np
 
 import jcr
 from jcr.geometry import rotation_between_deg
-from jcr.simulate.problem import hand_eye_problem
+
+sys.path.append(str(Path(__file__).parents[1]))  # of the checkout, for what is simulated
+from benchmarks.simulated.problem import hand_eye_problem
 
 # Ten poses of an arm that reports them with 0.5 mm and 0.1° of noise.
 noise = (0.0005, np.radians(0.1))

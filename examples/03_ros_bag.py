@@ -15,7 +15,9 @@ import numpy as np
 import jcr
 from jcr.capture.options import ReadOptions
 from jcr.check import check
-from jcr.simulate.ros_bag import write_bag
+
+sys.path.append(str(Path(__file__).parents[1]))  # of the checkout, for what is simulated
+from benchmarks.simulated.ros_bag import write_bag
 
 out = Path("out/ros_bag")
 shutil.rmtree(out, ignore_errors=True)

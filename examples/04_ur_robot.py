@@ -21,7 +21,9 @@ from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
 from jcr.live.rest import asks_at_rest
 from jcr.live.ur import states
-from jcr.simulate.ur import SimulatedUr
+
+sys.path.append(str(Path(__file__).parents[1]))  # of the checkout, for what is simulated
+from benchmarks.simulated.ur import SimulatedUr
 
 
 def simulated_camera(table, arm):

@@ -1,4 +1,4 @@
-"""Controllers that speak the protocols of the makers' own packages, as far as reading poses needs."""
+"""A controller that speaks the protocol of its maker's own package, as far as reading poses needs."""
 
 import json
 import socket
@@ -6,7 +6,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -17,10 +16,10 @@ from jcr.geometry import rotation_log
 
 
 @contextmanager
-def fake(name: str, host: str, pose: ndarray, joints: ndarray) -> Iterator[None]:
+def fake_xarm(host: str, pose: ndarray, joints: ndarray) -> Iterator[None]:
     """A controller in a process of its own: the makers' packages hold Python's lock while they wait for it."""
     numbers = [*pose.ravel().tolist(), *joints.tolist()]
-    command = [sys.executable, __file__, name, host, json.dumps(numbers)]
+    command = [sys.executable, __file__, host, json.dumps(numbers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
@@ -53,44 +52,6 @@ def exactly(connection: socket.socket, count: int) -> bytes:
     return data
 
 
-RTDE_TYPES = {"timestamp": ("DOUBLE", 1), "actual_q": ("VECTOR6D", 6), "actual_TCP_pose": ("VECTOR6D", 6)}
-
-
-def rtde(pose: ndarray, joints: ndarray) -> Callable[[socket.socket], None]:
-    """Universal Robots' Real-Time Data Exchange (port 30004), protocol 2, after the guide of Universal Robots."""
-    values = {
-        "actual_q": joints,
-        "actual_TCP_pose": np.concatenate([pose[:3, 3], rotation_log(pose[None, :3, :3])[0]]),
-    }
-
-    def serve(connection: socket.socket) -> None:
-        def send(kind: str, payload: bytes) -> None:
-            connection.sendall(struct.pack("!Hc", 3 + len(payload), kind.encode()) + payload)
-
-        names: list[str] = []
-        while True:
-            length, kind = struct.unpack("!Hc", exactly(connection, 3))
-            payload = exactly(connection, length - 3)
-            if kind == b"V":
-                send("V", b"\x01")
-            elif kind == b"v":
-                send("v", struct.pack("!4I", 5, 13, 0, 0))
-            elif kind == b"O":
-                names = payload[8:].decode().strip(",").split(",")
-                send("O", b"\x01" + ",".join(RTDE_TYPES[name][0] for name in names).encode())
-            elif kind == b"S":
-                send("S", b"\x01")
-                break
-        start = time.monotonic()
-        while True:
-            values["timestamp"] = np.array([time.monotonic() - start])
-            numbers = np.concatenate([values[name] for name in names])
-            send("U", b"\x01" + struct.pack(f"!{len(numbers)}d", *numbers))
-            time.sleep(0.008)
-
-    return serve
-
-
 def xarm(pose: ndarray, joints: ndarray) -> Callable[[socket.socket], None]:
     """UFACTORY's private Modbus TCP (port 502): transaction, protocol 2, length, function | state, data."""
     aa = np.concatenate([1e3 * pose[:3, 3], rotation_log(pose[None, :3, :3])[0]])
@@ -111,7 +72,6 @@ def xarm(pose: ndarray, joints: ndarray) -> Callable[[socket.socket], None]:
 
 
 if __name__ == "__main__":
-    which, address, told = sys.argv[1:]
+    address, told = sys.argv[1:]
     numbers = np.array(json.loads(told))
-    makes, at = {"rtde": (rtde, 30004), "xarm": (xarm, 502)}[which]
-    serve_each(address, at, makes(numbers[:16].reshape(4, 4), numbers[16:]))
+    serve_each(address, 502, xarm(numbers[:16].reshape(4, 4), numbers[16:]))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr import attempts
 from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import convention
@@ -21,7 +22,6 @@ from jcr.geometry import rotation_exp, transform
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
 from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
-from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
 GARBAGE = {
     "enc_embed_dim": 32,

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jcr
+from benchmarks.simulated.bent import bent_problem
 from jcr.calibration.calibration_json import calibration_file, write_calibration
 from jcr.calibration.drift import drift
 from jcr.calibration.options import CalibrateOptions
@@ -25,7 +26,6 @@ from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.simulate.capture import with_robot_noise
-from jcr.simulate.robots import bent_problem
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 MAY_NEED_TORCH = (
     "match/aliked", "match/learned", "match/lightglue", "match/xfeat",
     "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
-    "reconstruct/views_at_once/", "reconstruct/predictions", "reconstruct/threads", "represent/", "segment/sam",
+    "reconstruct/views_at_once/", "reconstruct/predictions", "represent/", "segment/sam",
     "export/mesh", "export/rrd", "export/volume", "view/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""

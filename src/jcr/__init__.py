@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jcr.capture.options import ReadOptions
     from jcr.capture.read import read_capture
     from jcr.check import check as check_capture
-    from jcr.cli.export import export_run
+    from jcr.export.formats import export_run
     from jcr.handeye.solve import solve_hand_eye
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.represent.map_file import load_map
@@ -29,7 +29,7 @@ _MODULE_OF = {
     "RunOptions": "jcr.results",
     "check_capture": "jcr.check:check",
     "verify_run": "jcr.verify:verify",
-    "export_run": "jcr.cli.export",
+    "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
     "run": "jcr.pipeline",

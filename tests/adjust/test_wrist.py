@@ -7,14 +7,14 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
+from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.records import Intrinsics, Tracks
-from jcr.simulate.observations import LENS, observed
-from jcr.simulate.problem import HandEyeProblem, error, hand_eye_problem
 
 
 def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options) -> Adjusted:

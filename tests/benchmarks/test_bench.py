@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from importlib import import_module
@@ -22,11 +21,11 @@ from benchmarks.freshness import (
     says_it_is_old,
 )
 from benchmarks.peers import grid_search
+from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
-from jcr.cli import dispatch
+from jcr.cli import call
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
-from jcr.simulate.problem import hand_eye_problem
 from places import ROOT
 
 RESULTS = ROOT / "docs" / "results"
@@ -35,7 +34,7 @@ MEASURED = re.compile(r"(\d[\d,.]*\d|\d)\s?(mm|cm|°|%|ms|s|dB|GiB|GB|MiB|M|minu
 
 def test_the_index_claims_what_the_benches_found_and_nothing_else():
     index = (RESULTS / "README.md").read_text()
-    assert with_claims(index, RESULTS) == index, "write it again: jcr bench stale --write"
+    assert with_claims(index, RESULTS) == index, "write it again: python -m benchmarks stale --write"
 
 
 def test_every_number_of_the_readme_is_in_the_results():
@@ -70,7 +69,7 @@ def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page
     if not has_history():
         pytest.skip("a shallow clone, or no repository: git cannot tell what changed since")
     old = bool(changed_since_measured(page, paths, at_most=1))
-    assert old is says_it_is_old(text), "measure it again, or: jcr bench stale --write"
+    assert old is says_it_is_old(text), "measure it again, or: python -m benchmarks stale --write"
 
 
 def test_what_code_says_does_not_make_a_page_old():
@@ -83,7 +82,7 @@ def test_what_code_says_does_not_make_a_page_old():
 
 
 def test_a_page_says_that_it_is_old_below_its_commit_and_once():
-    page = "# jcr bench map\n\n2026-11-22, commit `abcdef0`. A machine.\n\n> found\n"
+    page = "# python -m benchmarks map\n\n2026-11-22, commit `abcdef0`. A machine.\n\n> found\n"
     once = marked(page, ["src/jcr/a.py"])
     assert says_it_is_old(once) and once.splitlines()[4].endswith("`src/jcr/a.py` changed since.")
     assert marked(once, ["src/jcr/a.py"]) == once and marked(once, []) == page
@@ -94,7 +93,8 @@ def test_every_page_of_results_says_which_command_writes_it():
     assert named == {page.stem for page in RESULTS.glob("*.md")} - {"README"}
     for page in named:
         text, name = (RESULTS / f"{page}.md").read_text(), page.removesuffix(LONG)
-        assert name in BENCHES and f"\n    jcr bench {name}" in text and claims(RESULTS / f"{page}.md"), page
+        assert name in BENCHES and claims(RESULTS / f"{page}.md"), page
+        assert f"\n    python -m benchmarks {name}" in text, page
         pictures = re.findall(r"\]\((\w+\.png)\)", text)
         assert all((RESULTS / picture).is_file() for picture in pictures)
 
@@ -114,10 +114,10 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     assert "nonsense" in outcomes[0].trouble and "nowhere" in outcomes[1].trouble
     assert outcomes[2].seconds is None and not outcomes[2].trouble  # newer than the sources: left out
     assert len(told) == 2
-    write_index(outcomes, tmp_path, "jcr bench all", "a machine.", ["a network: no weights"], 90.0)
+    write_index(outcomes, tmp_path, "python -m benchmarks all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
     assert "2 of 3 benches were run this time, in 1.5 minutes" in index
-    assert "| map | the map is good | [`jcr bench map`](map.md) |" in index
+    assert "| map | the map is good | [`python -m benchmarks map`](map.md) |" in index
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 
 
@@ -131,10 +131,10 @@ def test_a_page_older_than_the_sources_is_measured_again(tmp_path: Path):
 
 
 def test_claims_go_between_the_marks_as_a_table_and_an_index_without_them_is_refused(tmp_path: Path):
-    about = "# map\n\nof things\n\n    jcr bench map\n\n2026-11-22, commit `abcdef0`.\n"
+    about = "# map\n\nof things\n\n    python -m benchmarks map\n\n2026-11-22, commit `abcdef0`.\n"
     (tmp_path / "map.md").write_text(f"{about}{CLAIM}the map: 1 mm off\n{CLAIM}2 s long\n")
     written = with_claims(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n", tmp_path)
-    command = "[`jcr bench map`](map.md) | `abcdef0` |"
+    command = "[`python -m benchmarks map`](map.md) | `abcdef0` |"
     assert f"| the map | 1 mm off | {command}\n| of things | 2 s long | {command}\n" in written
     assert written.startswith("before\n") and written.endswith("after\n") and "old" not in written
     with pytest.raises(InputError, match="marks|lines"):
@@ -153,23 +153,10 @@ def test_the_papers_grid_search_finds_the_answer_within_its_grid_and_only_there(
 
 
 @pytest.mark.slow
-def test_benches_run_as_a_package_of_their_own_and_are_not_installed(tmp_path: Path):
-    """`python -m benchmarks` is the command line; the package alone says where they are and completes all else."""
-
-    def ended(*arguments: str, source: Path, at: Path) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PYTHONPATH": str(source)}
-        command = [sys.executable, "-m", *arguments]
-        return subprocess.run(command, env=environment, cwd=at, capture_output=True, text=True)
-
-    shutil.copytree(
-        ROOT / "src" / "jcr", tmp_path / "jcr", ignore=shutil.ignore_patterns("__pycache__", "*.html")
-    )
-    alone = ended("jcr", "bench", "run", "--out", "pages", source=tmp_path, at=tmp_path)
-    assert alone.returncode == 2 and "python -m benchmarks" in alone.stderr and alone.stderr.count("\n") == 1
-    script = ended("jcr", "--completion", "bash", source=tmp_path, at=tmp_path)
-    assert script.returncode == 0 and "--backend" in script.stdout and "table1" not in script.stdout
-
-    refused = ended("benchmarks", "real", source=ROOT / "src", at=ROOT)
+def test_benches_run_as_a_package_of_their_own():
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    command = [sys.executable, "-m", "benchmarks", "real"]
+    refused = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     assert refused.returncode == 2 and "name the folder" in refused.stderr and refused.stderr.count("\n") == 1
     assert set(BENCHES) <= {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
 
@@ -181,7 +168,7 @@ def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]
         ("bag", "--long"): "has no --long",
         ("all", "--long", "--out", "pages"): "of one bench at a time",
     }.items():
-        assert dispatch(["bench", *given]) == 2
+        assert call(lambda: import_module("benchmarks.__main__"), "python -m benchmarks", given) == 2
         assert said in capsys.readouterr().err
 
 

@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 
 import jcr
+from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import inverse, transform
 from jcr.handeye.fit import Cues
 from jcr.handeye.systematic import smooth_errors
-from jcr.simulate.observations import LENS, observed
-from jcr.simulate.problem import error, hand_eye_problem
 
 
 def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_once_it_is_considered():

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
+from benchmarks.simulated.faults import LENS, Faults, faulty_capture
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.geometry import retract, step_between
 from jcr.records import Kind
 from jcr.records.words import sentence
-from jcr.simulate.faults import LENS, Faults, faulty_capture
 
 pytestmark = pytest.mark.slow
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import (
     CalibrationFile,
     calibration_file,
@@ -21,7 +22,6 @@ from jcr.errors import InputError
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import CAMERA, Finding, HandEye, Kind, PosePairs, verdict_of
 from jcr.records.words import remedy, sentence, text
-from jcr.simulate.problem import hand_eye_problem
 from places import ROOT
 
 GOLDEN = ROOT / "tests" / "golden"

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file
 from jcr.calibration.options import CalibrateOptions
@@ -19,7 +20,6 @@ from jcr.records import Finding, HandEye, Kind, PosePairs
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
-from jcr.simulate.problem import hand_eye_problem
 
 DISAGREE = Finding(
     kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}

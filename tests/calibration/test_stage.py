@@ -3,13 +3,13 @@
 import numpy as np
 
 from benchmarks.attack import reconstructed
+from benchmarks.simulated.faults import faulty_capture
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration import adjust as adjust_stage
 from jcr.calibration import case
 from jcr.calibration.stage import calibrate
 from jcr.geometry import step_between
 from jcr.records import Tracks
-from jcr.simulate.faults import faulty_capture
 
 
 def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypatch):

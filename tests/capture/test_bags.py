@@ -13,6 +13,8 @@ import pytest
 
 import capture_writers as writers
 import jcr
+from benchmarks.simulated.problem import hand_eye_problem
+from benchmarks.simulated.ros_bag import nearest_view, write_bag
 from jcr.capture.best_frames import best_frames
 from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
@@ -22,8 +24,6 @@ from jcr.capture.ros_image import depth_of, picture_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, CellCamera
-from jcr.simulate.problem import hand_eye_problem
-from jcr.simulate.ros_bag import nearest_view, write_bag
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
 FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=12)

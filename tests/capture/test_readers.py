@@ -12,6 +12,7 @@ import pytest
 
 import capture_writers as writers
 import jcr
+from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.capture import capture_json
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import read_npy, read_yaml
@@ -21,7 +22,6 @@ from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.cli.query import read_points
 from jcr.geometry import scale_translation
 from jcr.records import Capture, PosePairs
-from jcr.simulate.problem import HandEyeProblem, hand_eye_problem
 
 
 @pytest.fixture(scope="module")

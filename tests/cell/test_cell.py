@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jcr
+from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.images import ImageProblem, evidence, noise_of, view_of
 from jcr.adjust.intrinsics_prior import HELD, prior_of
 from jcr.adjust.robots import Adjusted, adjust
@@ -32,7 +33,6 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.relocate import Features
 from jcr.records import Capture, CellCamera, Finding, HandEye, Intrinsics, Reconstruction, Tracks
 from jcr.records import Kind as FindingKind
-from jcr.simulate.cell import CellProblem, Kind, cell_problem
 
 COUNT = 8
 OLD = 9

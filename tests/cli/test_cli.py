@@ -215,7 +215,6 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
         (["compare", "nowhere", "nowhere"], "nowhere"),
         (["query", "nowhere", "nowhere"], "nowhere"),
         (["map", "nowhere"], "nowhere"),
-        (["bench", "everything"], "everything"),
     ],
 )
 def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list[str], words: str):

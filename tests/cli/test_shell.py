@@ -17,8 +17,9 @@ import pytest
 
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.completion import SHELLS, arguments_of, script
-from jcr.cli.export import FORMATS, FormatName
 from jcr.cli.output import Output
+from jcr.export.formats import FORMATS
+from jcr.export.options import FormatName
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,6 @@ def commands(done: Path, tabletop: Path, tmp_path_factory: pytest.TempPathFactor
         "export": ["export", run, "ros2"],
         "measure": ["measure", run],
         "compare": ["compare", run, tabletop],
-        "bench": ["bench", "run"],
         "models": ["models"],
     }
     return {name: list(map(str, line)) for name, line in lines.items()}
@@ -59,15 +59,14 @@ def test_every_command_takes_json_and_quiet(name: str):
 
 
 def test_json_is_one_object_and_quiet_is_silence(
-    commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    commands: dict[str, list[str]], capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("benchmarks.run.run", lambda long: "| a |\n")
     for name, line in commands.items():
         assert dispatch([*line, "--quiet", "--json"]) == 0, name
         told = capsys.readouterr()
         assert isinstance(json.loads(told.out), dict), name
         assert told.err == "", name
-    for name in ("check", "query", "export", "measure", "compare", "bench", "models"):
+    for name in ("check", "query", "export", "measure", "compare", "models"):
         assert dispatch([*commands[name], "--quiet"]) == 0, name
         told = capsys.readouterr()
         assert told.out and told.err == "", name

@@ -20,19 +20,20 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import jcr
+from benchmarks.simulated.surface import solid_labels
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
-from jcr.cli.export import FORMATS
 from jcr.errors import InputError
 from jcr.export import ros
+from jcr.export.formats import FORMATS
 from jcr.export.provenance import Provenance
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
-from jcr.simulate.scenes import make_scene, solid_labels
+from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
 
 if TYPE_CHECKING:

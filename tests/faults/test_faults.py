@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr import attempts, pipeline, run_folder
 from jcr.calibration.calibration_json import read_calibration
 from jcr.calibration.stage import calibrate
@@ -32,7 +33,6 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.robots import forward_kinematics
 from jcr.reconstruct.reconstruction_npz import read_reconstruction
 from jcr.run_folder import RunFolder
-from jcr.simulate.problem import hand_eye_problem
 
 SIZE = (96, 72)
 COUNT = 6

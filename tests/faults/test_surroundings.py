@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.calibration.calibration_json import read_calibration
 from jcr.geometry import scale_translation
-from jcr.simulate.problem import hand_eye_problem
 from waiting import until
 
 pytestmark = pytest.mark.slow

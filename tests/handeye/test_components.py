@@ -5,12 +5,12 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
+from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.geometry import retract, rotation_exp, step_between, transform
 from jcr.handeye.components import Equations, _cholesky, most_likely, over_sizes, posterior, solve
 from jcr.handeye.equation import residuals
 from jcr.handeye.robust import robust_fit
 from jcr.handeye.systematic import Region, arm_errors, smooth_errors
-from jcr.simulate.problem import error, hand_eye_problem
 
 WHITE = (2e-4, np.radians(0.03))
 
@@ -107,8 +107,8 @@ def test_constant_errors_of_base_and_gripper_are_part_of_the_answer():
 @pytest.mark.parametrize("joints_known", [False, True])
 def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
     """More images of an arm with joint offsets made answers of white noise alone worse: 12 of 24 beyond 3 sigma."""
+    from benchmarks.simulated.bent import bent_problem
     from jcr.handeye.arms import arm_named
-    from jcr.simulate.robots import bent_problem
 
     arm, worst = arm_named("ur5e"), []
     for seed in range(12):
@@ -131,8 +131,8 @@ def test_a_matrix_without_full_rank_still_has_a_factor():
 
 
 def test_a_named_arm_whose_joints_are_known_is_used_and_budgeted():
+    from benchmarks.simulated.bent import bent_problem
     from jcr.handeye.arms import arm_named
-    from jcr.simulate.robots import bent_problem
 
     problem = bent_problem(arm_named("panda"), "typical", 12, 1)
     poses = problem.base_from_gripper, problem.recon_from_camera

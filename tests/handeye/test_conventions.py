@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.poses import calibrate_poses
 from jcr.geometry import inverse, transform
@@ -14,7 +15,6 @@ from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.next_poses import next_poses
 from jcr.records import PosePairs
 from jcr.records.words import sentence
-from jcr.simulate.problem import hand_eye_problem
 
 
 def with_rotation(poses: np.ndarray, rotation: Rotation) -> np.ndarray:

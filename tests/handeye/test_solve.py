@@ -6,13 +6,13 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
+from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.components import Equations, solve
 from jcr.handeye.equation import PRIOR_STD, residuals, residuals_by_camera
 from jcr.handeye.fit import Cues, fit_poses, left_out
 from jcr.handeye.systematic import smooth_errors
-from jcr.simulate.problem import error, hand_eye_problem, unit_similarity
 
 NOISE = (5e-4, np.radians(0.1))
 
@@ -47,7 +47,9 @@ def test_a_similarity_of_the_reconstruction_changes_nothing_but_scale():
     rng = np.random.default_rng(4)
     problem = hand_eye_problem(rng, 9, robot_noise=NOISE)
     before = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-    moved, factor = unit_similarity(problem.recon_from_camera, rng)
+    factor = float(np.exp(rng.uniform(-3, 3)))
+    other_from_recon = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    moved = inverse(other_from_recon) @ scale_translation(problem.recon_from_camera, factor)
     after = jcr.solve_hand_eye(problem.base_from_gripper, moved)
     assert np.allclose(before.gripper_from_camera, after.gripper_from_camera, atol=1e-8)
     assert after.scale * factor == pytest.approx(before.scale, rel=1e-8)

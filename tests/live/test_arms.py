@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jcr
-from fake_arms import fake
+from fake_arms import fake_xarm
 from jcr.camera import project
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.handeye.arms import arm_named
@@ -58,14 +58,13 @@ ASK = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "package", "off"), [("rtde", "rtde_receive", 1e-9), ("xarm", "xarm", 1e-6)])
-def test_an_arm_gives_pose_and_joints_through_its_makers_package(name: str, package: str, off: float):
-    needs(package)
-    with fake(name, "127.0.0.7", POSE, JOINTS):
-        pose, joints, refused = told_by(ASK, name, "127.0.0.7", "127.0.0.8")
+def test_an_arm_gives_pose_and_joints_through_its_makers_package():
+    needs("xarm")
+    with fake_xarm("127.0.0.7", POSE, JOINTS):
+        pose, joints, refused = told_by(ASK, "xarm", "127.0.0.7", "127.0.0.8")
     # An xArm tells float32, of which its package keeps six digits.
-    assert np.allclose(pose, POSE, atol=off) and np.allclose(joints, JOINTS, atol=off)
-    assert f"{name}:127.0.0.8" in refused and "check the address" in refused
+    assert np.allclose(pose, POSE, atol=1e-6) and np.allclose(joints, JOINTS, atol=1e-6)
+    assert "xarm:127.0.0.8" in refused and "check the address" in refused
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import pytest
 from numpy import ndarray
 
 import jcr
+from benchmarks.simulated.ur import SimulatedUr
 from jcr.capture.images import read_image
 from jcr.live import line_server, ur
 from jcr.live.asks import Ask, pose_of_numbers
@@ -27,7 +28,6 @@ from jcr.live.line_server import MAX_LINE, MOST_REFUSED, Listen, bound, served_p
 from jcr.live.look import picture
 from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
-from jcr.simulate.ur import SimulatedUr
 from places import ROOT
 from waiting import until
 

@@ -146,7 +146,7 @@ def test_an_option_of_one_back_end_selects_it(present: set[str]) -> None:
     ("options", "words"),
     [
         (ReconstructOptions("colmap", predictions=Path("p.npz")), "--predictions p.npz: .*--backend predictions"),
-        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or .*pi3x"),
+        (ReconstructOptions("predictions", weights="p.npz"), "--weights p.npz: .*mast3r or dust3r or da3 or .*mapany"),
         (ReconstructOptions("given", board="b"), "--board b: .*give --backend marker"),
         (ReconstructOptions("mapanything", pair_graph="window"), "--pair-graph window: .*mast3r or dust3r"),
         (ReconstructOptions(pair_graph="robot"), r"--pair-graph robot: .*\(colmap, direct\) does not use it"),

@@ -189,11 +189,11 @@ def test_what_is_not_whole_and_right_is_not_there(hub: Hub, tmp_path: Path, faul
 
 
 def test_a_non_commercial_licence_is_accepted_first_and_once(hub: Hub, tmp_path: Path) -> None:
-    asked = get(hub, tmp_path, "vggt")
+    asked = get(hub, tmp_path, "mast3r")
     assert asked.returncode == 2 and "--accept-licence" in asked.stderr and not hub.requests
-    accepted = get(hub, tmp_path, "vggt", "--accept-licence")
+    accepted = get(hub, tmp_path, "mast3r", "--accept-licence")
     assert accepted.returncode == 0, accepted.stderr
-    assert get(hub, tmp_path, "vggt").returncode == 0
+    assert get(hub, tmp_path, "mast3r").returncode == 0
 
 
 def test_no_hub_and_no_such_model_are_a_line(hub: Hub, tmp_path: Path) -> None:

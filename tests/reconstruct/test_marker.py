@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.real import run as run_real
+from benchmarks.simulated.problem import TARGET_IN_BASE, hand_eye_problem
 from jcr.calibration.stage import calibrate
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
@@ -20,7 +21,6 @@ from jcr.reconstruct.board import boards
 from jcr.reconstruct.marker import reconstruct
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics
-from jcr.simulate.problem import TARGET_IN_BASE, hand_eye_problem
 from places import SHARED
 
 pytestmark = pytest.mark.slow

@@ -231,7 +231,7 @@ def test_an_unchanged_scene_loses_nothing_and_the_new_depth_is_right(
         * (after.dense.points_in_recon[8] @ camera_from_recon[:3, :3].T + camera_from_recon[:3, 3])[..., 2]
     )
     true = cv2.resize(true_depth(truth, 8), SIZE, interpolation=cv2.INTER_NEAREST)
-    found = (after.confidence[8] > 0) & (true > 0)
+    found = (after.dense.confidence[8] > 0) & (true > 0)
     assert found.mean() > 0.3
     assert np.median(np.abs(depth / true - 1)[found]) < 0.005
 

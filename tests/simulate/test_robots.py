@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jcr
+from benchmarks.simulated.bent import bent_problem
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
@@ -20,8 +21,7 @@ from jcr.simulate.robots import (
     ArmErrors,
     BentArm,
     bend,
-    bent_problem,
-    effective_hand_eye_about,
+    effective_about,
     hand_eye_on,
     patterned,
     table_center,
@@ -61,11 +61,11 @@ def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
     physical = hand_eye_on(arm, rng)
     about_z = transform(rotation_exp(np.array([0.0, 0.0, 0.01])), np.zeros(3))
     # The last joint turns the flange about its z: to the user the camera sits turned. The first turns the base.
-    last = effective_hand_eye_about(only(arm, "joint 6", 0.01), physical, 12, rng)
+    last = effective_about(only(arm, "joint 6", 0.01), physical, 12, rng).gripper_from_camera
     np.testing.assert_allclose(last, about_z @ physical, atol=1e-9)
-    first = effective_hand_eye_about(only(arm, "joint 1", 0.01), physical, 12, rng)
+    first = effective_about(only(arm, "joint 1", 0.01), physical, 12, rng).gripper_from_camera
     np.testing.assert_allclose(first, physical, atol=1e-9)
-    elbow = effective_hand_eye_about(only(arm, "joint 3", 0.01), physical, 12, rng)
+    elbow = effective_about(only(arm, "joint 3", 0.01), physical, 12, rng).gripper_from_camera
     assert rotation_angle(elbow[:3, :3] @ physical[:3, :3].T) > 1e-3
 
 

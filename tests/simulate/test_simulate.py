@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated.surface import solid_labels, truth_points, winding_number
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, skew, transform
 from jcr.records import Intrinsics
 from jcr.simulate.capture import SimulateOptions, simulate, with_robot_noise
-from jcr.simulate.meshes import winding_number
 from jcr.simulate.objects import CATALOGUE
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
-from jcr.simulate.scenes import RECIPES, make_scene, solid_labels
-from jcr.simulate.truth import read_truth, true_depth, true_labels, truth_points
+from jcr.simulate.scenes import RECIPES, make_scene
+from jcr.simulate.truth import read_truth, true_depth, true_labels
 
 CAMERA = Intrinsics(610.0, 610.0, 319.5, 239.5, 640, 480)
 

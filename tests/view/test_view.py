@@ -20,7 +20,6 @@ from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
 from jcr.simulate.truth import Truth, read_truth
-from jcr.view.gate import Gate
 from jcr.view.robot import read_joints, read_urdf, solve_joints
 from waiting import until
 
@@ -62,7 +61,7 @@ def viewer(done: Path, gantry: Path) -> "Iterator[Viewer]":
 
     run, robot = read_run(done), read_urdf(gantry)
     values = solve_joints(robot, "revolute_x", run.base_from_gripper)
-    server = open_server("127.0.0.1", 0, "test")
+    server = open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(layers, "MAP_POINTS", 15_000)  # drawn without a graphics card
         yield Viewer(server, run, robot, values)
@@ -221,7 +220,7 @@ def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: 
     assert near < 0.05
     moved = run.base_from_gripper[:, :3, 3] - viewer.run.base_from_gripper[:, :3, 3]
     assert np.abs(moved).max() < 2e-3
-    server = open_server("127.0.0.1", 0, "bare")
+    server = open_server(0, "bare")
     try:
         bare = Viewer(server, run)
         assert len(bare.points) and len(bare.frusta) == 12
@@ -231,17 +230,15 @@ def test_without_map_or_capture_cameras_and_points_remain(done: Path, tmp_path: 
         server.stop()
 
 
-def test_port_and_host_are_taken_or_refused(done: Path):
+def test_a_port_is_taken_or_refused():
     from jcr.view.server import open_server
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 .*--port"):
-            open_server("127.0.0.1", port, "")
-    with pytest.raises(InputError, match="192.0.2.1"):
-        open_server("192.0.2.1", 0, "")
+            open_server(port, "")
     with pytest.raises(InputError, match="70000"):
-        open_server("127.0.0.1", 70000, "")
+        open_server(70000, "")
 
 
 def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
@@ -266,40 +263,6 @@ def test_command_serves_this_machine_alone_until_it_is_interrupted(done: Path):
             served.kill()  # or the test would wait for it for ever
             raise
         assert served.returncode == 0 and out == "" and err == ""
-
-
-def test_others_need_the_token_of_the_address(done: Path):
-    from jcr.view.server import open_server
-
-    server = open_server("127.0.0.1", 0, "")
-    gate = Gate("127.0.0.1", 0, server.get_port())
-
-    def asked(request: str, more: str = "") -> str:
-        with socket.create_connection(("127.0.0.1", gate.port), timeout=10) as client:
-            client.sendall(f"{request} HTTP/1.1\r\nHost: x\r\n{more}Connection: close\r\n\r\n".encode())
-            return client.recv(1000).decode(errors="replace")
-
-    upgrade = (
-        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n"
-    )
-    try:
-        for request, more in (
-            ("GET /", ""),
-            ("GET /?token=wrong", ""),
-            ("GET /?token=%ff", ""),
-            ("GET //[", ""),
-            ("GET", ""),
-            ("GET /", "Cookie: jcr=wrong\r\n"),
-            ("GET /", upgrade.replace("Upgrade:", "Connection: Upgrade\r\nUpgrade:")),
-        ):
-            assert asked(request, more).startswith("HTTP/1.1 403"), request
-        assert asked("GET /", f"X: {'x' * 20_000}\r\n") == ""  # too long a head is not read to its end
-        welcome = asked(f"GET /?token={gate.token}")
-        assert welcome.startswith("HTTP/1.1 303") and f"jcr={gate.token}; HttpOnly" in welcome
-        assert asked("GET /", f"Cookie: a=b; jcr={gate.token}\r\n").startswith("HTTP/1.1 200")
-    finally:
-        gate.stop()
-        server.stop()
 
 
 def test_in_a_browser(viewer: "Viewer", tmp_path: Path):

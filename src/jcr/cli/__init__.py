@@ -38,7 +38,6 @@ COMMANDS = {
     "touch": "touch test: compare points touched with the robot's tip with the map",
     "batch": "run many captures, on this machine or a Ray cluster",
     "simulate": "simulate a capture, with ground truth",
-    "bench": "measure the tables and timings of the README (from a checkout)",
     "models": "list back ends with their licences; download weights",
     "docs": "print the pages of the manual",
 }

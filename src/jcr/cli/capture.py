@@ -44,8 +44,8 @@ class Arguments:
     """V4L2 device number, realsense[:SERIAL], URL of a stream (rtsp://…), or a recording (video file, .bag)."""
     optics: CameraOptions = field(default_factory=CameraOptions)
     poses: Annotated[str, tyro.conf.arg(metavar="SOURCE")] = "tcp"
-    """Where gripper poses come from: ur:HOST[:PORT] or rtde:HOST (Universal Robots), franka:HOST, xarm:HOST, typed (by
-    hand), or tcp (a program sends them, jcr docs capture)."""
+    """Where gripper poses come from: ur:HOST[:PORT] (Universal Robots), franka:HOST, xarm:HOST, typed (by hand),
+    or tcp (a program sends them, jcr docs capture)."""
     pose_convention: ConventionName = "auto"
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
@@ -97,7 +97,7 @@ def _say(text: str) -> None:
 
 def _asks(arguments: Arguments) -> "Iterator[Ask]":
     from jcr.errors import InputError
-    from jcr.live import franka, rtde, ur, xarm
+    from jcr.live import franka, ur, xarm
     from jcr.live.line_server import Listen, bound, served_poses
     from jcr.live.rest import asks_at_rest
     from jcr.live.typed import typed_poses
@@ -118,15 +118,13 @@ def _asks(arguments: Arguments) -> "Iterator[Ask]":
             host, port = _address(address, 30003, "--poses ur:")
             yield from asks_at_rest(lambda: ur.states(host, port))
         else:
-            module = {"rtde": rtde, "franka": franka, "xarm": xarm}[kind]
+            module = franka if kind == "franka" else xarm
             yield from asks_at_rest(lambda: module.states(address))
     else:
-        raise InputError(
-            f"--poses {arguments.poses}: give ur:HOST, rtde:HOST, franka:HOST, xarm:HOST, typed or tcp"
-        )
+        raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")
 
 
-_SPOKEN: dict[str, ConventionName] = {"ur": "ur", "rtde": "ur", "franka": "franka", "xarm": "xarm"}
+_SPOKEN: dict[str, ConventionName] = {"ur": "ur", "franka": "franka", "xarm": "xarm"}
 """How the arms' own pendants and programs write poses."""
 
 

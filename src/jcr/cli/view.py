@@ -1,6 +1,5 @@
 """`jcr view`: a run in 3D, in the browser."""
 
-import sys
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +14,8 @@ from jcr.cli.output import Output
 class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
-    The page is served until Ctrl-C, and only to this machine unless --host is given. Needs viser: pip install
-    'jcr-handeye[view]'.
+    The page is served until Ctrl-C, and only to this machine; from another one use
+    ssh -L 8080:127.0.0.1:8080. Needs viser: pip install 'jcr-handeye[view]'.
 
     examples:
       jcr view out/table
@@ -33,11 +32,8 @@ class Arguments:
     at each gripper pose."""
     tip: Annotated[str | None, tyro.conf.arg(metavar="LINK")] = None
     """The URDF link whose poses the capture contains."""
-    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen on. For any but 127.0.0.1 the printed address contains a token, which is required; there is no
-    encryption."""
     port: int = 8080
-    """Port to listen on; 0 selects a free one."""
+    """Port of 127.0.0.1 to listen on; 0 selects a free one."""
     output: Output = field(default_factory=Output)
 
 
@@ -57,10 +53,9 @@ def main(arguments: Arguments) -> int:
     RunFolder(arguments.out).calibration()  # says in a moment where there is none
     for package in ("viser", "matplotlib", "torch"):
         extra(package, "view", "jcr view")
-    from jcr.view.gate import Gate
     from jcr.view.robot import read_joints, read_urdf, solve_joints
     from jcr.view.run import read_run
-    from jcr.view.server import is_loopback, open_server
+    from jcr.view.server import open_server
     from jcr.view.viewer import Viewer
 
     run = read_run(arguments.out)
@@ -71,27 +66,15 @@ def main(arguments: Arguments) -> int:
             values = read_joints(arguments.joints, robot, len(run.calibration.images))[run.gripper_image]
         elif arguments.tip is not None:
             values = solve_joints(robot, arguments.tip, run.base_from_gripper)
-    local = is_loopback(arguments.host)
-    host, port = (arguments.host, arguments.port) if local else ("127.0.0.1", 0)
-    server = open_server(host, port, f"jcr · {run.name}")
-    gate = None
+    server = open_server(arguments.port, f"jcr · {run.name}")
     try:
         with progress_bars() as progress:
             Viewer(server, run, robot, values, progress)
-        address = f"http://{arguments.host}:{server.get_port()}"
-        if not local:
-            gate = Gate(arguments.host, arguments.port, server.get_port())
-            address = f"http://{arguments.host}:{gate.port}/?token={gate.token}"
-            sys.stderr.write(
-                "warning: whoever has this address sees the run, and on the way it is not encrypted; from another "
-                "machine rather use ssh -L 8080:127.0.0.1:8080 and the default --host\n"
-            )
+        address = f"http://127.0.0.1:{server.get_port()}"
         arguments.output.result(f"{address} (Ctrl-C ends it)\n", {"address": address})
         threading.Event().wait()
     except KeyboardInterrupt:
         return 0
     finally:
-        if gate is not None:
-            gate.stop()
         server.stop()
     return 0

@@ -89,7 +89,6 @@ class Matched:
     """None where the robot poses were not used."""
     lens: Intrinsics
     """At the working size: given, or as the robot and the images have it."""
-    pairs_tried: int
     upright: Float[ndarray, " n"] | None = None
     """Angles (rad) by which the images were rotated, once X's rotation was known."""
     notes: tuple[str, ...] = ()
@@ -256,7 +255,7 @@ def match_with_robot(
         found = _with_lens(search, lens)
     if found.of_x is None:
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.lens, len(search.tried), None, notes)
+        return Matched(search.geometries, None, search.view.lens, None, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     if matcher.minds_roll:
         search.match(everything, upright)
@@ -276,7 +275,7 @@ def match_with_robot(
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.lens, len(search.tried), upright, notes, warnings)
+    return Matched(kept, found, search.view.lens, upright, notes, warnings)
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:

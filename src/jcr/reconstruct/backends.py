@@ -17,8 +17,6 @@ from jcr.reconstruct.hub import HUB_FILES, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
-
-CC_BY_NC = "CC BY-NC 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc/4.0/)"
 INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps depth-anything-3"
 """Without what the package asks for beside these, numpy below 2 among it; its network uses none of it."""
 
@@ -56,15 +54,14 @@ def _views_at_once(
 ) -> Reconstruction:
     """All models that see every view at once: their rows name the adapter."""
     extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.reconstruct.views_at_once import da3, mapanything, pi3x, vggt
+    from jcr.reconstruct.views_at_once import da3, mapanything
     from jcr.reconstruct.views_at_once.cost import Cost
     from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
 
     row = BACKENDS[options.backend]
-    adapter = {"da3": da3, "da3-small": da3, "mapanything": mapanything, "vggt": vggt, "pi3x": pi3x}[row.name]
     made = ViewsOptions(
         row.name,
-        adapter.load,
+        mapanything.load if row.name == "mapanything" else da3.load,
         weights_folder(options),
         weights_of(options)[1],
         Cost(*row.cost),
@@ -256,32 +253,6 @@ BACKENDS: dict[str, Backend] = {
             install="pip install git+https://github.com/facebookresearch/map-anything",
             takes_poses=True,
             cost=(5.0, 0.4, 20.0, 4.0),
-        ),
-        Backend(
-            "vggt",
-            _views_at_once,
-            "VGGT licence, non-commercial use only (https://github.com/facebookresearch/vggt)",
-            options=("weights",),
-            hub_id="facebook/VGGT-1B",
-            package="vggt",
-            install="pip install git+https://github.com/facebookresearch/vggt",
-            parameters=1257,
-            download_gb=5.0,
-            commercial=False,
-            cost=(5.2, 0.4, 20.0, 4.0),
-        ),
-        Backend(
-            "pi3x",
-            _views_at_once,
-            CC_BY_NC,
-            metric=True,
-            options=("weights",),
-            hub_id="yyfz233/Pi3X",
-            package="pi3",
-            install="pip install git+https://github.com/yyfz/Pi3",
-            commercial=False,
-            takes_poses=True,
-            cost=(6.0, 0.4, 20.0, 4.0),
         ),
         Backend(
             "direct",

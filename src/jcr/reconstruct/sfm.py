@@ -206,7 +206,7 @@ def _matched(
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
-        matched = Matched(matcher.geometries(pairs, np.zeros((len(pairs), 2))), None, working, len(pairs))
+        matched = Matched(matcher.geometries(pairs, np.zeros((len(pairs), 2))), None, working)
     else:
         matched = match_with_robot(
             matcher,

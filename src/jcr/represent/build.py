@@ -2,6 +2,9 @@
 
 import math
 import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -12,7 +15,6 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.progress import Progress, silent
-from jcr.reconstruct.threads import threads_of_one_core
 from jcr.records import PointCloud
 from jcr.represent.clear import with_clear_cells
 from jcr.represent.fields import Field, Fields, FieldShape, Lattice
@@ -106,3 +108,19 @@ def feature_lattices(seen: SeenGrid) -> list[Lattice]:
         Lattice.around(dilate(halve(hit), math.ceil(NEAR)), seen.lower, cell),
         Lattice.around(dilate(hit, 1), seen.lower, cell / 2),
     ]
+
+
+@contextmanager
+def threads_of_one_core(device: torch.device, count: int | None = None) -> Iterator[Executor]:
+    """`count` threads, by default one for each core, in which torch works without threads of its own; one on a GPU.
+
+    Torch's own wait for each other, spinning, after each of thousands of short operations: where another process takes
+    one core, the training that should last a second lasted a minute.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor((count or threads) if device.type == "cpu" else 1) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)

@@ -202,7 +202,7 @@ def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, 
     middle = float(np.median(height[around]))
     spread = 1.4826 * float(np.median(np.abs(height[around] - middle)))
     # Where matching windows straddle a rim, depth is drawn down. The median of a wide top does not suffer; that of
-    # a top that is all rim does, by a cell at most. The cube was fitted to scenes 3 to 5 of `jcr bench table2`.
+    # a top that is all rim does, by a cell at most. The cube was fitted to scenes 3 to 5 of the bench table2.
     top = binary_closing(_counted(x_in_support[around, :2]) > 0, np.ones((3, 3)))
     narrow = 1 - binary_erosion(top, np.ones((3, 3))).sum() / max(top.sum(), 1)
     rim, above_lid = _rim(x_in_support[height > middle - 2.5 * width])

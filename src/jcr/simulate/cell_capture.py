@@ -19,12 +19,20 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, steps
 from jcr.records import Intrinsics
-from jcr.simulate.cell import about_posture, effective_exchanged, looking_at
 from jcr.simulate.objects import held_package
 from jcr.simulate.options import SimulateOptions
-from jcr.simulate.poses import gripper_poses, random_hand_eye
+from jcr.simulate.poses import gripper_poses, looking_at, random_hand_eye
 from jcr.simulate.render import render
-from jcr.simulate.robots import EFFECTIVE_POSES, bend, effective_about, hand_eye_on, patterned, table_center
+from jcr.simulate.robots import (
+    EFFECTIVE_POSES,
+    about_posture,
+    bend,
+    effective_about,
+    effective_exchanged,
+    hand_eye_on,
+    patterned,
+    table_center,
+)
 from jcr.simulate.scenes import Scene, make_scene, moved
 from jcr.simulate.taken import degraded, encoded, pinhole, with_lens_error, with_robot_noise
 from jcr.simulate.truth import Truth

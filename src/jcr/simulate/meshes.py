@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial.distance import cdist
 
 Triple = tuple[float, float, float]
 
@@ -97,26 +96,3 @@ def tube(path: Float[ndarray, "n 3"], radius: float, segments: int = 12) -> Mesh
     ring = np.cos(2 * np.pi * turn) * side[:, None] + np.sin(2 * np.pi * turn) * other[:, None]
     along = np.linspace(0, 1, len(path))[:, None]
     return _grid(path[:, None] + radius * ring, np.stack(np.broadcast_arrays(turn[..., 0], along), -1))
-
-
-def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-    """How often the surface winds around each point: 1 within a closed one, 0 outside; parts add up.
-
-    The triangles' solid angles (van Oosterom and Strackee 1983, eq. 8) over 4π, as in Jacobson et al. 2013.
-    """
-    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
-    # With the corners seen from x, a' = a - x, both the volume a'·(b'×c') and a'·b' are polynomials in x.
-    normal = np.cross(a, b) + np.cross(b, c) + np.cross(c, a)
-    volume = (a * np.cross(b, c)).sum(-1)
-
-    def dot(p: ndarray, q: ndarray, x: ndarray) -> Float[ndarray, "k f"]:
-        return (p * q).sum(-1) - x @ (p + q).T + (x * x).sum(-1, keepdims=True)
-
-    turns = np.empty(len(points))
-    # In blocks that stay within the cache.
-    for start in range(0, len(points), 128):
-        x = points[start : start + 128]
-        la, lb, lc = cdist(x, mesh.vertices)[:, mesh.faces].transpose(2, 0, 1)
-        cosines = la * lb * lc + dot(a, b, x) * lc + dot(b, c, x) * la + dot(c, a, x) * lb
-        turns[start : start + 128] = np.arctan2(volume - x @ normal.T, cosines).sum(-1) / (2 * np.pi)
-    return turns

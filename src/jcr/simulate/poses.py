@@ -46,6 +46,17 @@ def random_hand_eye(rng: np.random.Generator) -> Float[ndarray, "4 4"]:
     return transform(rotation, np.array([aside * np.cos(side), aside * np.sin(side), ahead]))
 
 
+def looking_at(
+    place: Float[ndarray, "3"], target: Float[ndarray, "3"], rng: np.random.Generator
+) -> Float[ndarray, "4 4"]:
+    """base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
+    z = target - place + 0.03 * rng.normal(size=3)
+    z /= np.linalg.norm(z)
+    x = np.cross(z, rng.normal(size=3))
+    x /= np.linalg.norm(x)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
 def gripper_poses(
     pattern: Pattern,
     count: int,

@@ -13,9 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, rotation_exp, scale_translation, skew, transform
+from jcr.geometry import inverse, retract, rotation_exp, skew, step_between, transform
+from jcr.handeye.equation import predict, residuals
 from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
-from jcr.handeye.known_scale import Fit, fit_known_scale
+from jcr.handeye.known_scale import FREE, Fit, fit_known_scale
 from jcr.handeye.robots import (
     Arm,
     ErrorSizes,
@@ -28,7 +29,6 @@ from jcr.handeye.robots import (
     kinematic_jacobian,
 )
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
-from jcr.simulate.problem import HandEyeProblem, disturbed
 
 ALL_KINDS: tuple[Kind, ...] = ("joint", "link", "sag", "gear")
 EFFECTIVE_POSES = 120
@@ -49,6 +49,8 @@ ASIDE, START_SPREAD, LOOKING_STEPS = 0.35, 0.7, 15
 search for a view begins, and its steps."""
 REACHING_STEPS = 16
 """Of other arms towards a wished view; where that leaves them is the view."""
+STRIDE = 0.4
+"""rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
 
@@ -246,20 +248,6 @@ def patterned(
     return posture.joints
 
 
-def effective_hand_eye_about(
-    bent: BentArm,
-    gripper_from_camera: Float[ndarray, "4 4"],
-    count: int,
-    rng: np.random.Generator,
-    target_in_base: Float[ndarray, "3"] | None = None,
-) -> Float[ndarray, "4 4"]:
-    """The effective gripper_from_camera (4,4) of a bent arm over the workspace of a capture of `count` `views`.
-
-    Other poses of the same views: a capture of few does not reach where the pattern's later ones are.
-    """
-    return effective_about(bent, gripper_from_camera, count, rng, target_in_base).gripper_from_camera
-
-
 def effective_about(
     bent: BentArm,
     gripper_from_camera: Float[ndarray, "4 4"],
@@ -267,7 +255,12 @@ def effective_about(
     rng: np.random.Generator,
     target_in_base: Float[ndarray, "3"] | None = None,
 ) -> Fit:
-    """The same with the effective base, from the one in which the true poses are."""
+    """The effective gripper_from_camera of a bent arm over the workspace of a capture of `count` `views`.
+
+    With it comes the effective base, from the one in which the true poses are.
+
+    Other poses of the same views: a capture of few does not reach where the pattern's later ones are.
+    """
     captures = -(-EFFECTIVE_POSES // count)
     others = [views(bent.arm, count, gripper_from_camera, rng, target_in_base) for _ in range(captures)]
     joints = np.concatenate(others)
@@ -276,61 +269,33 @@ def effective_about(
     return fit_known_scale(bent.reported(joints), cameras, start, EFFECTIVE_NOISE)
 
 
-def effective_hand_eye(
-    reported: Float[ndarray, "n 4 4"],
-    base_from_camera: Float[ndarray, "n 4 4"],
-    gripper_from_camera: Float[ndarray, "4 4"],
-) -> Float[ndarray, "4 4"]:
-    """gripper_from_camera (4,4) that with a free base best predicts exact cameras from reported poses, scale known.
-
-    Weighted least squares (1 mm and 2 mrad count alike), started from the physical transform.
-    """
-    start = gripper_from_camera, np.eye(4)
-    return fit_known_scale(reported, base_from_camera, start, EFFECTIVE_NOISE).gripper_from_camera
+def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
+    """Joint angles (count,dof) about those of a posture; the wrist moves most."""
+    width = STRIDE * np.array([0.5, 0.5, 0.5, 1.5, 1.5, 2.0])
+    return posture + width * rng.uniform(-1, 1, (count, arm.dof))
 
 
-@dataclass(frozen=True)
-class BentProblem(HandEyeProblem):
-    """A hand-eye problem of a bent arm; `gripper_from_camera` is the effective one."""
-
-    bent: BentArm
-    joints: Float[ndarray, "n dof"]
-    physical_gripper_from_camera: Float[ndarray, "4 4"]
-
-    @property
-    def base_from_camera(self) -> Float[ndarray, "n 4 4"]:
-        """Where the cameras were."""
-        return self.true_base_from_gripper @ self.physical_gripper_from_camera
-
-
-def bent_problem(
-    arm: Arm,
-    errors: ArmErrors | PresetName,
-    count: int,
-    seed: int,
-    camera_noise: tuple[float, float] = (5e-5, np.radians(0.005)),
-) -> BentProblem:
-    """A random bent arm, hand-eye transform, reconstruction frame and scale, and `count` views of a table.
-
-    `camera_noise` is one sigma (m, rad) per axis of the reconstructed cameras.
-    """
-    errors = PRESETS[errors] if isinstance(errors, str) else errors
-    hand_eye, motion, arms, noise, elsewhere = (np.random.default_rng([seed, k]) for k in range(5))
-    physical = hand_eye_on(arm, hand_eye)
-    bent = bend(arm, errors.sizes, arms)
-    joints = views(arm, count, physical, motion)
-    true = bent.true(joints)
-    effective = effective_hand_eye_about(bent, physical, count, elsewhere)
-    recon_from_base = transform(rotation_exp(noise.normal(size=3)), noise.normal(size=3))
-    scale = float(np.exp(noise.uniform(-2, 2)))
-    cameras = disturbed(recon_from_base @ true @ physical, camera_noise, noise)
-    return BentProblem(
-        disturbed(bent.reported(joints), errors.white, noise),
-        scale_translation(cameras, 1 / scale),
-        effective,
-        scale,
-        true,
-        bent,
-        joints,
-        physical,
-    )
+def effective_exchanged(
+    bent: BentArm,
+    joints: Joints,
+    base_from_camera: Float[ndarray, "4 4"],
+    gripper_from_object: Float[ndarray, "4 4"],
+) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]:
+    """The pair that from reported poses best predicts where the camera sees the object; as effective_about."""
+    reported, true = bent.reported(joints), bent.true(joints)
+    object_from_camera = inverse(true @ gripper_from_object) @ base_from_camera
+    x, z, weight = base_from_camera, gripper_from_object, 1 / np.repeat(EFFECTIVE_NOISE, 3)
+    for _ in range(30):
+        predicted = predict(x, 1.0, z, object_from_camera)
+        off = step_between(reported, inverse(predicted))
+        rotation_t = np.swapaxes(predicted[:, :3, :3], 1, 2)
+        to_inverse = np.zeros((len(true), 6, 6))
+        to_inverse[:, :3, :3] = to_inverse[:, 3:, 3:] = -rotation_t
+        to_inverse[:, :3, 3:] = -rotation_t @ skew(predicted[:, :3, 3])
+        j = to_inverse @ residuals(x, 1.0, z, inverse(reported), object_from_camera)[1]
+        rows = (weight[:, None] * j[:, :, FREE]).reshape(-1, len(FREE))
+        step = -np.linalg.lstsq(rows, (weight * off).ravel(), rcond=1e-9)[0]
+        x, z = retract(x, step[:6]), retract(z, step[6:])
+        if np.abs(step).max() < 1e-12:
+            break
+    return x, z

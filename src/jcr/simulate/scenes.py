@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import apply, inverse, transform
+from jcr.geometry import transform
 from jcr.simulate import textures
-from jcr.simulate.meshes import box, winding_number
+from jcr.simulate.meshes import box
 from jcr.simulate.objects import CATALOGUE, Part, TableObject
 from jcr.simulate.truth import TrueObject
 
@@ -99,22 +99,6 @@ def moved(scene: Scene, center_in_base: Float[ndarray, "3"]) -> Scene:
     return replace(
         scene, table_center_in_base=center_in_base, objects=objects, light_in_base=scene.light_in_base + shift
     )
-
-
-def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
-    """Label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
-    table_frame = transform(np.eye(3), scene.table_center_in_base)
-    solids = [(table_frame, scene.table), *((thing.base_from_object, thing.parts) for thing in scene.objects)]
-    labels = np.zeros(len(x_in_base), np.int64)
-    for label, (base_from_solid, parts) in enumerate(solids, start=1):
-        x_in_solid = apply(inverse(base_from_solid), x_in_base)
-        corners = np.concatenate([part.mesh.vertices for part in parts])
-        near = ((x_in_solid >= corners.min(0)) & (x_in_solid <= corners.max(0))).all(1)
-        turns = sum(
-            (winding_number(part.mesh, x_in_solid[near]) for part in parts), start=np.zeros(near.sum())
-        )
-        labels[np.flatnonzero(near)[turns > 0.5]] = label
-    return labels
 
 
 def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:

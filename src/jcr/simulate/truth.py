@@ -7,16 +7,14 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jcr.camera import rays
 from jcr.capture.images import encode_png
 from jcr.capture.plain_files import first_fault, read_json
 from jcr.errors import InputError
 from jcr.files import read_bytes, write_bytes, write_text
-from jcr.geometry import apply
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
 from jcr.simulate.robots import BentArm
@@ -167,25 +165,6 @@ def true_depth(truth: Truth, image: int) -> Float[ndarray, "h w"]:
 def true_labels(truth: Truth, image: int) -> UInt8[ndarray, "h w"]:
     """Labels of the pixels of one image."""
     return _read(_path(truth, "labels", image))
-
-
-def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
-    """The surface that the images show: points in the base frame (n,3) m, one a pixel, and their labels (n,).
-
-    Table and objects within the workspace box. InputError where the depth was not written (`--truth scene`).
-    """
-    truth = read_truth(folder)
-    camera = truth.intrinsics
-    rays_in_camera = rays(camera)
-    low, high = truth.workspace_in_base
-    points, labels = [], []
-    for k, base_from_camera in enumerate(truth.base_from_camera):
-        depth, label = true_depth(truth, k), true_labels(truth, k)
-        x_in_base = apply(base_from_camera, depth[..., None] * rays_in_camera)
-        shown = (label > 0) & ((x_in_base >= low) & (x_in_base <= high)).all(-1)
-        points.append(x_in_base[shown])
-        labels.append(label[shown].astype(np.int64))
-    return np.concatenate(points), np.concatenate(labels)
 
 
 def _folder(truth: Truth) -> Path:

@@ -34,8 +34,6 @@ class MapPoints:
     occupancy: Float[ndarray, " n"]
     color: UInt8[ndarray, "n 3"]
     label: Int[ndarray, " n"]
-    spacing: float
-    """Metres between neighbours, about."""
 
 
 def map_points(scene: SceneMap, seed: int = 0) -> MapPoints:
@@ -49,8 +47,7 @@ def map_points(scene: SceneMap, seed: int = 0) -> MapPoints:
     answer = scene.query(x)
     known = np.flatnonzero(~answer.unknown & (answer.occupancy >= LEAST))[:MAP_POINTS]
     color = (255 * answer.color[known]).clip(0, 255).astype(np.uint8)
-    spacing = cell * float(min(1.0, (hit.sum() / max(2 * MAP_POINTS, 1)) ** (1 / 3)))
-    return MapPoints(x[known], answer.occupancy[known], color, answer.label[known], spacing)
+    return MapPoints(x[known], answer.occupancy[known], color, answer.label[known])
 
 
 def unknown_edge(scene: SceneMap) -> tuple[Float[ndarray, "v 3"], Integer[ndarray, "f 3"]]:

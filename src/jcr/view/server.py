@@ -1,4 +1,4 @@
-"""The web server of the viewer: viser, held to one address and port, its sharing through others' machines off."""
+"""The web server of the viewer: viser, held to this machine and one port, its sharing through others' machines off."""
 
 import io
 import socket
@@ -7,6 +7,9 @@ from contextlib import redirect_stdout
 import viser
 
 from jcr.errors import InputError
+
+HOST = "127.0.0.1"
+"""viser has no password and no encryption, so that no other machine may reach it."""
 
 
 class LocalServer(viser.ViserServer):
@@ -22,24 +25,18 @@ class LocalServer(viser.ViserServer):
             super().stop()
 
 
-def open_server(host: str, port: int, title: str) -> LocalServer:
-    """A running server at host and port (0: any free one); InputError where it cannot listen there."""
+def open_server(port: int, title: str) -> LocalServer:
+    """A running server at a port of 127.0.0.1 (0: any free one); InputError where it cannot listen there."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # viser would silently take the next port, and try for ever on an address that is not this machine's.
+    # viser would silently take the next port.
     try:
-        with socket.create_server((host, port), family=family):
+        with socket.create_server((HOST, port)):
             pass
     except OSError as error:
-        cure = "choose another with --port (0 takes any free one), or another --host"
-        raise InputError(f"cannot listen on port {port} of {host} ({error.strerror}); {cure}") from None
+        cure = "choose another with --port (0 takes any free one)"
+        raise InputError(f"cannot listen on port {port} of {HOST} ({error.strerror}); {cure}") from None
     with redirect_stdout(io.StringIO()):
-        server = LocalServer(host=host, port=port, label=title, verbose=False)
+        server = LocalServer(host=HOST, port=port, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a server that listens there."""
-    return host == "localhost" or host == "::1" or host.startswith("127.")

@@ -81,7 +81,7 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
     import torch
     from torch import nn
 
-    from jcr.reconstruct.views_at_once import da3, mapanything, moge, pi3x, vggt
+    from jcr.reconstruct.views_at_once import da3, mapanything, moge
 
     def tensor(values: ndarray) -> Any:
         return torch.tensor(np.asarray(values, np.float32))
@@ -103,39 +103,6 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
                 "depth_conf": torch.ones(1, *depth.shape),
                 "extrinsics": tensor(poses[:, :3])[None],
                 "intrinsics": tensor(edges(matrices))[None],
-            }
-
-    class Vggt(Network):
-        def forward(self, images: Any) -> Any:
-            matrices, depth = scene.seen(images.double().numpy().transpose(0, 2, 3, 1))
-            poses = inverse(scene.recon_from_camera)
-            height, width = depth.shape[1:]
-            encoded = np.concatenate(
-                [
-                    poses[:, :3, 3] / UNIT,
-                    Rotation.from_matrix(poses[:, :3, :3]).as_quat(),
-                    2 * np.arctan(height / 2 / matrices[:, 1, 1])[:, None],
-                    2 * np.arctan(width / 2 / matrices[:, 0, 0])[:, None],
-                ],
-                axis=1,
-            )
-            return {
-                "pose_enc": tensor(encoded)[None],
-                "depth": tensor(depth / UNIT)[None, ..., None],
-                "depth_conf": torch.ones(1, *depth.shape),
-            }
-
-    class Pi3x(Network):
-        def forward(self, images: Any, **known: Any) -> Any:
-            told.update(known)
-            matrices, depth = scene.seen(images[0].double().numpy().transpose(0, 2, 3, 1))
-            told["matrices"] = matrices
-            logits = torch.full((1, *depth.shape, 1), 2.0)
-            logits[0, 0, 0, 0] = -5.0
-            return {
-                "local_points": tensor(points_of(matrices, depth))[None],
-                "conf": logits,
-                "camera_poses": tensor(scene.recon_from_camera)[None],
             }
 
     class MapAnything:
@@ -174,15 +141,13 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
 
     return {
         "da3": lambda views: da3.predict(Da3(), views),
-        "vggt": lambda views: vggt.predict(Vggt(), views),
-        "pi3x": lambda views: pi3x.predict(Pi3x(), views),
         "mapanything": lambda views: mapanything.predict(MapAnything(), views),
         "moge": lambda views: moge.predict(MoGe(), views),
     }
 
 
 @pytest.mark.parametrize("size", [(640, 480), (480, 640), (1000, 700)], ids=str)
-@pytest.mark.parametrize("name", ["da3", "vggt", "pi3x", "mapanything", "moge"])
+@pytest.mark.parametrize("name", ["da3", "mapanything", "moge"])
 def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, int]) -> None:
     from jcr.reconstruct.views_at_once.interface import Views, rays_of
 
@@ -191,7 +156,7 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
     grid = found.grid
     assert all(edge % 14 == 0 for edge in grid.size) or name == "moge"
     unit = 1.0 if found.is_metric else UNIT
-    assert found.is_metric == (name in ("pi3x", "mapanything", "moge"))
+    assert found.is_metric == (name in ("mapanything", "moge"))
 
     # The grid is where the adapter says, so that the true lens on it gives the true rays and depth.
     known = grid.grid_intrinsics(scene.pinhole)
@@ -202,7 +167,7 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
     off = np.linalg.norm(unit * found.x_in_camera - rays * depth[..., None], axis=-1) / depth
     there = found.confidence > 0
     assert np.median(off[there]) < 5e-4 and there.mean() > 0.99
-    assert (found.confidence[0, 0, 0] == 0) == (name in ("pi3x", "mapanything"))
+    assert (found.confidence[0, 0, 0] == 0) == (name == "mapanything")
 
     if name == "moge":
         assert found.recon_from_camera is None
@@ -214,7 +179,7 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
     )
 
 
-@pytest.mark.parametrize("name", ["da3", "pi3x", "mapanything", "moge"])
+@pytest.mark.parametrize("name", ["da3", "mapanything", "moge"])
 def test_what_is_known_is_told_in_the_packages_conventions(name: str) -> None:
     from jcr.reconstruct.views_at_once.interface import Views
 
@@ -231,9 +196,6 @@ def test_what_is_known_is_told_in_the_packages_conventions(name: str) -> None:
             np.testing.assert_allclose(view["camera_poses"][0], pose, atol=1e-6)
         return
     np.testing.assert_allclose(told["intrinsics"][0], edges(matrices), rtol=2e-3, atol=0.06)
-    if name == "pi3x":
-        np.testing.assert_allclose(told["poses"][0], scene.recon_from_camera, atol=1e-6)
-        return
     # Depth Anything 3: from the first camera, in units of the median distance from it.
     given = inverse(told["extrinsics"][0].double().numpy())
     np.testing.assert_allclose(given[0], np.eye(4), atol=1e-6)
@@ -306,30 +268,6 @@ def test_depth_anything_3_agrees_with_its_package() -> None:
     poses[1, 0, 3] = 0.3
     shown = da3.predict(network, Views(images, Intrinsics(400.0, 400.0, 204.5, 149.5, 410, 300), poses))
     assert np.abs(shown.x_in_camera - found.x_in_camera).max() > 1e-4
-
-
-def test_vggts_cameras_are_those_of_its_formula() -> None:
-    """Depth Anything 3's package decodes the same nine numbers, but for recon_from_camera."""
-    decoder = pytest.importorskip("depth_anything_3.model.utils.transform")
-    import torch
-
-    from jcr.reconstruct.views_at_once.interface import pinhole_of_edges
-    from jcr.reconstruct.views_at_once.vggt import cameras
-
-    rng = np.random.default_rng(0)
-    quaternion = rng.normal(size=(5, 4))
-    encoding = np.concatenate(
-        [
-            rng.normal(size=(5, 3)),
-            quaternion / np.linalg.norm(quaternion, axis=1)[:, None],
-            rng.uniform(0.5, 1.2, (5, 2)),
-        ],
-        1,
-    )
-    pose, intrinsics = decoder.pose_encoding_to_extri_intri(torch.tensor(encoding)[None].float(), (392, 518))
-    recon_from_camera, pinholes = cameras(encoding, 392, 518)
-    np.testing.assert_allclose(inverse(recon_from_camera)[:, :3], pose[0, :, :3], atol=1e-5)
-    np.testing.assert_allclose(pinholes, pinhole_of_edges(intrinsics[0].numpy()), rtol=1e-5)
 
 
 def test_moge_agrees_with_its_package() -> None:

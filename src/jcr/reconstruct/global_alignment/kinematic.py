@@ -5,14 +5,12 @@ The unknowns of global alignment's cameras, 6 per image and only up to a similar
 motion then sets the metric scale inside the alignment, pair scales included, instead of after it.
 """
 
-import time
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import InputError
 from jcr.geometry import (
     inverse,
     retract,
@@ -23,25 +21,14 @@ from jcr.geometry import (
 )
 from jcr.handeye.closed_form import initial_estimate
 from jcr.handeye.systematic import REACH
-from jcr.progress import Progress
-from jcr.reconstruct.global_alignment.alignment import (
-    Alignment,
-    AlignOptions,
-    check_connected,
-    check_options,
-    pinhole_of,
-)
 from jcr.reconstruct.global_alignment.gauss_newton import (
     FINE_TOLERANCE,
     NORMAL_SQUARE_MEDIAN,
     Problem,
     Solution,
-    dense_alignment,
     gauss_newton,
-    solve_free,
 )
 from jcr.reconstruct.global_alignment.normal_equations import Layout
-from jcr.reconstruct.global_alignment.observations import weight_is_log
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.global_alignment.pointmap_residuals import State
 
@@ -56,30 +43,6 @@ LEAST_NOISE = 1e-5
 """rad: a tenth of what the best arm repeats."""
 
 
-@dataclass(frozen=True)
-class KinematicOptions:
-    """How camera poses are tied to the gripper poses."""
-
-    robot_noise: tuple[float, float] | None = None
-    """One-sigma noise of the gripper poses per axis, metres and radians; 0 holds them, None estimates it."""
-    align: AlignOptions = field(default_factory=AlignOptions)
-
-
-@dataclass(frozen=True)
-class KinematicAlignment:
-    """A reconstruction in the robot's base frame, in metres, with the hand-eye transform that made it."""
-
-    gripper_from_camera: Float[ndarray, "4 4"]
-    scale: float
-    """Metres per unit of the free alignment, which is the geometric mean of the pairs' units."""
-    base_from_gripper: Float[ndarray, "n 4 4"]
-    """Corrected within the robot pose noise."""
-    covariance: Float[ndarray, "7 7"]
-    """Of gripper_from_camera and log scale, in the order of `records.COVARIANCE_ORDER`."""
-    alignment: Alignment
-    """Here the recon frame is the base frame, in metres."""
-
-
 class HandEyeCameras:
     """Cameras on a gripper: base_from_camera[i] = base_from_gripper[i] · gripper_from_camera."""
 
@@ -87,14 +50,12 @@ class HandEyeCameras:
         self,
         base_from_gripper: Float[ndarray, "n 4 4"],
         gripper_from_camera: Float[ndarray, "4 4"],
-        options: KinematicOptions,
     ) -> None:
         self.measured = base_from_gripper
         self.base_from_gripper = base_from_gripper
         self.gripper_from_camera = gripper_from_camera
-        self.estimated = options.robot_noise is None
-        self.spread = np.repeat(options.robot_noise or (REACH * START_NOISE, START_NOISE), 3)
-        """One sigma of the gripper poses' errors: translation, rotation."""
+        self.spread = np.repeat([REACH * START_NOISE, START_NOISE], 3)
+        """One sigma of the gripper poses' errors, estimated in each step: translation, rotation."""
         self.normal = self.jacobian = np.zeros((0, 0))
 
     @property
@@ -104,8 +65,8 @@ class HandEyeCameras:
 
     @property
     def information(self) -> Float[ndarray, "6"]:
-        """Inverse variance of the gripper poses' errors; 0 where they are held."""
-        return np.where(self.spread == 0, 0.0, 1.0 / np.where(self.spread == 0, 1.0, self.spread) ** 2)
+        """Inverse variance of the gripper poses' errors."""
+        return 1.0 / self.spread**2
 
     def step(
         self, layout: Layout, hessian: Float[ndarray, "p p"], gradient: Float[ndarray, " p"]
@@ -129,18 +90,15 @@ class HandEyeCameras:
         jacobian[6 * images :, 6 + 6 * images :] = np.eye(rest)
         prior = np.concatenate([np.full(6, VAGUE**-2), np.tile(self.information, images), np.zeros(rest)])
         pull = np.concatenate([np.zeros(6), (self.information * self.deviation()).ravel(), np.zeros(rest)])
-        free = np.concatenate([np.ones(6, bool), np.tile(self.spread > 0, images), np.ones(rest, bool)])
 
-        self.normal = (jacobian.T @ hessian @ jacobian + np.diag(prior))[np.ix_(free, free)]
-        self.jacobian = jacobian[: 6 * images, free]
-        full = np.zeros(6 + layout.size)
-        full[free] = -np.linalg.solve(self.normal, (jacobian.T @ gradient + pull)[free])
+        self.normal = jacobian.T @ hessian @ jacobian + np.diag(prior)
+        self.jacobian = jacobian[: 6 * images]
+        full = -np.linalg.solve(self.normal, jacobian.T @ gradient + pull)
         self.gripper_from_camera = retract(self.gripper_from_camera, full[:6])
         correction = to_base @ full[6 : 6 + 6 * images].reshape(-1, 6, 1)
         self.base_from_gripper = retract(self.base_from_gripper, correction[..., 0])
-        if self.estimated:
-            variance = np.linalg.inv(self.normal).diagonal()[6 : 6 + 6 * images].reshape(-1, 6)
-            self.spread = self._estimated_spread(variance)
+        variance = np.linalg.inv(self.normal).diagonal()[6 : 6 + 6 * images].reshape(-1, 6)
+        self.spread = self._estimated_spread(variance)
         return jacobian @ full
 
     def _estimated_spread(self, variance: Float[ndarray, "n 6"]) -> Float[ndarray, "6"]:
@@ -154,13 +112,6 @@ class HandEyeCameras:
         """Of the cameras' steps, r = 6n, from the equations of the last one."""
         return self.jacobian @ np.linalg.solve(self.normal, self.jacobian.T)
 
-    def hand_eye_covariance(self, pairs: int) -> Float[ndarray, "7 7"]:
-        """Of gripper_from_camera and the mean log pair scale, in the order of COVARIANCE_ORDER."""
-        functional = np.zeros((7, len(self.normal)))
-        functional[:6, :6] = np.eye(6)
-        functional[6, -pairs:] = 1.0 / pairs
-        return functional @ np.linalg.solve(self.normal, functional.T)
-
     def strain(self) -> Float[ndarray, " n"]:
         """By how many standard deviations of the robot pose noise each gripper pose had to move, at most."""
         return np.abs(self.deviation() * np.sqrt(self.information)).max(axis=1)
@@ -170,54 +121,12 @@ class HandEyeCameras:
         return step_between(np.eye(4), inverse(self.measured) @ self.base_from_gripper)
 
 
-def align_kinematic(
-    predictions: PairPredictions,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    options: KinematicOptions | None = None,
-    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
-    progress: Progress | None = None,
-) -> KinematicAlignment:
-    """Solve for gripper_from_camera and the reconstruction together, gripper poses under the robot pose noise.
-
-    The start is a free alignment and a hand-eye transform in closed form, or the one given. Motions that
-    leave a direction unobservable show in the covariance. Raises InputError as `align` does, and where there
-    are fewer than 3 images, or gripper poses of another number.
-    """
-    options = options or KinematicOptions()
-    begin = time.perf_counter()
-    check_options(options.align)
-    check_connected(predictions)
-    count = predictions.image_count
-    if len(base_from_gripper) != count:
-        raise InputError(f"{len(base_from_gripper)} gripper poses for {count} images; give one for each")
-    if count < 3:
-        raise InputError(f"kinematic alignment needs 3 images or more, there are {count}; take more")
-    problem = Problem(predictions, pinhole_of(predictions, options.align), weight_is_log(predictions))
-    free = solve_free(problem, options.align)
-    solution, cameras = solve_kinematic(problem, free, base_from_gripper, options, gripper_from_camera)
-    alignment = dense_alignment(problem, solution, begin, progress)
-    warnings = (*alignment.warnings, *contradictions(cameras, predictions))
-    return KinematicAlignment(
-        gripper_from_camera=cameras.gripper_from_camera,
-        scale=float(np.exp(solution.state.log_pair_scale.mean())),
-        base_from_gripper=cameras.base_from_gripper,
-        covariance=cameras.hand_eye_covariance(len(predictions.edges)),
-        alignment=replace(alignment, method="kinematic", warnings=warnings),
-    )
-
-
 def solve_kinematic(
-    problem: Problem,
-    free: Solution,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    options: KinematicOptions,
-    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    problem: Problem, free: Solution, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Solution, HandEyeCameras]:
     """Kinematic alignment, base frame and metres, from a free one; raises as `gauss_newton` does."""
     start, scale, _ = initial_estimate(base_from_gripper, free.state.recon_from_camera)
-    cameras = HandEyeCameras(
-        base_from_gripper, start if gripper_from_camera is None else gripper_from_camera, options
-    )
+    cameras = HandEyeCameras(base_from_gripper, start)
     state = replace(rescaled(free.state, scale), recon_from_camera=cameras.recon_from_camera)
     spread = free.pair_spread * np.repeat([scale, 1.0], 3)
     solution = gauss_newton(free.images, state, problem.layout, cameras, spread, FINE_TOLERANCE)
@@ -238,15 +147,15 @@ def rescaled(state: State, factor: float) -> State:
 def contradictions(cameras: HandEyeCameras, predictions: PairPredictions) -> tuple[str, ...]:
     """A warning that names the images whose gripper pose had to move further than the robot pose noise explains.
 
-    Where that noise is estimated, four images or fewer cannot tell a wrong pose from a bad robot.
+    That noise is estimated, and four images or fewer cannot tell a wrong pose from a bad robot.
     """
     strain = cameras.strain()
-    if strain.max() <= STRAIN or (cameras.estimated and len(strain) < 5):
+    if strain.max() <= STRAIN or len(strain) < 5:
         return ()
     names = [
         predictions.images[k] if predictions.images else f"#{k}" for k in np.flatnonzero(strain > STRAIN)
     ]
     return (
         f"the images contradict the gripper poses of {', '.join(names)} by up to {strain.max():.0f} times the "
-        "robot pose noise; these poses are wrong, or --robot-noise is too small",
+        "robot pose noise; these poses are wrong",
     )

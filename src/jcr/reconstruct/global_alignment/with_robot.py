@@ -19,12 +19,7 @@ from jcr.reconstruct.global_alignment.alignment import (
     pinhole_of,
 )
 from jcr.reconstruct.global_alignment.gauss_newton import Problem, Solution, dense_alignment, solve_free
-from jcr.reconstruct.global_alignment.kinematic import (
-    KinematicOptions,
-    contradictions,
-    rescaled,
-    solve_kinematic,
-)
+from jcr.reconstruct.global_alignment.kinematic import contradictions, rescaled, solve_kinematic
 from jcr.reconstruct.global_alignment.observations import weight_is_log
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.records import CameraEvidence
@@ -63,7 +58,7 @@ def align_with_robot(
     problem = Problem(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
     free = solve_free(problem, options)
     evidence = CameraEvidence(free.state.recon_from_camera, free.cameras.covariance())
-    kinematic, note, warnings = _kinematic_if_better(problem, free, base_from_gripper, options)
+    kinematic, note, warnings = _kinematic_if_better(problem, free, base_from_gripper)
     alignment = dense_alignment(problem, kinematic or free, begin, progress)
     method = "fast" if kinematic is None else "kinematic"
     alignment = replace(
@@ -76,16 +71,14 @@ def align_with_robot(
 
 
 def _kinematic_if_better(
-    problem: Problem, free: Solution, base_from_gripper: Float[ndarray, "n 4 4"], options: AlignOptions
+    problem: Problem, free: Solution, base_from_gripper: Float[ndarray, "n 4 4"]
 ) -> tuple[Solution | None, str, tuple[str, ...]]:
     """Kinematic alignment in the frame and unit of the free one, or None; what speaks for the choice; and warnings."""
     count = problem.predictions.image_count
     if count < 3:
         return None, f"cameras aligned freely: {count} images are too few to tie them to the robot", ()
     try:
-        kinematic, cameras = solve_kinematic(
-            problem, free, base_from_gripper, KinematicOptions(align=options)
-        )
+        kinematic, cameras = solve_kinematic(problem, free, base_from_gripper)
     except (NotTrustedError, np.linalg.LinAlgError):
         return None, "cameras aligned freely: tied to the robot's poses they came to nothing", ()
     contradicted = contradictions(cameras, problem.predictions)

@@ -1,4 +1,4 @@
 """Networks that see all views at once: images in, depth, confidence and cameras of every view out.
 
-An adapter each (da3, mapanything, vggt, pi3x, moge) converts its package's conventions to ours; all else is shared.
+An adapter each (da3, mapanything, moge) converts its package's conventions to ours; all else is shared.
 """

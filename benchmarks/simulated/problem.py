@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
+from jcr.geometry import rotation_exp, scale_translation, step_between, transform
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 
 TARGET_IN_BASE = np.array([0.5, 0.0, 0.0])
@@ -74,12 +74,3 @@ def error(
     return np.r_[
         step_between(gripper_from_camera, problem.gripper_from_camera), np.log(problem.scale / scale)
     ]
-
-
-def unit_similarity(
-    recon_from_camera: Float[ndarray, "n 4 4"], rng: np.random.Generator
-) -> tuple[Float[ndarray, "n 4 4"], float]:
-    """The same reconstruction in another frame and unit, and the factor on its unit."""
-    factor = float(np.exp(rng.uniform(-3, 3)))
-    other_from_recon = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
-    return inverse(other_from_recon) @ scale_translation(recon_from_camera, factor), factor

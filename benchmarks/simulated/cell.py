@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.observations import LENS
+from benchmarks.simulated.problem import disturbed
 from jcr.adjust.robots import ArmPoses
 from jcr.adjust.scene import Observations
 from jcr.camera import project
@@ -19,28 +21,23 @@ from jcr.geometry import (
     apply,
     apply_similarity,
     inverse,
-    retract,
     rotation_exp,
-    skew,
-    step_between,
     transform,
 )
 from jcr.handeye.arms import arm_named
-from jcr.handeye.equation import predict, residuals
-from jcr.handeye.known_scale import FREE, fit_known_scale
-from jcr.handeye.robots import Arm, Joints
+from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
-from jcr.simulate.observations import LENS
-from jcr.simulate.poses import random_hand_eye
-from jcr.simulate.problem import disturbed
+from jcr.simulate.poses import looking_at, random_hand_eye
 from jcr.simulate.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
     PRESETS,
     BentArm,
     PresetName,
+    about_posture,
     bend,
+    effective_exchanged,
     hand_eye_on,
     table_center,
     views,
@@ -53,8 +50,6 @@ TABLE = np.array([[-0.25, -0.25, 0.0], [0.25, 0.25, 0.12]])
 BOX = np.array([0.16, 0.12, 0.1])
 """m: the thing in the gripper, its middle this far ahead of the gripper's frame."""
 BOX_AHEAD = 0.12
-STRIDE = 0.4
-"""rad by which joints move about a posture while the box is watched."""
 
 
 @dataclass(frozen=True)
@@ -207,55 +202,12 @@ def _drawn(preset: PresetName, rng: np.random.Generator) -> BentArm:
     return bend(arm_named("ur5e"), PRESETS[preset].sizes, rng)
 
 
-def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
-    """Postures about one; the wrist moves most."""
-    width = STRIDE * np.array([0.5, 0.5, 0.5, 1.5, 1.5, 2.0])
-    return posture + width * rng.uniform(-1, 1, (count, arm.dof))
-
-
-def looking_at(
-    place: Float[ndarray, "3"], target: Float[ndarray, "3"], rng: np.random.Generator
-) -> Float[ndarray, "4 4"]:
-    """base_from_camera at a place, the target nearly in the middle of its image, rolled at random."""
-    z = target - place + 0.03 * rng.normal(size=3)
-    z /= np.linalg.norm(z)
-    x = np.cross(z, rng.normal(size=3))
-    x /= np.linalg.norm(x)
-    return transform(np.stack([x, np.cross(z, x), z], axis=1), place)
-
-
 def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3"]]:
     """Points on the faces of the box, and the faces' normals."""
     axis, side = rng.integers(0, 3, points), rng.choice([-1.0, 1.0], points)
     x = rng.uniform(-0.5, 0.5, (points, 3))
     x[np.arange(points), axis] = 0.5 * side
     return x * BOX, side[:, None] * np.eye(3)[axis]
-
-
-def effective_exchanged(
-    bent: BentArm,
-    joints: Joints,
-    base_from_camera: Float[ndarray, "4 4"],
-    gripper_from_object: Float[ndarray, "4 4"],
-) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]:
-    """The pair that from reported poses best predicts where the camera sees the object; as effective_hand_eye."""
-    reported, true = bent.reported(joints), bent.true(joints)
-    object_from_camera = inverse(true @ gripper_from_object) @ base_from_camera
-    x, z, weight = base_from_camera, gripper_from_object, 1 / np.repeat(EFFECTIVE_NOISE, 3)
-    for _ in range(30):
-        predicted = predict(x, 1.0, z, object_from_camera)
-        off = step_between(reported, inverse(predicted))
-        rotation_t = np.swapaxes(predicted[:, :3, :3], 1, 2)
-        to_inverse = np.zeros((len(true), 6, 6))
-        to_inverse[:, :3, :3] = to_inverse[:, 3:, 3:] = -rotation_t
-        to_inverse[:, :3, 3:] = -rotation_t @ skew(predicted[:, :3, 3])
-        j = to_inverse @ residuals(x, 1.0, z, inverse(reported), object_from_camera)[1]
-        rows = (weight[:, None] * j[:, :, FREE]).reshape(-1, len(FREE))
-        step = -np.linalg.lstsq(rows, (weight * off).ravel(), rcond=1e-9)[0]
-        x, z = retract(x, step[:6]), retract(z, step[6:])
-        if np.abs(step).max() < 1e-12:
-            break
-    return x, z
 
 
 def _seen(

@@ -1,0 +1,1 @@
+"""Problems and machines with known answers, without images: for benches, tests and examples."""

@@ -1,0 +1,72 @@
+"""What is solid in a simulated scene, and the surface that its images show."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial.distance import cdist
+
+from jcr.camera import rays
+from jcr.geometry import apply, inverse, transform
+from jcr.simulate.meshes import Mesh
+from jcr.simulate.scenes import Scene
+from jcr.simulate.truth import read_truth, true_depth, true_labels
+
+
+def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
+    """Label of the solid that each point (n,3) m lies within: the table, an object, or 0 for none."""
+    table_frame = transform(np.eye(3), scene.table_center_in_base)
+    solids = [(table_frame, scene.table), *((thing.base_from_object, thing.parts) for thing in scene.objects)]
+    labels = np.zeros(len(x_in_base), np.int64)
+    for label, (base_from_solid, parts) in enumerate(solids, start=1):
+        x_in_solid = apply(inverse(base_from_solid), x_in_base)
+        corners = np.concatenate([part.mesh.vertices for part in parts])
+        near = ((x_in_solid >= corners.min(0)) & (x_in_solid <= corners.max(0))).all(1)
+        turns = sum(
+            (winding_number(part.mesh, x_in_solid[near]) for part in parts), start=np.zeros(near.sum())
+        )
+        labels[np.flatnonzero(near)[turns > 0.5]] = label
+    return labels
+
+
+def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+    """How often the surface winds around each point: 1 within a closed one, 0 outside; parts add up.
+
+    The triangles' solid angles (van Oosterom and Strackee 1983, eq. 8) over 4π, as in Jacobson et al. 2013.
+    """
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    # With the corners seen from x, a' = a - x, both the volume a'·(b'×c') and a'·b' are polynomials in x.
+    normal = np.cross(a, b) + np.cross(b, c) + np.cross(c, a)
+    volume = (a * np.cross(b, c)).sum(-1)
+
+    def dot(p: ndarray, q: ndarray, x: ndarray) -> Float[ndarray, "k f"]:
+        return (p * q).sum(-1) - x @ (p + q).T + (x * x).sum(-1, keepdims=True)
+
+    turns = np.empty(len(points))
+    # In blocks that stay within the cache.
+    for start in range(0, len(points), 128):
+        x = points[start : start + 128]
+        la, lb, lc = cdist(x, mesh.vertices)[:, mesh.faces].transpose(2, 0, 1)
+        cosines = la * lb * lc + dot(a, b, x) * lc + dot(b, c, x) * la + dot(c, a, x) * lb
+        turns[start : start + 128] = np.arctan2(volume - x @ normal.T, cosines).sum(-1) / (2 * np.pi)
+    return turns
+
+
+def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:
+    """The surface that the images show: points in the base frame (n,3) m, one a pixel, and their labels (n,).
+
+    Table and objects within the workspace box. InputError where the depth was not written (`--truth scene`).
+    """
+    truth = read_truth(folder)
+    camera = truth.intrinsics
+    rays_in_camera = rays(camera)
+    low, high = truth.workspace_in_base
+    points, labels = [], []
+    for k, base_from_camera in enumerate(truth.base_from_camera):
+        depth, label = true_depth(truth, k), true_labels(truth, k)
+        x_in_base = apply(base_from_camera, depth[..., None] * rays_in_camera)
+        shown = (label > 0) & ((x_in_base >= low) & (x_in_base <= high)).all(-1)
+        points.append(x_in_base[shown])
+        labels.append(label[shown].astype(np.int64))
+    return np.concatenate(points), np.concatenate(labels)

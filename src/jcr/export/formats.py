@@ -1,0 +1,359 @@
+"""The table of formats: a run's calibration and map as other tools read them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jcr.errors import InputError
+from jcr.export import ros
+from jcr.export.options import ExportOptions, FormatName
+from jcr.export.provenance import Provenance
+from jcr.files import write_text
+from jcr.geometry import transform
+from jcr.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.cell.cameras_json import CameraPlaced
+    from jcr.export.views import PosedImages
+    from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
+    from jcr.represent.scene import SceneMap
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row of the table."""
+
+    name: FormatName
+    file: str
+    """In OUT/export, where the user names none; ends with / for a folder."""
+    about: str
+    write: Callable[["Run", Path], None]
+
+
+def export_run(
+    out: str | Path, format: FormatName, path: str | Path | None = None, **options: object
+) -> Path:
+    """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
+
+    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does; if the
+    calibration is rejected, the file says so.
+    """
+    named = None if path is None else Path(path)
+    made = ExportOptions(**options)  # pyright: ignore[reportArgumentType]
+    return written(Path(out), format, named, made)[2]
+
+
+def written(
+    out: Path, format: FormatName, path: Path | None, options: ExportOptions
+) -> "tuple[Run, Format, Path]":
+    """Write a run folder in a format, and return what was exported, the row of the table and the path.
+
+    Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it needs.
+    """
+    row = next((row for row in FORMATS if row.name == format), None)
+    if row is None:
+        raise InputError(f"{format}: no such format; choose one of {', '.join(get_args(FormatName))}")
+    if options.root_from_optical and not options.to_root:
+        raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
+    run = Run(out, options)
+    path = path or out / "export" / row.file
+    if path.is_dir() and not row.file.endswith("/"):
+        raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    row.write(run, path)
+    return run, row, path
+
+
+class Run:
+    """A run folder and how to export it; what a format does not need is not read."""
+
+    def __init__(self, out: Path, options: ExportOptions) -> None:
+        self.options, self.folder = options, RunFolder(out)
+        if self.calibration.parent_from_camera is None:
+            raise InputError(
+                f"{out}: found no calibration to export ({self.doubt}); run it on a fixed capture"
+            )
+
+    @cached_property
+    def calibration(self) -> "CalibrationFile":
+        """calibration.json."""
+        return self.folder.calibration()
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the calibration is rejected; None when it is."""
+        return self.calibration.doubt
+
+    @property
+    def provenance(self) -> Provenance:
+        """Of what is in the base frame."""
+        ros.require_frame_name(self.options.base_frame)
+        return Provenance(self.options.base_frame, self.doubt)
+
+    @property
+    def mount(self) -> ros.CameraMount:
+        """The camera on the gripper, as the user wants its frames."""
+        options = self.options
+        if options.camera is not None:
+            mount = self._mount_of(self._camera(options.camera), options.child_frame)
+        else:
+            uncertainty = self.calibration.uncertainty
+            assert uncertainty is not None  # wherever there is a transform
+            fixed = self.calibration.mount == "base"
+            mount = ros.camera_mount(
+                np.array(self.calibration.parent_from_camera),
+                np.array(uncertainty.covariance),
+                options.base_frame if fixed else options.parent_frame,
+                options.child_frame,
+                options.base_frame,
+                self.doubt,
+            )
+        if options.to_root is None:
+            return mount
+        if options.root_from_optical is None:
+            return ros.on_root(mount, options.to_root)
+        x, y, z, *quat_xyzw = options.root_from_optical
+        length = float(np.linalg.norm(quat_xyzw))
+        if not abs(length - 1) < 1e-2 or not np.isfinite([x, y, z]).all():
+            raise InputError(
+                f"--root-from-optical: its quaternion has length {length:.3g}, not 1; give x y z (m) qx qy qz qw"
+            )
+        rotation = Rotation.from_quat(quat_xyzw).as_matrix()
+        return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
+
+    @property
+    def others(self) -> list[ros.CameraMount]:
+        """Further cameras and arms; none where one camera is asked for."""
+        cameras = self.folder.cameras()
+        if cameras is None or self.options.camera is not None:
+            return []
+        mounts = [
+            self._mount_of(camera, f"{camera.name}_optical_frame")
+            for camera in cameras.cameras
+            if camera.parent_from_camera is not None
+        ]
+        base = self.options.base_frame
+        return mounts + [
+            ros.CameraMount(
+                base,
+                f"{arm.name}_{base}",
+                np.array(arm.base_from_other_base),
+                np.array(arm.uncertainty.covariance),
+                base,
+            )
+            for arm in cameras.arms
+        ]
+
+    def _camera(self, name: str) -> "CameraPlaced":
+        cameras = self.folder.cameras()
+        for camera in () if cameras is None else cameras.cameras:
+            if camera.name == name and camera.parent_from_camera is not None:
+                return camera
+        raise InputError(
+            f"--camera {name}: {self.folder.path} has placed no camera of that name; see its cameras.json"
+        )
+
+    def _mount_of(self, camera: "CameraPlaced", child: str) -> ros.CameraMount:
+        options = self.options
+        assert camera.uncertainty is not None  # wherever there is a transform
+        parent = options.base_frame if camera.mount == "base" else options.parent_frame
+        if camera.arm is not None:
+            parent = f"{camera.arm}_{parent}"
+        return ros.camera_mount(
+            np.array(camera.parent_from_camera),
+            np.array(camera.uncertainty.covariance),
+            parent,
+            child,
+            options.base_frame,
+            camera.doubt,
+        )
+
+    @property
+    def lens(self) -> "Intrinsics":
+        """As calibrated."""
+        lens = self.calibration.intrinsics
+        if self.options.camera is not None:
+            lens = self._camera(self.options.camera).intrinsics
+        if lens is None:
+            raise InputError(
+                f"{self.folder.path}: knows no intrinsics, for camera poses were given and no images; export "
+                "something else"
+            )
+        return lens.record()
+
+    @cached_property
+    def scene(self) -> "SceneMap":
+        """map.safetensors; asked for before what writes it is imported, which needs torch as well."""
+        return self.folder.scene()
+
+    @cached_property
+    def cloud(self) -> "PointCloud":
+        """cloud.ply."""
+        return self.folder.cloud()
+
+    @cached_property
+    def capture(self) -> "Capture":
+        """The images and poses the run was made from."""
+        return self.folder.capture()
+
+    @cached_property
+    def reconstruction(self) -> "Reconstruction":
+        """reconstruction.npz."""
+        return self.folder.reconstruction()
+
+    @property
+    def views(self) -> "PosedImages":
+        """The registered images in the base frame."""
+        from jcr.export.views import posed_images
+
+        scale = self.calibration.scale
+        assert scale is not None  # wherever there is a transform
+        if self.calibration.mount == "base":
+            raise InputError(
+                f"{self.folder.path}: a fixed camera watched the gripper: its images show no scene in the base frame"
+            )
+        base_from_recon = np.array(self.calibration.base_from_recon)
+        return posed_images(self.capture, self.reconstruction, base_from_recon, scale)
+
+    @property
+    def other_views(self) -> "list[PosedImages]":
+        """The images of further cameras that see the scene, in the base frame."""
+        from jcr.cell.added import read_added_cameras
+        from jcr.export.cell_views import posed_cameras
+
+        cameras = self.folder.cameras()
+        if cameras is None:
+            return []
+        others = (*self.capture.others, *read_added_cameras(self.folder.path, self.capture))
+        own = np.array(self.calibration.gripper_from_camera)
+        return posed_cameras(self.capture, others, cameras, self.views, self.reconstruction.image_index, own)
+
+
+def _of_mount(text: Callable[[ros.CameraMount], str]) -> Callable[[Run, Path], None]:
+    """The format whose file is that text about the camera on the gripper."""
+    return lambda run, path: write_text(path, text(run.mount))
+
+
+def _ros2(run: Run, path: Path) -> None:
+    write_text(path, ros.ros2_launch(run.mount, *run.others))
+
+
+def _urdf(run: Run, path: Path) -> None:
+    write_text(path, ros.urdf(run.mount, *run.others))
+
+
+def _easy_handeye2(run: Run, path: Path) -> None:
+    write_text(path, ros.easy_handeye2(run.mount, path.stem))
+
+
+def _camera_info(run: Run, path: Path) -> None:
+    write_text(path, ros.camera_info(run.mount, run.lens))
+
+
+def _joint_offsets(run: Run, path: Path) -> None:
+    errors = run.calibration.robot_errors
+    if errors is None or errors.joints is None:
+        raise InputError(
+            f"{run.folder.path}: no joint offsets were estimated; name the arm (--robot, or robot in capture.json)"
+        )
+    offsets = [(joint.offset_deg, joint.std_deg) for joint in errors.joints]
+    write_text(path, ros.joint_offsets(offsets, errors.p, run.doubt))
+
+
+def _ply(run: Run, path: Path) -> None:
+    from jcr.represent.cloud_ply import write_cloud
+
+    write_cloud(path, run.cloud, run.provenance.notes)
+
+
+def _glb(run: Run, path: Path) -> None:
+    scene = run.scene
+    from jcr.export.mesh import write_glb
+
+    write_glb(path, scene, run.provenance)
+
+
+def _octomap(run: Run, path: Path) -> None:
+    scene = run.scene
+    from jcr.export.volume import write_octomap
+
+    write_octomap(path, scene, run.provenance, run.options.voxel_size)
+
+
+def _esdf(run: Run, path: Path) -> None:
+    scene = run.scene
+    from jcr.export.volume import write_esdf
+
+    unknown = run.options.unknown or "occupied"
+    write_esdf(path, scene, run.provenance, unknown, run.options.voxel_size)
+
+
+def _spheres(run: Run, path: Path) -> None:
+    scene = run.scene
+    from jcr.export.volume import write_spheres
+
+    write_spheres(path, scene, run.provenance, run.options.unknown or "free", run.options.excess)
+
+
+def _nerfstudio(run: Run, path: Path) -> None:
+    from jcr.export.views import write_nerfstudio
+
+    images = run.options.undistort, run.options.link_images
+    write_nerfstudio(path, run.views, run.cloud, run.provenance, *images, others=run.other_views)
+
+
+def _colmap(run: Run, path: Path) -> None:
+    from jcr.export.views import write_colmap
+
+    images = run.options.undistort, run.options.link_images
+    write_colmap(path, run.views, run.provenance, *images, others=run.other_views)
+
+
+def _rerun(run: Run, path: Path) -> None:
+    scene = run.scene
+    from jcr.export.rrd import write_rrd
+
+    base_from_gripper = run.capture.base_from_gripper[run.reconstruction.image_index]
+    write_rrd(path, run.views, base_from_gripper, run.cloud, scene, run.provenance)
+
+
+FORMATS = (
+    Format("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file", _ros2),
+    Format(
+        "moveit",
+        "hand_eye.launch.py",
+        "launch file as MoveIt Calibration saves it",
+        _of_mount(ros.moveit_launch),
+    ),
+    Format("urdf", "hand_eye.urdf", "camera link and fixed joint", _urdf),
+    Format("xacro", "hand_eye.xacro", "macro that adds the camera link and joint", _of_mount(ros.xacro)),
+    Format("easy_handeye2", "hand_eye.calib", ".calib for its publisher", _easy_handeye2),
+    Format(
+        "covariance",
+        "hand_eye.yaml",
+        "PoseWithCovarianceStamped, 36 numbers",
+        _of_mount(ros.pose_with_covariance),
+    ),
+    Format("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager", _camera_info),
+    Format(
+        "joint_offsets", "joint_offsets.yaml", "by how much each joint of the arm seems off", _joint_offsets
+    ),
+    Format("ply", "cloud.ply", "points, colours, labels", _ply),
+    Format("glb", "map.glb", "mesh of the seen surface with colours", _glb),
+    Format("octomap", "map.bt", "occupied, free and unknown voxels", _octomap),
+    Format("esdf", "esdf.npz", "voxels of signed distance", _esdf),
+    Format("spheres", "spheres.npz", "spheres that cover what is solid", _spheres),
+    Format(
+        "nerfstudio",
+        "nerfstudio/",
+        "transforms.json, images and first points for a splat or NeRF",
+        _nerfstudio,
+    ),
+    Format("colmap", "colmap/", "COLMAP model in the base frame, binary and text", _colmap),
+    Format("rerun", "run.rrd", "recording for the Rerun viewer", _rerun),
+)

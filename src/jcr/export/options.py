@@ -1,0 +1,44 @@
+"""The formats and how they are written, apart from the writers so that the command line stays quick."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+FormatName = Literal[
+    "ros2", "moveit", "urdf", "xacro", "easy_handeye2", "covariance", "camera_info", "joint_offsets", "ply", "glb",
+    "octomap", "esdf", "spheres", "nerfstudio", "colmap", "rerun",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Frames, resolution and images of an exported file; a format uses those that concern it."""
+
+    parent_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "tool0"
+    """The gripper frame whose poses the capture contains."""
+    child_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "camera_color_optical_frame"
+    """The camera's optical frame: x right, y down, z forward."""
+    base_frame: Annotated[str, tyro.conf.arg(metavar="FRAME")] = "base_link"
+    """The robot's base, the frame of the map."""
+    camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Another camera of the cell (cameras.json), for formats with one camera; unset: the run's own camera, and for ros2
+    and urdf all cameras. The parent of a fixed camera is the base frame."""
+    to_root: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
+    """Export the transform to this link instead, the root of the camera's own frames (e.g. camera_link)."""
+    root_from_optical: Annotated[
+        tuple[float, float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="X Y Z QX QY QZ QW"),
+    ] = None
+    """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
+    prints it; by default the same origin, with axes as in REP-103."""
+    voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Voxel size (m) for octomap and esdf; by default the map's cell."""
+    unknown: Literal["occupied", "free"] | None = None
+    """How unseen space counts: by default as occupied in esdf, as free (left out) in spheres."""
+    excess: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Metres by which spheres may extend into free space; by default two cells of the map."""
+    undistort: bool = False
+    """Resample the images of nerfstudio and colmap to a pinhole camera."""
+    link_images: bool = False
+    """Link to the capture's images instead of copying them."""
