@@ -24,7 +24,7 @@ from jcr.adjust.scene import (
     stepped,
 )
 from jcr.camera import by_parameters, by_point, project
-from jcr.geometry import apply, inverse, skew, step_between
+from jcr.geometry import apply, inverse, scale_translation, skew, step_between
 from jcr.least_squares import one_blas_thread
 
 ROUNDS = 12
@@ -125,8 +125,8 @@ class ImageEvidence:
     view: View
 
     def rig_covariance(self) -> Float[ndarray, "r r"]:
-        """Of steps of the rigs, r = 6m, cameras and points eliminated, with the first rig and the size of the world held:
-        those of the first rig are 0."""
+        """Of steps of the rigs, r = 6m, in the frame of the first and at one size of the world, everything else
+        eliminated: those of the first rig are 0."""
         freedom, rigs = self.problem.freedom, self.scene.world_from_rig
         unseen, others = similarities(self.scene, freedom), slice(freedom.first_rig + 6, None)
         gauge = np.zeros((7, len(unseen)))
@@ -140,26 +140,30 @@ class ImageEvidence:
 
 @one_blas_thread
 def adjust_images(scene: Scene, observations: Observations, freedom: Freedom) -> ImageEvidence:
-    """Adjust images alone, from a scene that is near: the first rig stays where it is, the rigs together keep their
-    size.
+    """Adjust images alone, from a scene that is near: the first rig stays where it is, depths keep their median.
 
     Points that fewer than two images see are left out.
     """
     scene, problem = posed(scene, observations, freedom)
-    noise, damping = noise_of(scene, view_of(scene, problem), problem), 1e-4
-    start, rigs = scene.world_from_rig, 6 * len(scene.world_from_rig)
-    world = RigInformation(start, similarity_held(similarities_of_rigs(start), 1.0), np.zeros(rigs))
+    start, view = scene.world_from_rig, view_of(scene, problem)
+    noise, depth, damping = noise_of(scene, view, problem), view.depth, 1e-4
+    held = similarity_held(similarities_of_rigs(start), 1.0)
+    world = RigInformation(start, held, np.zeros(len(held)))
     for _ in range(ROUNDS):
         before = noise
         scene, view, damping = minimised(scene, problem, noise, world, damping)
         noise = noise_of(scene, view, problem, before)
         if noise.change(before) < SIZES_SETTLED:
             break
-    back = start[0] @ inverse(scene.world_from_rig[0])
-    points = apply(back, scene.points_in_world)
-    return evidence(
-        replace(scene, world_from_rig=back @ scene.world_from_rig, points_in_world=points), problem, noise
+    unit = float(np.median(np.abs(depth / view.depth)))
+    back = inverse(scale_translation(scene.world_from_rig[0], unit))
+    scene = replace(
+        scene,
+        world_from_rig=start[0] @ back @ scale_translation(scene.world_from_rig, unit),
+        rig_from_camera=scale_translation(scene.rig_from_camera, unit),
+        points_in_world=apply(start[0] @ back, unit * scene.points_in_world),
     )
+    return evidence(scene, problem, noise)
 
 
 def posed(

@@ -66,27 +66,40 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
     camera = work.grid_intrinsics(pinhole)
     depth = _depth_on(work, predicted)
     factor = np.ones(predicted.confidence.shape, np.float32)
+    adjusted = None
     for _ in range(ROUNDS):
         geometry = Geometry(camera, poses, depth)
         tracks = _tracks(colour_matches(gray, geometry, KEYPOINTS // len(gray)), geometry)
         if np.bincount(tracks.image, minlength=len(gray)).min() < LEAST_MATCHES:
             return None
         adjusted = _adjusted(tracks, geometry, hold=images.pinhole is not None)
-        poses, camera = adjusted.scene.world_from_rig, adjusted.scene.cameras[0]
-        tracks, error_px = _inliers(adjusted)
-        if len(tracks.image) == 0:
+        if len(adjusted.tracks.image) == 0:
             return None
-        change = depth_changes(tracks, poses, depth)
+        poses, camera = adjusted.shown.scene.world_from_rig, adjusted.shown.scene.cameras[0]
+        change = depth_changes(adjusted.tracks, poses, depth)
         depth = depth * np.stack([smooth_factor(c, work.size[1], work.size[0]) for c in change])
         factor = factor * np.stack([smooth_factor(c, *predicted.grid.size[::-1]) for c in change])
+    assert adjusted is not None
+    tracks = adjusted.tracks
     return Refined(
         poses,
         factor,
         replace(tracks, x_px=_capture_px(images, work.original_from_grid(tracks.x_px))),
         pinhole if images.pinhole is not None else work.original_intrinsics(camera),
-        CameraEvidence(poses, adjusted.rig_covariance()),
-        error_px / float(work.scale.mean()),
+        CameraEvidence(poses, adjusted.shown.rig_covariance()),
+        adjusted.error_px / float(work.scale.mean()),
     )
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """On the working grid."""
+
+    shown: ImageEvidence
+    tracks: Tracks
+    """Without outliers; none where most points came to lie behind their cameras."""
+    error_px: float
+    """Median, of these."""
 
 
 def _working_grid(size: tuple[int, int]) -> ImageGrid:
@@ -135,11 +148,12 @@ def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
     )
 
 
-def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> ImageEvidence:
-    """Cameras and points adjusted, and the focal length unless it is held."""
+def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> _Adjusted:
+    """Cameras and points adjusted, and the focal length unless it is held; matches far from their points left out, and
+    points that fewer than two views are left to see."""
     each, camera = np.arange(len(geometry.recon_from_camera)), geometry.pinhole
     prior = prior_of(camera, HELD if hold else {"f": ESTIMATED["f"]})
-    return adjust_images(
+    shown = adjust_images(
         Scene(
             world_from_rig=geometry.recon_from_camera,
             rig_from_camera=np.eye(4)[None],
@@ -151,19 +165,14 @@ def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> ImageEvidence:
         ),
         Freedom.of((camera,), (prior,), len(each)),
     )
-
-
-def _inliers(adjusted: ImageEvidence) -> tuple[Tracks, float]:
-    """Tracks without matches far from their points, and without points that fewer than two views are left to see; and
-    the median error of what is left (px)."""
-    seen, points = adjusted.problem.observations, adjusted.scene.points_in_world
-    error = np.linalg.norm(adjusted.view.residual_px, axis=1)
-    error[adjusted.view.depth <= 0] = np.inf
+    seen, points = shown.problem.observations, shown.scene.points_in_world
+    error = np.linalg.norm(shown.view.residual_px, axis=1)
+    error[shown.view.depth <= 0] = np.inf
     good = error < LARGEST_PX * max(float(np.median(error)), 0.1)
     good &= (np.bincount(seen.point[good], minlength=len(points)) >= 2)[seen.point]
     kept, point = np.unique(seen.point[good], return_inverse=True)
-    tracks = Tracks(seen.image[good], seen.x_px[good], point, points[kept])
-    return tracks, float(np.median(error[good])) if good.any() else np.inf
+    inliers = Tracks(seen.image[good], seen.x_px[good], point, points[kept])
+    return _Adjusted(shown, inliers, float(np.median(error[good])) if good.any() else np.inf)
 
 
 def depth_changes(
