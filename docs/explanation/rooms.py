@@ -26,11 +26,12 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("export/", "formats of other tools", 1), ("simulate/", "captures with known answers", 1)),
     (("segment/", "labels and sizes of objects", 1), ("represent/", "cloud, trained map, queries", 1)),
     (("cell/", "every camera of the cell: fixed, several on a wrist, two arms, eye-to-hand", 1),),
-    (("calibration/", "the stage: bundle adjustment, given intrinsics, calibration.json", 1),),
+    (("calibration/", "the stage: fit, adjust, checks, verdict, requirement, calibration.json", 1),),
     (("depth/", "the stage densify: PatchMatch and planes on known cameras", 1),),
     (("reconstruct/", "the table of back ends: COLMAP, boards, networks, given cameras", 1),),
     (("match/", "features and matches that the robot checks", 1),),
     (("capture/", "readers of every format, and their checks", 1),),
+    (("adjust/", "images and robots together: rigs, cameras, points, errors of pixels", 1),),
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (
         ("camera.py", "projection, distortion, derivatives", 1),
