@@ -14,10 +14,23 @@ from numpy import ndarray
 
 from jcr.adjust.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
 from jcr.adjust.pixel_noise import Layout, PixelNoise, pixel_noise, variance_ratios
-from jcr.adjust.scene import Freedom, Observations, Scene, similarities, stepped
+from jcr.adjust.scene import (
+    Freedom,
+    Observations,
+    Scene,
+    at_start,
+    similarities,
+    similarities_of_rigs,
+    stepped,
+)
 from jcr.camera import by_parameters, by_point, project
-from jcr.geometry import skew, step_between
+from jcr.geometry import apply, inverse, scale_translation, skew, step_between
+from jcr.least_squares import one_blas_thread
 
+ROUNDS = 12
+"""Of an adjustment, with the sizes of errors estimated in between."""
+SIZES_SETTLED = 0.01
+"""Relative change of the sizes of errors, of pixels and of robots, from one round to the next that ends them."""
 ENOUGH = 1e-5
 """Of the cost, which is in squared standard deviations: what less than it would gain, nobody sees."""
 STEPS = 60
@@ -113,6 +126,64 @@ class ImageEvidence:
     noise: PixelNoise
     view: View
 
+    def rig_covariance(self) -> Float[ndarray, "r r"]:
+        """Of steps of the rigs, r = 6m, in the frame of the first and at one size of the world, everything else
+        eliminated: those of the first rig are 0."""
+        freedom, rigs = self.problem.freedom, self.scene.world_from_rig
+        unseen, others = similarities(self.scene, freedom), slice(freedom.first_rig + 6, None)
+        gauge = np.zeros((7, len(unseen)))
+        gauge[:6, freedom.first_rig : others.start] = np.eye(6)
+        gauge[6, freedom.first_rig :].reshape(-1, 6)[:, :3] = rigs[:, :3, 3] - rigs[0, :3, 3]
+        to_gauge = (np.eye(len(unseen)) - unseen @ np.linalg.solve(gauge @ unseen, gauge))[others]
+        covariance = np.zeros((6 * len(rigs), 6 * len(rigs)))
+        covariance[6:, 6:] = to_gauge @ np.linalg.solve(self.information, to_gauge.T)
+        return (covariance + covariance.T) / 2
+
+
+@one_blas_thread
+def adjust_images(scene: Scene, observations: Observations, freedom: Freedom) -> ImageEvidence:
+    """Adjust images alone, from a scene that is near: the first rig stays where it is, depths keep their median.
+
+    Points that fewer than two images see are left out.
+    """
+    scene, problem = posed(scene, observations, freedom)
+    start, view = scene.world_from_rig, view_of(scene, problem)
+    noise, depth, damping = noise_of(scene, view, problem), view.depth, 1e-4
+    held = similarity_held(similarities_of_rigs(start), 1.0)
+    world = RigInformation(start, held, np.zeros(len(held)))
+    for _ in range(ROUNDS):
+        before = noise
+        scene, view, damping = minimised(scene, problem, noise, world, damping)
+        noise = noise_of(scene, view, problem, before)
+        if noise.change(before) < SIZES_SETTLED:
+            break
+    unit = float(np.median(np.abs(depth / view.depth)))
+    back = inverse(scale_translation(scene.world_from_rig[0], unit))
+    scene = replace(
+        scene,
+        world_from_rig=start[0] @ back @ scale_translation(scene.world_from_rig, unit),
+        rig_from_camera=scale_translation(scene.rig_from_camera, unit),
+        points_in_world=apply(start[0] @ back, unit * scene.points_in_world),
+    )
+    return evidence(scene, problem, noise)
+
+
+def posed(
+    scene: Scene, observations: Observations, freedom: Freedom, prior: RigInformation | None = None
+) -> tuple[Scene, ImageProblem]:
+    """Where an adjustment starts: with the points that two or more observations show, and cameras where their priors
+    have their middle."""
+    problem = ImageProblem.of(scene, observations, freedom, prior)
+    seen = replace(scene, points_in_world=scene.points_in_world[problem.points])
+    return at_start(seen, freedom), problem
+
+
+def similarity_held(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
+    """Information of this size along the steps that a similarity of the world makes (scene.similarities): nothing else
+    holds the world, and without it what is quadratic would rotate and shrink with it."""
+    unseen = np.linalg.qr(steps)[0]
+    return strength * unseen @ unseen.T
+
 
 def view_of(scene: Scene, problem: ImageProblem) -> View:
     """The observations' points as a scene projects them."""
@@ -187,9 +258,8 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
     information[np.diag_indices(len(information))] += FAINT
     if problem.prior is None:
         # A unit of the world that is that of its rigs' places, all alike: what λ is counted in.
-        unseen = np.linalg.qr(similarities(scene, problem.freedom))[0]
         of_rigs = information.diagonal()[problem.freedom.first_rig :]
-        information += float(of_rigs.mean()) * unseen @ unseen.T
+        information += similarity_held(similarities(scene, problem.freedom), float(of_rigs.mean()))
     return ImageEvidence(
         scene=scene,
         problem=problem,

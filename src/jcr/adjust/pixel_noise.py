@@ -38,6 +38,10 @@ class PixelNoise:
     """Of the variance of what many observations say together, because neighbours share errors; one for all cameras, for
     where points follow the few observations of one its own residuals do not show it."""
 
+    def change(self, before: "PixelNoise") -> float:
+        """Of the sizes, relative; the largest."""
+        return float(np.abs(np.log(self.sigma_px / before.sigma_px)).max())
+
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], camera: Int[ndarray, " k"]
     ) -> Float[ndarray, " k"]:

@@ -21,16 +21,19 @@ from numpy import ndarray
 from scipy.linalg import cho_factor, cho_solve
 
 from jcr.adjust.images import (
+    ROUNDS,
+    SIZES_SETTLED,
     ImageEvidence,
-    ImageProblem,
     RigInformation,
     evidence,
     minimised,
     noise_of,
+    posed,
+    similarity_held,
     view_of,
 )
 from jcr.adjust.intrinsics_prior import off_by
-from jcr.adjust.scene import Freedom, Observations, Scene, at_start, similarities_of_rigs, stepped
+from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped
 from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import POSES, Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, SCALE, Poses, predict, residuals, residuals_by_camera
@@ -41,11 +44,9 @@ from jcr.records import Budget
 
 START_NOISE = (1e-3, np.radians(0.2))
 """m, rad; of gripper poses, until it is estimated."""
-SIZES_SETTLED = 0.01
-"""Relative change of the sizes of errors, of pixels and of the robot, from one round to the next that ends them."""
 STEP_SETTLED = 1e-4
 """Squared standard deviations that the arms' unknowns move by in a round, or a step, that ends them."""
-ROUNDS, STEPS = 12, 30
+STEPS = 30
 LARGEST_ROTATION = 0.5
 """rad, and of the logarithm of scale, in one step."""
 TINY_STEP = 1e-6
@@ -193,8 +194,7 @@ def adjust(
     estimated with the rest, and all arms are taken to be equally exact. `prior` is what others than the images and the
     robots know of the first rigs. `scale` is about that of the scene (metres per unit).
     """
-    problem = ImageProblem.of(scene, observations, freedom, prior)
-    scene = at_start(replace(scene, points_in_world=scene.points_in_world[problem.points]), freedom)
+    scene, problem = posed(scene, observations, freedom, prior)
     placed = Placed(
         x=np.stack([arm.start[0] for arm in arms]),
         scale=1.0,
@@ -214,8 +214,7 @@ def adjust(
         equations, _ = equations_of(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
-        change = max(change, float(np.abs(np.log(pixels.sigma_px / before[0].sigma_px)).max()))
-        if change < SIZES_SETTLED and moved < STEP_SETTLED:
+        if max(change, pixels.change(before[0])) < SIZES_SETTLED and moved < STEP_SETTLED:
             break
     return tied(given, placed, log_sizes)
 
@@ -366,10 +365,9 @@ def _rig_information(
     of_all, gradient_of_all = np.zeros((count, count)), np.zeros(count)
     of_all[np.ix_(rows, rows)] = (information + information.T) / 2
     gradient_of_all[rows] = gradient
-    # Neither images nor robots hold the world, and what is quadratic here is not to rotate with it.
-    unseen = np.linalg.qr(similarities_of_rigs(placed.scene.world_from_rig))[0]
-    of_all += float(of_all.diagonal().mean()) * unseen @ unseen.T
-    return RigInformation(placed.scene.world_from_rig, of_all, gradient_of_all)
+    now = placed.scene.world_from_rig
+    of_all += similarity_held(similarities_of_rigs(now), float(of_all.diagonal().mean()))
+    return RigInformation(now, of_all, gradient_of_all)
 
 
 def _by_inverse(a_from_b: Poses) -> Float[ndarray, "n 6 6"]:

@@ -8,6 +8,7 @@ moved; its tail is averaged over the sizes of the robot's errors. The same with 
 that was moved.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,7 +30,7 @@ from jcr.handeye.equation import (
     residuals,
     residuals_by_camera,
 )
-from jcr.handeye.fit import PoseFit
+from jcr.handeye.fit import PoseFit, Unknowns
 from jcr.handeye.systematic import Region
 
 CLEAR = 10.0
@@ -132,26 +133,10 @@ def _moved_by(
         calibrated.given_noise,
     )
     log_sizes, information = most_likely(alone)
-    known_sizes = over_sizes(alone, log_sizes, information)
 
     def together(moved: Float[ndarray, "4 4"]) -> Equations:
-        place = (moved, scale, z) if of_x else (x, scale, moved)
-        residual_new, jacobian_new = residuals(*place, *new[:2])
-        of_new = jacobian_new.reshape(n, 13)
-        by_camera = residuals_by_camera(*place, new[1])
-        known = np.zeros((m + n, m + n))
-        known[m:, m:] = block_diag(*(by_camera @ new[2] @ np.swapaxes(by_camera, 1, 2)))
-        both = np.concatenate([stacked, of_new])
-        design = np.concatenate([both, np.concatenate([np.zeros((m, 6)), of_new[:, columns]])], axis=1)
-        everywhere = Region(np.delete(both, SCALE, axis=1), np.hstack([region.fit, np.zeros((12, n))]))
-        return Equations(
-            np.concatenate([residual.ravel(), residual_new.ravel()]),
-            design,
-            np.diag(np.r_[np.diag(prior), np.zeros(6)]),
-            np.zeros(19),
-            known,
-            everywhere.left(systematic),
-            calibrated.given_noise,
+        return _together(
+            alone, region, (moved, scale, z) if of_x else (x, scale, moved), new, systematic, columns
         )
 
     start = moved = x if of_x else z
@@ -160,7 +145,52 @@ def _moved_by(
         moved = retract(moved, step)
         if float(np.abs(step).max()) < SETTLED:
             break
-    joint, begun = together(moved), step_between(start, moved)
+    return _averaged(
+        alone, together(moved), over_sizes(alone, log_sizes, information), step_between(start, moved), n - 6
+    )
+
+
+def _together(
+    alone: Equations,
+    region: Region,
+    seen_by_new: Unknowns,
+    new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
+    systematic: Float[ndarray, "s s"],
+    columns: slice,
+) -> Equations:
+    """The equations of old images with those of new ones, whose X or base_from_recon, `columns`, is one of their own."""
+    m, n = len(alone.residual), 6 * len(new[0])
+    residual_new, jacobian_new = residuals(*seen_by_new, *new[:2])
+    of_new = jacobian_new.reshape(n, 13)
+    by_camera = residuals_by_camera(*seen_by_new, new[1])
+    known = np.zeros((m + n, m + n))
+    known[m:, m:] = block_diag(*(by_camera @ new[2] @ np.swapaxes(by_camera, 1, 2)))
+    both = np.concatenate([alone.jacobian, of_new])
+    design = np.concatenate([both, np.concatenate([np.zeros((m, 6)), of_new[:, columns]])], axis=1)
+    everywhere = Region(np.delete(both, SCALE, axis=1), np.hstack([region.fit, np.zeros((12, n))]))
+    return Equations(
+        np.concatenate([alone.residual, residual_new.ravel()]),
+        design,
+        np.diag(np.r_[np.diag(alone.prior_information), np.zeros(6)]),
+        np.zeros(19),
+        known,
+        everywhere.left(systematic),
+        alone.given,
+    )
+
+
+def _averaged(
+    alone: Equations,
+    joint: Equations,
+    known_sizes: Iterable[tuple[ndarray, ndarray, Solution]],
+    begun: Float[ndarray, "6"],
+    freedom: int,
+) -> _Moved:
+    """The motion, and how the new images agree on it, averaged over the sizes of the robot's errors that the old images
+    leave open.
+
+    `begun` is the motion at which `joint` is linear; `freedom` that of the new images' residuals beside it.
+    """
     weights, steps, covariances, misfits = [], [], [], []
     for weight, sizes, by_old in known_sizes:
         solution = solve(joint, sizes)
@@ -177,7 +207,7 @@ def _moved_by(
         np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
         float(weight @ chi2.sf(distances, 6)),
         float(weight @ misfits),
-        float(weight @ chi2.sf(misfits, n - 6)) if n > 6 else None,
+        float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
     )
 
 

@@ -102,18 +102,7 @@ def fit_poses(
     if systematic is None:
         systematic = smooth_errors(base_from_gripper)
     problem = _Problem(base_from_gripper, recon_from_camera, used, noise, cues, camera_covariance, systematic)
-    unknowns, log_sizes = start, None
-    for _ in range(iterations):
-        linear = _linearised(problem, unknowns)
-        log_sizes, information = most_likely(linear.equations, log_sizes)
-        solution = solve(linear.equations, log_sizes)
-        step = solution.step * min(
-            1.0, LARGEST_TURN / max(np.abs(solution.step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300)
-        )
-        settled = float(((solution.information_root.T @ step) ** 2).sum()) < (1e-14 if averaged else 1e-6)
-        unknowns = _moved(*unknowns, step)
-        if settled:
-            break
+    unknowns, log_sizes = _stepped(problem, start, 1e-14 if averaged else 1e-6, iterations)
     linear = _linearised(problem, unknowns)
     log_sizes, information = most_likely(linear.equations, log_sizes)
     solution = solve(linear.equations, log_sizes)
@@ -141,6 +130,24 @@ def fit_poses(
         missed,
         missed_covariance,
     )
+
+
+def _stepped(
+    problem: "_Problem", unknowns: Unknowns, settled: float, iterations: int
+) -> tuple[Unknowns, Float[ndarray, " c"] | None]:
+    """Gauss-Newton until a step of less than `settled` squared standard deviations; the sizes of errors before it."""
+    log_sizes = None
+    for _ in range(iterations):
+        linear = _linearised(problem, unknowns)
+        log_sizes, _ = most_likely(linear.equations, log_sizes)
+        solution = solve(linear.equations, log_sizes)
+        step = solution.step * min(
+            1.0, LARGEST_TURN / max(np.abs(solution.step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300)
+        )
+        unknowns = _moved(*unknowns, step)
+        if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
+            break
+    return unknowns, log_sizes
 
 
 def exceeds(noise: tuple[float, float], given: tuple[float, float] | None) -> bool:

@@ -4,13 +4,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.handeye.arms import arm_named
+from jcr.handeye.equation import Poses
 from jcr.handeye.fit import Cues, PoseFit
 from jcr.handeye.observability import observability
 from jcr.handeye.residuals import paper_residuals
@@ -78,71 +79,79 @@ def solve_hand_eye(
     Raises InputError for shapes, values or counts that cannot be poses, and for poses or angles that do not fit the
     robot. Degenerate motion raises nothing; it is in the result (`observability`, `converged`).
     """
-    gripper = _checked(base_from_gripper, "base_from_gripper")
-    camera = _checked(recon_from_camera, "recon_from_camera")
+    gripper, camera = _checked_pairs(base_from_gripper, recon_from_camera)
     n = len(gripper)
-    if len(camera) != n:
-        raise InputError(
-            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
-        )
-    if n < 2:
-        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
-    if scale is not None:
-        if not (np.isfinite([scale, scale_std]).all() and scale > 0 and scale_std > 0):
-            raise InputError(
-                f"scale: {scale} ± {scale_std} must be two positive numbers (m per unit, relative)"
-            )
-        cues = replace(cues or Cues(), scale=(scale, scale_std))
+    cues = _with_scale(cues, scale, scale_std)
     if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
         raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
-
     if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
         raise InputError(
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
-
     if systematic is None:
         systematic = systematic_errors(gripper, *_checked_arm(robot, joints, n))
+    fitted = _fit_distinct(gripper, camera, robot_noise, cues, camera_covariance, systematic)
+    return judged(_with_residuals(gripper, camera, *fitted, cues))
 
-    # Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image
-    # that was given twice is one: its error counted as two would pass for agreement.
+
+def _fit_distinct(
+    gripper: Poses,
+    camera: Poses,
+    noise: tuple[float, float] | None,
+    cues: Cues | None,
+    covariance: Float[ndarray, "r r"] | None,
+    systematic: Float[ndarray, "r r"],
+) -> tuple[PoseFit, Bool[ndarray, " d"], Int[ndarray, " n"]]:
+    """The robust fit to the distinct images, which of these it uses, and which of these each image is.
+
+    Sorted by what the poses are, not by how they came: the same images in any order, the same last bit. An image that
+    was given twice is one: its error counted as two would pass for agreement.
+    """
+    n = len(gripper)
     pairs = np.concatenate([gripper.reshape(n, 16), camera.reshape(n, 16)], axis=1)
     _, order, back = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
     rows = (6 * order[:, None] + np.arange(6)).ravel()
     among = np.ix_(rows, rows)
-    if camera_covariance is not None:
-        camera_covariance = camera_covariance[among]
-    fit, used_sorted = robust_fit(
-        gripper[order], camera[order], robot_noise, cues, camera_covariance, systematic[among]
-    )
-    used = used_sorted[back]
+    if covariance is not None:
+        covariance = covariance[among]
+    return *robust_fit(gripper[order], camera[order], noise, cues, covariance, systematic[among]), back
+
+
+def _with_residuals(
+    gripper: Poses,
+    camera: Poses,
+    fit: PoseFit,
+    used_distinct: Bool[ndarray, " d"],
+    distinct: Int[ndarray, " n"],
+    cues: Cues | None,
+) -> HandEye:
+    """The calibration of a fit to distinct images, not judged yet; `distinct` says which of these each image is."""
+    used = used_distinct[distinct]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
-    noise = RobotNoise(*fit.noise, fit.noise_estimated, robot_noise, fit.systematic, fit.systematic_left)
+    noise = RobotNoise(*fit.noise, fit.noise_estimated, fit.given_noise, fit.systematic, fit.systematic_left)
     metres, radians = (
-        np.linalg.norm(residual, axis=1)[back]
+        np.linalg.norm(residual, axis=1)[distinct]
         for residual in (fit.translation_residual, fit.rotation_residual)
     )
-    return judged(
-        HandEye(
-            estimate=Estimate(
-                gripper_from_camera=fit.gripper_from_camera,
-                scale=fit.scale,
-                base_from_recon=fit.base_from_recon,
-                covariance=fit.covariance,
-                budget=fit.budget,
-            ),
-            images=ImageResiduals(
-                inliers=used,
-                translation_residual_m=metres,
-                rotation_residual_rad=radians,
-                reasons=_reasons(used, metres, radians, noise),
-            ),
-            residuals=PaperResiduals(delta_t, delta_r),
-            robot=RobotExamined(noise),
-            held_out=_held_out(fit, used_sorted),
-            findings=seen.findings,
-        )
+    return HandEye(
+        estimate=Estimate(
+            gripper_from_camera=fit.gripper_from_camera,
+            scale=fit.scale,
+            base_from_recon=fit.base_from_recon,
+            covariance=fit.covariance,
+            budget=fit.budget,
+        ),
+        images=ImageResiduals(
+            inliers=used,
+            translation_residual_m=metres,
+            rotation_residual_rad=radians,
+            reasons=_reasons(used, metres, radians, noise),
+        ),
+        residuals=PaperResiduals(delta_t, delta_r),
+        robot=RobotExamined(noise),
+        held_out=_held_out(fit, used_distinct),
+        findings=seen.findings,
     )
 
 
@@ -271,6 +280,28 @@ def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
     return HeldOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )
+
+
+def _checked_pairs(base_from_gripper: ArrayLike, recon_from_camera: ArrayLike) -> tuple[Poses, Poses]:
+    gripper = _checked(base_from_gripper, "base_from_gripper")
+    camera = _checked(recon_from_camera, "recon_from_camera")
+    n = len(gripper)
+    if len(camera) != n:
+        raise InputError(
+            f"recon_from_camera: {len(camera)} camera poses for {n} gripper poses; give one per image"
+        )
+    if n < 2:
+        raise InputError(f"base_from_gripper: {n} pose; a hand-eye calibration needs three or more")
+    return gripper, camera
+
+
+def _with_scale(cues: Cues | None, scale: float | None, std: float) -> Cues | None:
+    """The cues with a known scale, where one is given."""
+    if scale is None:
+        return cues
+    if not (np.isfinite([scale, std]).all() and scale > 0 and std > 0):
+        raise InputError(f"scale: {scale} ± {std} must be two positive numbers (m per unit, relative)")
+    return replace(cues or Cues(), scale=(scale, std))
 
 
 def _checked_arm(
