@@ -52,8 +52,10 @@ def require_one_verdict(
 
 def findings_of_words(warnings: Sequence[str], converged: bool) -> list[Finding]:
     """Warnings of a file of an earlier version, of which only the words are known; the first says why it is rejected."""
-    severities: list[Severity] = ["warns" if converged else "rejects", *["warns"] * len(warnings)]
+    first: Severity = "warns" if converged else "rejects"
     return [
-        Finding(kind=Kind.EARLIER_VERSION, severity=severity, details={"text": said, "remedy": ""})
-        for severity, said in zip(severities, warnings, strict=False)
+        Finding(
+            kind=Kind.EARLIER_VERSION, severity="warns" if k else first, details={"text": said, "remedy": ""}
+        )
+        for k, said in enumerate(warnings)
     ]

@@ -25,7 +25,7 @@ ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 """Of the covariances: the step (geometry.retract) that takes the transform to the true one, in axes of its parent."""
 
 
-class Sureness(Part):
+class TransformUncertainty(Part):
     """One-sigma uncertainty of a transform, along axes of its parent frame."""
 
     translation_std_mm: Spread3
@@ -48,7 +48,7 @@ class CameraPlaced(Part):
     """Of a fixed camera."""
     gripper_from_camera: Matrix | None = None
     """Of a camera on a gripper."""
-    uncertainty: Sureness | None = None
+    uncertainty: TransformUncertainty | None = None
     intrinsics: IntrinsicsAndStd | None = None
     images: list[ImageFound] = Field(alias="pictures")
     findings: list[FindingJson] = []
@@ -87,7 +87,7 @@ class ArmPlaced(Part):
     name: str
     base_from_other_base: Matrix
     """From its base to that of the capture's own arm."""
-    uncertainty: Sureness
+    uncertainty: TransformUncertainty
 
 
 class CamerasFile(Part):
@@ -121,7 +121,7 @@ def _camera(found: CameraFound) -> CameraPlaced:
         arm=found.arm,
         uncertainty=None
         if covariance is None
-        else _sureness(covariance, found.std_at_scene, found.scene_distance),
+        else _uncertainty(covariance, found.std_at_scene, found.scene_distance),
         intrinsics=IntrinsicsAndStd.of(found.intrinsics, found.intrinsics_std),
         pictures=list(found.images),
         **derived(found.findings),
@@ -133,15 +133,15 @@ def _arm(found: ArmFound) -> ArmPlaced:
     return ArmPlaced(
         name=found.name,
         base_from_other_base=found.base_from_other.tolist(),
-        uncertainty=_sureness(found.covariance),
+        uncertainty=_uncertainty(found.covariance),
     )
 
 
-def _sureness(
+def _uncertainty(
     covariance: Float[ndarray, "6 6"], at_scene: float | None = None, distance: float | None = None
-) -> Sureness:
+) -> TransformUncertainty:
     std = np.sqrt(np.diag(covariance))
-    return Sureness(
+    return TransformUncertainty(
         translation_std_mm=(1e3 * std[:3]).tolist(),
         rotation_std_deg=np.degrees(std[3:]).tolist(),
         covariance=covariance.tolist(),
@@ -211,7 +211,7 @@ def in_words(content: CamerasFile) -> list[str]:
     return lines
 
 
-def _plus_minus(sure: Sureness) -> str:
+def _plus_minus(sure: TransformUncertainty) -> str:
     x, y, z = sure.translation_std_mm
     rx, ry, rz = sure.rotation_std_deg
     return f"± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ)"

@@ -4,7 +4,7 @@ from html import escape
 
 import numpy as np
 
-from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, Sureness
+from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, TransformUncertainty
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button
 from jcr.rounding import significant
@@ -39,7 +39,7 @@ def _arm(arm: ArmPlaced) -> str:
     return f'<div class="notation wide"><header><h3>arm {escape(arm.name)}: base_from_other_base</h3>{body}</div>'
 
 
-def _transform(name: str, matrix: list[list[float]] | None, sure: Sureness | None) -> str:
+def _transform(name: str, matrix: list[list[float]] | None, sure: TransformUncertainty | None) -> str:
     """The rest of the header, the matrix and its standard deviations."""
     if matrix is None or sure is None:
         return "</header>"
