@@ -44,6 +44,7 @@ from jcr.records import (
     HandEye,
     Intrinsics,
     Kind,
+    Mend,
     Reconstruction,
     strongest_first,
 )
@@ -86,8 +87,9 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.converged:
-        why = Finding(kind=Kind.OWN_REJECTED, severity="rejects", details={"camera": capture.camera_name})
-        return CellFound(tuple(_Seen.nothing_of(camera).refused(why) for camera in others), (), None)
+        seen = map(_Seen.nothing_of, others)
+        refused = [one.refused(Kind.OWN_REJECTED, camera=capture.camera_name) for one in seen]
+        return CellFound(tuple(refused), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
@@ -182,8 +184,20 @@ class _Seen:
         """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
-    def refused(self, *why: Finding) -> CameraFound:
-        """The camera is not placed."""
+    def refused(
+        self,
+        kind: Kind,
+        mend: Mend = "none",
+        images: tuple[str, ...] = (),
+        value: float | None = None,
+        **details: float | str,
+    ) -> CameraFound:
+        """The camera is not placed, for this finding."""
+        why = Finding(kind=kind, severity="rejects", mend=mend, images=images, value=value, details=details)
+        return self.not_placed(why)
+
+    def not_placed(self, *why: Finding) -> CameraFound:
+        """The camera with why it is not placed."""
         camera = self.camera
         images = [
             ImageFound(image, False, count, None, reason or "the camera was not placed")
@@ -227,14 +241,8 @@ class _Rigs:
         """The camera's images among the rigs; or why it cannot be placed."""
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
-            few = Finding(
-                kind=Kind.FEW_POINTS_SHARED,
-                severity="rejects",
-                mend="images",
-                images=(seen.camera.images[most],),
-                value=float(seen.counts[most]),
-            )
-            return seen.refused(few)
+            best, count = seen.camera.images[most], float(seen.counts[most])
+            return seen.refused(Kind.FEW_POINTS_SHARED, "images", (best,), count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
@@ -249,15 +257,8 @@ class _Rigs:
             most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
         if metres.max() > most_m or radians.max() > most_rad:
             a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
-            moved = Finding(
-                kind=Kind.NOT_FIXED,
-                severity="rejects",
-                mend="mount",
-                images=(names[a], names[b]),
-                value=float(metres[a, b]),
-                details={"rotation": float(radians[a, b])},
-            )
-            return seen.refused(moved)
+            apart_m, apart_rad = float(metres[a, b]), float(radians[a, b])
+            return seen.refused(Kind.NOT_FIXED, "mount", (names[a], names[b]), apart_m, rotation=apart_rad)
         middle = int(metres.sum(1).argmin())
         rig = np.full(len(seen.shared), -1)
         rig[seen.rows] = len(self.poses)
@@ -296,7 +297,7 @@ class _Rigs:
         seen = seen.without(unused)
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
-            return seen.refused(Finding(kind=Kind.NO_COMMON_POSE, severity="rejects", mend="images"))
+            return seen.refused(Kind.NO_COMMON_POSE, "images")
         on_rig = inverse(np.stack(self.poses)[rig[taken]]) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -305,14 +306,8 @@ class _Rigs:
             np.linalg.norm(off[:, 3:], axis=1) > SAME_PLACE[1]
         )
         if astray.mean() > 0.4:
-            loose = Finding(
-                kind=Kind.NOT_RIGID,
-                severity="rejects",
-                mend="mount",
-                value=float(np.linalg.norm(off[:, :3], axis=1).max()),
-                details={"camera": self._capture.camera_name},
-            )
-            return seen.refused(loose)
+            most_m = float(np.linalg.norm(off[:, :3], axis=1).max())
+            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=self._capture.camera_name)
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
@@ -321,21 +316,16 @@ class _Rigs:
     def _on_other_arm(self, seen: _Seen, arm: str) -> _Member | CameraFound:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused(Finding(kind=Kind.SECOND_ON_ARM, severity="rejects", details={"arm": arm}))
+            return seen.refused(Kind.SECOND_ON_ARM, arm=arm)
         if len(seen.rows) < LEAST_POSES:
-            few = Finding(
-                kind=Kind.FEW_LOCALISED,
-                severity="rejects",
-                mend="images",
-                value=float(len(seen.rows)),
-                details={"needed": float(LEAST_POSES)},
+            return seen.refused(
+                Kind.FEW_LOCALISED, "images", value=float(len(seen.rows)), needed=float(LEAST_POSES)
             )
-            return seen.refused(few)
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
         if not found.converged:
-            return seen.refused(*found.findings)
+            return seen.not_placed(*found.findings)
         rig = np.full(len(seen.shared), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
@@ -401,14 +391,7 @@ def _adjusted(
             rig.append(int(member.rig[k]))
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
-    intrinsics = [member.seen.intrinsics for member in members]
-    priors = [
-        prior_about(start, member.camera.intrinsics is not None, member.camera.intrinsics_std)
-        for start, member in zip(intrinsics, members, strict=True)
-    ]
-    first = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
-    movable = np.array([False, *(member.rig_from_camera is not None for member in members)])
-    cameras = (reconstruction.intrinsics, *intrinsics)
+    cameras = (reconstruction.intrinsics, *(member.seen.intrinsics for member in members))
     adjusted = adjust(
         Scene(
             world_from_rig=np.stack(rigs.poses),
@@ -423,7 +406,7 @@ def _adjusted(
             x_px=np.concatenate(x_px),
             point=np.concatenate(point),
         ),
-        Freedom.of(cameras, (first, *priors), len(rig), movable),
+        _freedom(capture, members, cameras, len(rig)),
         rigs.arm_poses(options),
         options.robot_noise_m_rad,
         prior,
@@ -431,6 +414,20 @@ def _adjusted(
     evidence = adjusted.given.evidence
     medians = median_reprojection_px(evidence.view, evidence.problem)
     return adjusted, {key: float(medians[row]) for key, row in number.items()}
+
+
+def _freedom(
+    capture: Capture, members: Sequence[_Member], cameras: Sequence[Intrinsics], images: int
+) -> Freedom:
+    """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig."""
+    sources = (capture, *(member.camera for member in members))
+    priors = [
+        prior_about(start, source.intrinsics is not None, source.intrinsics_std)
+        for start, source in zip(cameras, sources, strict=True)
+    ]
+    return Freedom.of(
+        cameras, priors, images, [False, *(member.rig_from_camera is not None for member in members)]
+    )
 
 
 def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:
