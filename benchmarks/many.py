@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.matching import off
-from jcr.calibration.calibration_json import read_hand_eye
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.reconstruct.colmap import reconstruct

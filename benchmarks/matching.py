@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.calibration_json import read_hand_eye
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError

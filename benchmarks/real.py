@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.peers import opencv
-from jcr.calibration.calibration_json import read_hand_eye
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jcr.calibration.calibration_json import read_hand_eye
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.capture.read import read_capture
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg

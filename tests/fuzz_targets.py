@@ -14,9 +14,9 @@ from benchmarks.simulated.ros_bag import write_bag
 from jcr.calibration.calibration_json import (
     calibration_file,
     read_calibration,
-    read_hand_eye,
     write_calibration,
 )
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.capture import capture_json

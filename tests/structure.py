@@ -23,7 +23,7 @@ from benchmarks.simulated.ros_bag import write_bag
 from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
-from jcr.calibration.calibration_json import read_hand_eye
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.capture import capture_json
 from jcr.capture.added import read_added, read_pose
 from jcr.capture.camera_info import read_camera_info

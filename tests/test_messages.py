@@ -10,7 +10,7 @@ from places import ROOT
 SOURCES = [*(ROOT / "src" / "jcr").rglob("*.py"), *(ROOT / "ros2" / "jcr_ros" / "jcr_ros").glob("*.py")]
 FIELDS = {"warnings", "doubt", "remarks", "advice", "why_not", "unobservable", "remedies"}
 """Attributes that hold messages."""
-WORDS = {"text", "remedy", "sentence"}
+WORDS = {"text", "remedy", "sentence", "doubt_of", "warnings_of"}
 """Functions of records/words.py."""
 ERRORS = {"error", "failure", "nothing", "refusal"}
 """As exceptions are named."""

@@ -36,7 +36,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (("handeye/", "AX = XB with scale: arrays in, arrays out; no image, no file", 1),),
     (
         ("camera.py", "projection, distortion, derivatives", 1),
-        ("intrinsics_json.py", "intrinsics in our files", 1),
+        ("arrays_json, intrinsics_json", "parts of our files", 1),
         ("least_squares.py", "damped Gauss-Newton", 1),
     ),
     (

@@ -2,8 +2,11 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from jaxtyping import Float
+from numpy import ndarray
+from pydantic import Field, model_validator
 
+from jcr.arrays_json import Part, Spread
 from jcr.geometry import HUGE
 from jcr.records import COEFFICIENTS, Intrinsics, LensModel, coefficients_of
 
@@ -13,10 +16,9 @@ Pixels = Annotated[int, Field(ge=1, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, lt=HUGE)]
 
 
-class IntrinsicsJson(BaseModel):
+class IntrinsicsJson(Part):
     """Every number of an Intrinsics, in range."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     fx: Positive
     fy: Positive
     cx: float
@@ -45,3 +47,28 @@ class IntrinsicsJson(BaseModel):
             coefficients_of(self.distortion),
             self.model,
         )
+
+
+class IntrinsicsAndStd(IntrinsicsJson):
+    """With what is known of their errors."""
+
+    std: list[Spread] | None = None
+    """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> "IntrinsicsAndStd":
+        if self.std is not None and len(self.std) != 4 + len(self.distortion):
+            raise ValueError(
+                f"{len(self.std)} standard deviations, but a {self.model} model has "
+                f"{4 + len(self.distortion)} parameters"
+            )
+        return self
+
+    @classmethod
+    def of(
+        cls, intrinsics: Intrinsics | None, std: Float[ndarray, " q"] | None = None
+    ) -> "IntrinsicsAndStd | None":
+        """Those of a record, None where there are none."""
+        if intrinsics is None:
+            return None
+        return cls.model_validate(vars(intrinsics) | {"std": None if std is None else std.tolist()})

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jcr.calibration.calibration_json import Known
 from jcr.calibration.difference import difference
+from jcr.calibration.known_transform import Known
 from jcr.geometry import retract, rotation_exp, transform
 
 X = transform(rotation_exp(np.array([0.3, -1.0, 0.4])), np.array([0.05, 0.02, 0.08]))

@@ -11,7 +11,8 @@ from benchmarks.simulated.faults import LENS, Faults, faulty_capture
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.geometry import retract, step_between
+from jcr.cell.carried import exchanged, refined
+from jcr.geometry import inverse, retract, step_between
 from jcr.records import Kind
 from jcr.records.words import sentence
 
@@ -89,6 +90,21 @@ def test_a_focus_that_varies_is_modelled():
     assert (np.abs(step) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
     assert np.linalg.norm(step[:3]) < 4e-3
     assert hand_eye.converged and not hand_eye.warnings
+
+
+def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_faults():
+    """The same images, as of a fixed camera before which the gripper carries the scene; its zoom was moved."""
+    found = faulty_capture(np.random.default_rng(3), 12, NAMED["zoom"][0])
+    seen, reconstruction = reconstructed(found, estimated=False)
+    capture = replace(seen, base_from_gripper=inverse(seen.base_from_gripper), mount="base")
+    assert np.allclose(exchanged(capture).base_from_gripper, seen.base_from_gripper)
+    hand_eye = refined(capture, reconstruction, calibrate(exchanged(capture), reconstruction))
+    assert hand_eye.converged and hand_eye.budget is not None
+    parts = np.sum(list(vars(hand_eye.budget).values()), axis=0)
+    assert np.allclose(parts, hand_eye.covariance, rtol=0, atol=1e-9)
+    assert np.trace(hand_eye.budget.faults) > 0
+    error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
 
 
 def test_one_wrong_pose_among_right_ones_is_no_slip():

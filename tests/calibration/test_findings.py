@@ -13,8 +13,8 @@ from jcr.calibration.calibration_json import (
     CalibrationFile,
     calibration_file,
     read_calibration,
-    read_hand_eye,
 )
+from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.verdict import with_findings
 from jcr.cell.cameras_json import in_words, read_cameras
@@ -65,6 +65,16 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.JOINT_OFFSETS: {"joints": (2,), "p": 1e-9, "details": {"joint_2": 0.01, "joint_2_std": 0.001}},
     Kind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
     Kind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
+    Kind.OWN_REJECTED: {"details": {"camera": "wrist"}},
+    Kind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
+    Kind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},
+    Kind.SECOND_ON_ARM: {"details": {"arm": "right"}},
+    Kind.NOT_FIXED: {"value": 0.1, "images": ("a.png", "b.png"), "details": SIZE},
+    Kind.NOT_RIGID: {"value": 0.1, "details": {"camera": "wrist"}},
+    Kind.IMAGE_MISSES: {"value": 9.0, "images": ("a.png",), "details": {"mount": "base"}},
+    Kind.PLACE_UNCERTAIN: {"value": 0.1, "details": SIZE | {"focal_std": 0.1}, "mend": "intrinsics"},
+    Kind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
+    Kind.ANOTHER_SCENE: {"value": 9.0, "details": {"camera": "wrist"}},
 }
 """What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""
 

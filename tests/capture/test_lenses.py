@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 import jcr
-from jcr.calibration.calibration_json import Lens
 from jcr.capture import camera_info, capture_json, colmap_model, lens_json
 from jcr.export import ros
+from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import Intrinsics
 
 SIZE = (640, 480)
@@ -32,8 +32,8 @@ def test_a_lens_survives_capture_json_camera_info_and_calibration_json(lens: Int
     assert camera_info.read_camera_info(tmp_path / "camera_info.yaml", SIZE) == lens
     told = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
     assert told["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
-    file = Lens.model_validate(vars(lens) | {"distortion": list(lens.distortion)})
-    assert Lens.model_validate_json(file.model_dump_json()).record() == lens
+    file = IntrinsicsAndStd.model_validate(vars(lens) | {"distortion": list(lens.distortion)})
+    assert IntrinsicsAndStd.model_validate_json(file.model_dump_json()).record() == lens
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -23,8 +23,8 @@ from jcr.capture.added import read_added
 from jcr.capture.capture_json import read, write
 from jcr.cell import alone, carried, localise
 from jcr.cell.added import camera_of, read_added_cameras
-from jcr.cell.cameras_json import read_cameras
-from jcr.cell.found import CameraFound, PictureFound
+from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras
+from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.cell.stage import place_cameras
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
@@ -201,13 +201,15 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert [camera.converged for camera in found.cameras] == [False, False, False]
     assert "must see the same scene" in found.cameras[0].warnings[0]
     assert all("it is not fixed" in camera.warnings[0] for camera in found.cameras[1:])
+    kinds = [camera.findings[0].kind for camera in found.cameras]
+    assert kinds == [FindingKind.FEW_POINTS_SHARED, FindingKind.NOT_FIXED, FindingKind.NOT_FIXED]
     uncertain = Finding(kind=FindingKind.UNCERTAIN, severity="rejects", value=0.1, details={"part": "scale"})
     untrusted = place_cameras(old, [moving], reconstruction, hand_eye.with_findings(uncertain))
     assert "rejected" in untrusted.cameras[0].warnings[0]
 
 
 def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictures(
-    calibrated, monkeypatch, tabletop: Path
+    calibrated, monkeypatch, tabletop: Path, tmp_path: Path
 ):
     """Its reconstruction has a frame and a unit of its own; two of its images were left out."""
     old, reconstruction, hand_eye = calibrated
@@ -230,8 +232,13 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         return whole
 
     monkeypatch.setattr(alone, "reconstruct", reconstruct)
+    few = Finding(kind=FindingKind.FEW_POINTS_SHARED, severity="rejects", value=3.0, images=second.images[:1])
     nothing = CameraFound(
-        "second", "gripper", None, tuple(PictureFound(i, False, 3, None, "few") for i in second.images)
+        name="second",
+        mount="gripper",
+        arm=None,
+        images=tuple(ImageFound(i, False, 3, None, "few") for i in second.images),
+        findings=(few,),
     )
     assert alone.sees_another_scene(second, nothing)
     assert not alone.sees_another_scene(replace(second, mount="base"), nothing)
@@ -240,7 +247,7 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
     assert (asked[0].base_from_gripper == old.base_from_gripper[frame]).all() and asked[0].mount == "gripper"
     assert found.converged and found.parent_from_camera is not None
     assert np.abs(step_between(found.parent_from_camera, x)).max() < 1e-3
-    assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.pictures) == len(frame)
+    assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.images) == len(frame)
 
     def refuse(*_: object) -> Reconstruction:
         raise NotTrustedError("2 of 7 images could be registered")
@@ -250,6 +257,21 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         old, second, nothing, ReconstructOptions(), CalibrateOptions(), silent
     )
     assert not refused.converged and refused.warnings[0].endswith("2 of 7 images could be registered")
+    kinds = [one.kind for one in refused.findings]
+    assert kinds == [FindingKind.NO_RECONSTRUCTION, FindingKind.ANOTHER_SCENE]
+    # The file has the findings, and what older versions read.
+    content = cameras_file(CellFound((found, refused), (), None), "0")
+    write_cameras(tmp_path, content)
+    assert read_cameras(tmp_path) == content
+    written = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
+    assert [one["verdict"] for one in written] == ["accepted with warnings", "rejected"]
+    assert [one["kind"] for one in written[1]["findings"]] == kinds
+    assert written[1]["warnings"] == list(refused.warnings) and not written[1]["converged"]
+    assert [picture["image"] for picture in written[0]["pictures"]] == list(second.images)
+    written[0]["converged"] = False
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": written, "arms": [], "version": "0"}))
+    with pytest.raises(jcr.InputError, match="contradict one another"):
+        read_cameras(tmp_path)
 
 
 def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera(
@@ -277,7 +299,7 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
     assert np.abs(step_between(found.parent_from_camera, base_from_camera)).max() < 1e-3
     away = np.linalg.norm(old.base_from_gripper[frame, :3, 3] - base_from_camera[:3, 3], axis=1)
     assert found.scene_distance is not None and 0 < found.scene_distance < away.max() + 0.3
-    assert [picture.image for picture in found.pictures] == list(front.images)
+    assert [image.image for image in found.images] == list(front.images)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -16,12 +16,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
-from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file, worst_direction
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import log
+from jcr.calibration.words import log, worst_direction
 from jcr.capture.images import read_image
 from jcr.cell.cameras_json import cameras_file
-from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
+from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
 from jcr.errors import NotTrustedError
@@ -277,11 +277,20 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
         CellCamera("other", "gripper", ("a",), size, arm="right", base_from_gripper=poses[:1]),
     )
     found = [
-        CameraFound(name, kind, arm, pictures, mount, 1e-6 * np.eye(6), 1.0, run.lens, converged=True)
-        for name, kind, arm, pictures in (
-            ("top", "base", None, (PictureFound("t", True, 90, 0.3, None),)),
-            ("second", "gripper", None, tuple(PictureFound(i, i != "b", 90, 0.3, None) for i in "abc")),
-            ("other", "gripper", "right", (PictureFound("a", True, 90, 0.3, None),)),
+        CameraFound(
+            name=name,
+            mount=kind,
+            arm=arm,
+            images=images,
+            parent_from_camera=mount,
+            covariance=1e-6 * np.eye(6),
+            scene_distance=1.0,
+            intrinsics=run.lens,
+        )
+        for name, kind, arm, images in (
+            ("top", "base", None, (ImageFound("t", True, 90, 0.3, None),)),
+            ("second", "gripper", None, tuple(ImageFound(i, i != "b", 90, 0.3, None) for i in "abc")),
+            ("other", "gripper", "right", (ImageFound("a", True, 90, 0.3, None),)),
         )
     ]
     content = cameras_file(CellFound(tuple(found), (ArmFound("right", base, 1e-6 * np.eye(6)),), None), "0.0")

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.calibration_json import Known
+from jcr.calibration.known_transform import Known
 from jcr.geometry import step_between
 
 OTHER = "reference"

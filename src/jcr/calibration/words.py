@@ -4,15 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jcr.records import Attempt, DepthCheck, HeldOut, ScaleCheck
+from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck
 from jcr.records.words import network_scale, reached_in_words
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import (
-        CalibrationFile,
-        UncertaintyBudget,
-    )
+    from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.calibration.uncertainty_json import UncertaintyBudget
 
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
@@ -70,6 +68,24 @@ def found(content: "CalibrationFile") -> list[str]:
     if (held_out := content.held_out) is not None:
         lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
+
+
+def worst_direction(estimate: Estimate) -> str:
+    """The least certain direction of the translation in words, e.g. "along the optical axis: ±4.0 mm"."""
+    variance, vectors = np.linalg.eigh(estimate.covariance[:3, :3])
+    direction = vectors[:, 2]
+    std_mm = 1e3 * float(np.sqrt(variance[2]))
+    named = {
+        "the optical axis": estimate.gripper_from_camera[:3, 2],
+        "the image's x axis": estimate.gripper_from_camera[:3, 0],
+        "the image's y axis": estimate.gripper_from_camera[:3, 1],
+    }
+    name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
+    if abs(axis @ direction) < np.cos(np.radians(30)):
+        name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
+    # An offset that no motion shows may be uncertain by metres.
+    size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
+    return f"along {name}: ±{size}"
 
 
 def more_images_help(budget: "UncertaintyBudget") -> bool:

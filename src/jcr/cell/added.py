@@ -31,9 +31,7 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
     return tuple(replace(camera, folder=folder) for camera in read.others)
 
 
-def camera_of(
-    name: str, pictures: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]
-) -> CellCamera:
+def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str]) -> CellCamera:
     """A fixed camera of images where they lie; InputError for images that cannot be those of one camera.
 
     `intrinsics` is a JSON file as capture.json has them, or one that holds them as "intrinsics"; `taken` are names
@@ -43,21 +41,21 @@ def camera_of(
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
     if name in taken:
         raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
-    sizes = [read_image(picture).shape[1::-1] for picture in pictures]
-    for picture, size in zip(pictures, sizes, strict=True):
+    sizes = [read_image(file).shape[1::-1] for file in files]
+    for file, size in zip(files, sizes, strict=True):
         if size != sizes[0]:
             raise InputError(
-                f"{picture}: {size[0]}x{size[1]} pixels, but {pictures[0]} has {sizes[0][0]}x{sizes[0][1]}; images of "
+                f"{file}: {size[0]}x{size[1]} pixels, but {files[0]} has {sizes[0][0]}x{sizes[0][1]}; images of "
                 "one camera have one size: add each camera by itself"
             )
-    lens = None
+    known = None
     if intrinsics is not None:
         content = read_json(intrinsics)
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
-        lens = read_lens_of_these(content, sizes[0], f"{pictures[0]}, {intrinsics}")
-    images = tuple(str(picture.resolve()) for picture in pictures)
-    return CellCamera(name, "base", images, sizes[0], lens, folder=Path("/"))
+        known = read_lens_of_these(content, sizes[0], f"{files[0]}, {intrinsics}")
+    images = tuple(str(file.resolve()) for file in files)
+    return CellCamera(name, "base", images, sizes[0], known, folder=Path("/"))
 
 
 def keep_camera(run_folder: Path, capture: Capture, camera: CellCamera) -> CellCamera:

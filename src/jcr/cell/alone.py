@@ -11,13 +11,22 @@ import numpy as np
 from jcr.calibration.calibration_json import image_verdicts
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.cell.found import CameraFound, PictureFound
+from jcr.cell.found import CameraFound, ImageFound
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.relocate import MIN_POINTS
-from jcr.records import Capture, CellCamera, HandEye, Reconstruction
+from jcr.records import (
+    Capture,
+    CellCamera,
+    Finding,
+    HandEye,
+    Kind,
+    Reconstruction,
+    no_reconstruction,
+    strongest_first,
+)
 
 LEAST_POSES = 3
 """With fewer images nothing is reconstructed."""
@@ -47,7 +56,7 @@ def of_camera(capture: Capture, camera: CellCamera) -> Capture:
 def sees_another_scene(camera: CellCamera, found: CameraFound) -> bool:
     """Whether a camera on the capture's own gripper shares nothing with its images, and has enough of its own."""
     on_gripper = camera.mount == "gripper" and camera.frame is not None
-    few = all(picture.points < MIN_POINTS for picture in found.pictures)
+    few = all(image.points < MIN_POINTS for image in found.images)
     return on_gripper and few and len(camera.images) >= LEAST_POSES
 
 
@@ -61,52 +70,52 @@ def calibrated_elsewhere(
 ) -> CameraFound:
     """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those said of it."""
     own = of_camera(capture, camera)
+    other_scene = Finding(kind=Kind.ANOTHER_SCENE, severity="warns", details={"camera": capture.camera_name})
     try:
         reconstruction = reconstruct(own, replace(reconstruct_options, backend="auto"), progress)
         found = calibrate(own, reconstruction, options)
     except NotTrustedError as error:
-        why = f"it shares nothing with the {capture.camera_name} camera's images, and by its own images: {error}"
-        return replace(shared, warnings=(why,))
+        return replace(shared, findings=strongest_first((*no_reconstruction(error), other_scene)))
     depth = [
         float(np.median(apply(inverse(pose), reconstruction.tracks.points_in_recon)[:, 2]))
         for pose in reconstruction.recon_from_camera
     ]
-    note = (
-        f"it shares nothing with the {capture.camera_name} camera's images: calibrated by its own {len(own)} images, "
-        "and what it sees is not in the map"
-    )
     alone = found_alone(own, camera, reconstruction, found, found.scale * float(np.median(depth)))
-    return replace(alone, warnings=(*alone.warnings, note))
+    other_scene = replace(other_scene, value=float(len(own)))
+    return replace(alone, findings=strongest_first((*alone.findings, other_scene)))
 
 
 def found_alone(
     own: Capture, camera: CellCamera, reconstruction: Reconstruction, found: HandEye, scene_distance: float
 ) -> CameraFound:
     """What the calibration of a camera by its own images says of it."""
-    pictures = []
+    images = []
     for verdict in image_verdicts(own, reconstruction, found):
         row = own.images.index(verdict.image)
         points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
-        pictures.append(
-            PictureFound(verdict.image, verdict.used, points, verdict.reprojection_px, verdict.reason)
+        images.append(
+            ImageFound(verdict.image, verdict.used, points, verdict.reprojection_px, verdict.reason)
         )
-    std = found.estimate.intrinsics_covariance
     return CameraFound(
-        camera.name,
-        camera.mount,
-        camera.arm,
-        tuple(pictures),
-        found.gripper_from_camera,
-        found.covariance[:6, :6],
-        scene_distance,
-        found.intrinsics,
-        None if std is None else np.sqrt(np.diag(std)),
-        found.converged,
-        found.warnings,
+        name=camera.name,
+        mount=camera.mount,
+        arm=camera.arm,
+        images=tuple(images),
+        parent_from_camera=found.gripper_from_camera,
+        covariance=found.covariance[:6, :6],
+        scene_distance=scene_distance,
+        intrinsics=found.intrinsics,
+        intrinsics_std=found.estimate.intrinsics_std,
+        findings=found.findings,
     )
 
 
-def not_registered(camera: CellCamera, why: str) -> CameraFound:
-    """Of a camera whose images gave no reconstruction."""
-    pictures = tuple(PictureFound(image, False, 0, None, "not registered") for image in camera.images)
-    return CameraFound(camera.name, camera.mount, camera.arm, pictures, warnings=(why,))
+def not_registered(camera: CellCamera, error: NotTrustedError) -> CameraFound:
+    """Of a camera whose images could not be reconstructed."""
+    return CameraFound(
+        name=camera.name,
+        mount=camera.mount,
+        arm=camera.arm,
+        images=tuple(ImageFound(image, False, 0, None, "not registered") for image in camera.images),
+        findings=no_reconstruction(error),
+    )

@@ -27,24 +27,24 @@ GROWN, SOFT = 0.012, 0.008
 """Of the width: by how much what moves is grown, and sigma of the fading around it."""
 
 
-def moving_parts(pictures: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
+def moving_parts(images: Sequence[UInt8[ndarray, "h w 3"]]) -> list[UInt8[ndarray, "h w 3"]]:
     """The images of a fixed camera with what stands still faded to grey."""
-    height, width = pictures[0].shape[:2]
+    height, width = images[0].shape[:2]
     small = min(REDUCED, width), max(1, round(height * min(REDUCED, width) / width))
     reduced = np.stack(
-        [cv2.resize(picture, small, interpolation=cv2.INTER_AREA).astype(np.float32) for picture in pictures]
+        [cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32) for image in images]
     )
     background, known = _background(reduced)
     out = []
-    for picture, small_picture in zip(pictures, reduced, strict=True):
-        moves = (np.abs(small_picture - background).max(-1) > LEVELS) | ~known
+    for image, small_image in zip(images, reduced, strict=True):
+        moves = (np.abs(small_image - background).max(-1) > LEVELS) | ~known
         mask = cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
         grown = max(1, round(GROWN * small[0]))
         mask = cv2.dilate(mask, np.ones((2 * grown + 1, 2 * grown + 1), np.uint8))
         share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
         share = cv2.GaussianBlur(share, (0, 0), SOFT * width)[..., None]
-        out.append(np.rint(GREY + share * (picture.astype(np.float32) - GREY)).astype(np.uint8))
+        out.append(np.rint(GREY + share * (image.astype(np.float32) - GREY)).astype(np.uint8))
     return out
 
 
@@ -54,7 +54,7 @@ def _background(
     """At each pixel the colour on which most images agree, and whether enough of them do."""
     agreeing = np.stack(
         [(np.abs(reduced - one).max(-1) < LEVELS).sum(0) for one in reduced]
-    )  # (n,h,w): pictures like each
+    )  # (n,h,w): images like each
     best = agreeing.argmax(0)
     rows, columns = np.indices(best.shape)
     enough = agreeing.max(0) >= max(LEAST, LEAST_SHARE * len(reduced))
@@ -63,5 +63,5 @@ def _background(
 
 def write_moving_parts(source: Path, names: Sequence[str], folder: Path) -> None:
     """Write those of the images of a folder under the same names in another; PNG, whatever the names end with."""
-    for name, picture in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
-        write_bytes(folder / name, encode_png(picture))
+    for name, image in zip(names, moving_parts([read_image(source / name) for name in names]), strict=True):
+        write_bytes(folder / name, encode_png(image))

@@ -2,18 +2,22 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from jcr.calibration.calibration_json import Lens, Matrix, Spread, Spread3
+from jcr.arrays_json import Covariance6, Matrix, Part, Spread, Spread3
+from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.capture.plain_files import first_fault, is_written, read_json
-from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
+from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.errors import InputError
 from jcr.files import write_text
+from jcr.intrinsics_json import IntrinsicsAndStd
+from jcr.records import Mount, Verdict
+from jcr.records.words import doubt_of
 from jcr.rounding import significant
 
 FILE, FORMAT = "cameras.json", "jcr.cameras/1"
@@ -21,22 +25,7 @@ ORDER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 """Of the covariances: the step (geometry.retract) that takes the transform to the true one, in axes of its parent."""
 
 
-def _covariance(rows: list[list[float]]) -> list[list[float]]:
-    matrix = np.array(rows)
-    if np.linalg.eigvalsh((matrix + matrix.T) / 2)[0] < -1e-9 * max(float(np.abs(matrix).max()), 1e-12):
-        raise ValueError("no covariance: a variance is negative")
-    return rows
-
-
-Numbers6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_covariance)]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Sureness(_Part):
+class TransformUncertainty(Part):
     """One-sigma uncertainty of a transform, along axes of its parent frame."""
 
     translation_std_mm: Spread3
@@ -48,22 +37,27 @@ class Sureness(_Part):
     scene_distance_m: Spread | None = None
 
 
-class CameraPlaced(_Part):
+class CameraPlaced(Part):
     """One camera; of one that was not found the transforms are null, and the first warning says why."""
 
     name: str
-    mount: Literal["gripper", "base"]
+    mount: Mount
     arm: str | None
     """null: the capture's own arm."""
     base_from_camera: Matrix | None = None
     """Of a fixed camera."""
     gripper_from_camera: Matrix | None = None
     """Of a camera on a gripper."""
-    uncertainty: Sureness | None = None
-    intrinsics: Lens | None = None
-    pictures: list[PictureFound]
+    uncertainty: TransformUncertainty | None = None
+    intrinsics: IntrinsicsAndStd | None = None
+    images: list[ImageFound] = Field(alias="pictures")
+    findings: list[FindingJson] = []
+    """Strongest first."""
+    verdict: Verdict | None = None
+    """That of the worst finding; null as long as a file of an earlier version is read."""
     converged: bool
     warnings: list[str]
+    """Findings in words: what rejects first; then what the user must act on."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> "CameraPlaced":
@@ -73,8 +67,7 @@ class CameraPlaced(_Part):
             raise ValueError("base_from_camera of a camera that moves with the gripper")
         if self.converged and self.parent_from_camera is None:
             raise ValueError("converged without a transform")
-        if not self.converged and not self.warnings:
-            raise ValueError("not converged, and no warning says why")
+        require_one_verdict(self.findings, self.verdict, self.converged, self.warnings)
         return self
 
     @property
@@ -85,25 +78,29 @@ class CameraPlaced(_Part):
     @property
     def doubt(self) -> str | None:
         """Why it is rejected; None when it is."""
-        return None if self.converged else next(iter(self.warnings))
+        return doubt_of(self.findings)
 
 
-class ArmPlaced(_Part):
+class ArmPlaced(Part):
     """Another arm."""
 
     name: str
     base_from_other_base: Matrix
     """From its base to that of the capture's own arm."""
-    uncertainty: Sureness
+    uncertainty: TransformUncertainty
 
 
-class CamerasFile(_Part):
+class CamerasFile(Part):
     """The content of cameras.json."""
 
     format: Literal["jcr.cameras/1"] = FORMAT
     cameras: list[CameraPlaced]
     arms: list[ArmPlaced]
     version: str
+
+    def as_json(self) -> dict[str, Any]:
+        """As it is written."""
+        return self.model_dump(by_alias=True)
 
 
 def cameras_file(found: CellFound, version: str) -> CamerasFile:
@@ -118,22 +115,16 @@ def cameras_file(found: CellFound, version: str) -> CamerasFile:
 def _camera(found: CameraFound) -> CameraPlaced:
     key = "base_from_camera" if found.mount == "base" else "gripper_from_camera"
     transform, covariance = found.parent_from_camera, found.covariance
-    lens, std = found.intrinsics, found.intrinsics_std
     return CameraPlaced(
         name=found.name,
         mount=found.mount,
         arm=found.arm,
         uncertainty=None
         if covariance is None
-        else _sureness(covariance, found.std_at_scene, found.scene_distance),
-        intrinsics=None
-        if lens is None
-        else Lens.model_validate(
-            vars(lens) | {"distortion": list(lens.distortion), "std": None if std is None else std.tolist()}
-        ),
-        pictures=list(found.pictures),
-        converged=found.converged,
-        warnings=list(found.warnings),
+        else _uncertainty(covariance, found.std_at_scene, found.scene_distance),
+        intrinsics=IntrinsicsAndStd.of(found.intrinsics, found.intrinsics_std),
+        pictures=list(found.images),
+        **derived(found.findings),
         **{} if transform is None else {key: transform.tolist()},
     )
 
@@ -142,15 +133,15 @@ def _arm(found: ArmFound) -> ArmPlaced:
     return ArmPlaced(
         name=found.name,
         base_from_other_base=found.base_from_other.tolist(),
-        uncertainty=_sureness(found.covariance),
+        uncertainty=_uncertainty(found.covariance),
     )
 
 
-def _sureness(
+def _uncertainty(
     covariance: Float[ndarray, "6 6"], at_scene: float | None = None, distance: float | None = None
-) -> Sureness:
+) -> TransformUncertainty:
     std = np.sqrt(np.diag(covariance))
-    return Sureness(
+    return TransformUncertainty(
         translation_std_mm=(1e3 * std[:3]).tolist(),
         rotation_std_deg=np.degrees(std[3:]).tolist(),
         covariance=covariance.tolist(),
@@ -161,7 +152,7 @@ def _sureness(
 
 def write_cameras(folder: Path, content: CamerasFile) -> None:
     """Write cameras.json of a run folder, whole or not at all."""
-    write_text(folder / FILE, json.dumps(content.model_dump(), indent=2, allow_nan=False) + "\n")
+    write_text(folder / FILE, json.dumps(content.as_json(), indent=2, allow_nan=False) + "\n")
 
 
 def read_cameras(folder: Path) -> CamerasFile | None:
@@ -171,11 +162,19 @@ def read_cameras(folder: Path) -> CamerasFile | None:
         return None
     read_json(file)  # says what is no JSON
     try:
-        return CamerasFile.model_validate_json(file.read_bytes(), strict=True)
+        content = CamerasFile.model_validate_json(file.read_bytes(), strict=True)
     except ValidationError as error:
         raise InputError(
             f"{file}: {first_fault(error)}; place the cameras again (jcr run, jcr add-camera)"
         ) from None
+    return content.model_copy(update={"cameras": [_of_this_version(camera) for camera in content.cameras]})
+
+
+def _of_this_version(camera: CameraPlaced) -> CameraPlaced:
+    """With its warnings as findings, where an earlier version wrote it."""
+    if camera.verdict is not None:
+        return camera
+    return camera.model_copy(update=derived(findings_of_words(camera.warnings, camera.converged)))
 
 
 def in_words(content: CamerasFile) -> list[str]:
@@ -188,10 +187,9 @@ def in_words(content: CamerasFile) -> list[str]:
             continue
         sure = camera.uncertainty
         name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
-        used = sum(picture.used for picture in camera.pictures)
-        points = sum(picture.points for picture in camera.pictures if picture.used)
-        pictures = f"{used} of {len(camera.pictures)} images, {points} points"
-        lines.append(f"{camera.name}: {name} ({pictures})")
+        used = [image for image in camera.images if image.used]
+        points = sum(image.points for image in used)
+        lines.append(f"{camera.name}: {name} ({len(used)} of {len(camera.images)} images, {points} points)")
         with np.printoptions(precision=6, suppress=True):
             lines += [f"  {row}" for row in str(np.array(camera.parent_from_camera)).splitlines()]
         scene = (
@@ -204,7 +202,7 @@ def in_words(content: CamerasFile) -> list[str]:
             f"  {'rejected: ' if k == 0 and camera.doubt else ''}{text}"
             for k, text in enumerate(camera.warnings)
         ]
-        lines += [f"  not used: {p.image}: {p.reason}" for p in camera.pictures if not p.used]
+        lines += [f"  not used: {image.image}: {image.reason}" for image in camera.images if not image.used]
     for arm in content.arms:
         lines.append(f"base_from_{arm.name}_base")
         with np.printoptions(precision=6, suppress=True):
@@ -213,7 +211,7 @@ def in_words(content: CamerasFile) -> list[str]:
     return lines
 
 
-def _plus_minus(sure: Sureness) -> str:
+def _plus_minus(sure: TransformUncertainty) -> str:
     x, y, z = sure.translation_std_mm
     rx, ry, rz = sure.rotation_std_deg
     return f"± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ)"

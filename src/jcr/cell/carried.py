@@ -59,7 +59,7 @@ def calibrated_alone(
         reconstruction = reconstruct(seen, replace(reconstruct_options, backend="auto"), progress)
         found = refined(own, reconstruction, calibrate(seen, reconstruction, options), options)
     except NotTrustedError as error:
-        return not_registered(camera, str(error))
+        return not_registered(camera, error)
     middle = found.base_from_recon[:3, 3] + found.base_from_recon[:3, :3] @ (
         found.scale * np.median(reconstruction.tracks.points_in_recon, axis=0)
     )

@@ -9,14 +9,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import skew
-from jcr.records import Intrinsics, Mount
+from jcr.records import Finding, Intrinsics, Mount, Verdict, verdict_of
+from jcr.records.words import doubt_of, warnings_of
 
 if TYPE_CHECKING:
     from jcr.adjust.robots import Adjusted, Placed
 
 
 @dataclass(frozen=True)
-class PictureFound:
+class ImageFound:
     """What became of one image."""
 
     image: str
@@ -28,14 +29,14 @@ class PictureFound:
     """Why it was not used."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraFound:
     """Where one camera of the cell is."""
 
     name: str
     mount: Mount
     arm: str | None
-    pictures: tuple[PictureFound, ...]
+    images: tuple[ImageFound, ...]
     parent_from_camera: Float[ndarray, "4 4"] | None = None
     """base_from_camera or gripper_from_camera, of its own arm; None where it was not found."""
     covariance: Float[ndarray, "6 6"] | None = None
@@ -44,14 +45,28 @@ class CameraFound:
     """m along the optical axis to what it sees."""
     intrinsics: Intrinsics | None = None
     intrinsics_std: Float[ndarray, " q"] | None = None
-    converged: bool = False
-    warnings: tuple[str, ...] = ()
-    """The first says why it is rejected, where it is not."""
+    findings: tuple[Finding, ...] = ()
+    """Strongest first; of one that was not found, one that rejects it."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of the worst finding."""
+        return verdict_of(self.findings)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is accepted."""
+        return self.verdict != "rejected"
 
     @property
     def doubt(self) -> str | None:
-        """Why it is rejected; None when it is not."""
-        return None if self.converged else next(iter(self.warnings), "not placed")
+        """Why it is rejected, in words; None when it is not."""
+        return doubt_of(self.findings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each finding that rejects or warns."""
+        return warnings_of(self.findings)
 
     @property
     def std_at_scene(self) -> float | None:

@@ -44,7 +44,7 @@ SAME_VIEW = np.radians(5.0)
 class Known:
     """The images of known pose and what is found in them."""
 
-    lens: Intrinsics
+    intrinsics: Intrinsics
     recon_from_camera: Float[ndarray, "m 4 4"]
     found: tuple[Features, ...]
     learned: "Learned | None" = None
@@ -57,7 +57,7 @@ class Learned:
         self, images: Sequence[UInt8[ndarray, "h w 3"]], recon_from_camera: Float[ndarray, "m 4 4"]
     ) -> None:
         self._images = images
-        # The networks take little turning: one direction of the scene is turned to the right in all of them.
+        # The networks take little rotation: one direction of the scene points to the right in all of them.
         self._right = recon_from_camera[0, :3, 0]
         self._rolls = [self._roll(pose) for pose in recon_from_camera]
         self._features: LearnedFeatures | None = None
@@ -67,7 +67,7 @@ class Learned:
         return -math.atan2(y, x)
 
     def matched(
-        self, picture: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
+        self, image: UInt8[ndarray, "h w 3"], near: Float[ndarray, "4 4"]
     ) -> tuple[Float[ndarray, "k 2"], list[tuple[Int[ndarray, " c"], Float[ndarray, "c 2"]]]]:
         """Keypoints of an image (px), and for each image of known pose which of them it shows, and where.
 
@@ -77,10 +77,10 @@ class Learned:
 
         if self._features is None:  # the networks are loaded where they are needed
             self._features = LearnedFeatures("xfeat", self._images)
-        features, last = self._features, self._features.add(picture)
+        features, last = self._features, self._features.add(image)
 
         roll = self._roll(near)
-        rows = [features.match(image, last, self._rolls[image], roll) for image in range(len(self._images))]
+        rows = [features.match(k, last, self._rolls[k], roll) for k in range(len(self._images))]
         pairs = [(theirs[:, 1], features.x_px[k][theirs[:, 0]]) for k, theirs in enumerate(rows)]
         return features.x_px[last], pairs
 
@@ -90,7 +90,7 @@ class Shared:
     """The points that an image shares with images of known pose, and where it was taken from."""
 
     recon_from_camera: Float[ndarray, "4 4"]
-    lens: Intrinsics
+    intrinsics: Intrinsics
     points_in_recon: Float[ndarray, "p 3"]
     x_px: Float[ndarray, "p 2"]
     """In the image."""
@@ -102,17 +102,17 @@ class Shared:
 
 def known_images(
     images: Sequence[UInt8[ndarray, "h w 3"]],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     recon_from_camera: Float[ndarray, "m 4 4"],
 ) -> Known:
     """Images of one camera, whose poses are known, made ready."""
     installed = XFEAT.found() and LIGHTERGLUE.found() and find_spec("torch")
     learned = Learned(images, recon_from_camera) if installed else None
-    found = tuple(features(image, lens) for image in images)
-    return Known(lens, recon_from_camera, found, learned)
+    found = tuple(features(image, intrinsics) for image in images)
+    return Known(intrinsics, recon_from_camera, found, learned)
 
 
-def guessed_lens(size: tuple[int, int]) -> Intrinsics:
+def guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
     """Of images of a size, where nothing is known of their camera."""
     width, height = size
     focal = FOCAL_OF_WIDTH * max(size)
@@ -120,10 +120,10 @@ def guessed_lens(size: tuple[int, int]) -> Intrinsics:
 
 
 def localised(
-    known: Known, picture: UInt8[ndarray, "h w 3"], lens: Intrinsics, lens_is_known: bool, seed: int = 0
+    known: Known, image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics, is_given: bool, seed: int = 0
 ) -> Shared | int:
     """The image's place, or how few points it shares with the known images where these do not show it."""
-    found = features(picture, lens)
+    found = features(image, intrinsics)
     of_image = [matches(found.descriptors, other.descriptors) for other in known.found]
     seen = _Matched(
         found.x_px,
@@ -131,17 +131,17 @@ def localised(
         np.repeat(np.arange(len(of_image)), [len(mine) for mine, _ in of_image]),
         np.concatenate([known.found[k].x_px[theirs] for k, (_, theirs) in enumerate(of_image)]),
     )
-    best = _located(known, seen, lens, lens_is_known, seed)
+    best = _located(known, seen, intrinsics, is_given, seed)
     # One image's focal length and place bend to each other, and to the networks' errors, which are larger than SIFT's
     # and alike side by side: with them places came out up to 6.4 of their sigmas off, without at most 2.3.
-    if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None or not lens_is_known:
+    if isinstance(best, int) or len(best.x_px) >= FEW or known.learned is None or not is_given:
         return best
-    seen = seen.and_those(*known.learned.matched(picture, best.recon_from_camera))
-    more = _located(known, seen, lens, lens_is_known, seed)
+    seen = seen.and_those(*known.learned.matched(image, best.recon_from_camera))
+    more = _located(known, seen, intrinsics, is_given, seed)
     if isinstance(more, int) or len(more.x_px) <= len(best.x_px):
         return best
-    turned = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
-    return more if turned < SAME_VIEW else best
+    rotated = np.linalg.norm(step_between(best.recon_from_camera, more.recon_from_camera)[3:])
+    return more if rotated < SAME_VIEW else best
 
 
 @dataclass(frozen=True)
@@ -168,22 +168,22 @@ class _Matched:
 def _located(
     known: Known,
     seen: _Matched,
-    lens: Intrinsics,
-    lens_is_known: bool,
+    intrinsics: Intrinsics,
+    is_given: bool,
     seed: int,
 ) -> Shared | int:
     """As `localised`, of what was matched."""
     feature, row, count = seen.feature, seen.row, len(seen.x_px)
-    rays = unproject(known.lens, seen.row_x_px)[:, :2]
-    gate = GATE_PX / known.lens.fx
+    rays = unproject(known.intrinsics, seen.row_x_px)[:, :2]
+    gate = GATE_PX / known.intrinsics.fx
     points, _, good = triangulated(feature, row, rays, known.recon_from_camera, gate, count)
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     candidate = np.flatnonzero(good)
-    placed = _placed(seen.x_px[candidate], points[candidate], lens, lens_is_known, seed)
+    placed = _placed(seen.x_px[candidate], points[candidate], intrinsics, is_given, seed)
     if placed is None:
         return 0
-    recon_from_camera, lens, inlier = placed
+    recon_from_camera, intrinsics, inlier = placed
     if inlier.sum() < MIN_POINTS:
         return int(inlier.sum())
     agreed = candidate[inlier]
@@ -195,13 +195,13 @@ def _located(
     )
     ahead = in_camera[:, 2] > 1e-6
     miss = np.full(len(row), np.inf)
-    miss[ahead] = np.linalg.norm(project(known.lens, in_camera[ahead]) - seen.row_x_px[ahead], axis=1)
+    miss[ahead] = np.linalg.norm(project(known.intrinsics, in_camera[ahead]) - seen.row_x_px[ahead], axis=1)
     kept = (miss < GATE_PX) & np.isin(feature, agreed)
     number = np.zeros(count, int)
     number[agreed] = np.arange(len(agreed))
     return Shared(
         recon_from_camera,
-        lens,
+        intrinsics,
         points[agreed],
         seen.x_px[agreed],
         row[kept],
@@ -213,8 +213,8 @@ def _located(
 def _placed(
     x_px: Float[ndarray, "p 2"],
     points: Float[ndarray, "p 3"],
-    lens: Intrinsics,
-    lens_is_known: bool,
+    intrinsics: Intrinsics,
+    is_given: bool,
     seed: int,
 ) -> tuple[Float[ndarray, "4 4"], Intrinsics, ndarray] | None:
     """Pose, intrinsics and inliers; None where no pose has enough of these."""
@@ -222,12 +222,12 @@ def _placed(
         pycolmap.AbsolutePoseEstimationOptions(),
         pycolmap.AbsolutePoseRefinementOptions(),
     )
-    estimation.estimate_focal_length = not lens_is_known
-    estimation.ransac.max_error = 2 * GATE_PX * max(1.0, lens.width / 1600)
+    estimation.estimate_focal_length = not is_given
+    estimation.ransac.max_error = 2 * GATE_PX * max(1.0, intrinsics.width / 1600)
     estimation.ransac.max_num_trials, estimation.ransac.random_seed = TRIALS, seed
-    refinement.refine_focal_length = not lens_is_known
+    refinement.refine_focal_length = not is_given
     refinement.print_summary = False
-    camera = camera_of(lens, lens_is_known)
+    camera = camera_of(intrinsics, is_given)
     found = pycolmap.estimate_and_refine_absolute_pose(
         x_px + HALF_PIXEL, points, camera, estimation, refinement
     )
@@ -235,18 +235,24 @@ def _placed(
         return None
     motion = found["cam_from_world"]
     recon_from_camera = inverse(transform(motion.rotation.matrix(), motion.translation))
-    if not lens_is_known:
+    if not is_given:
         focal, cx, cy, k1, k2 = (float(value) for value in camera.params)
-        lens = Intrinsics(
-            focal, focal, cx - HALF_PIXEL, cy - HALF_PIXEL, lens.width, lens.height, (k1, k2, 0.0, 0.0, 0.0)
+        intrinsics = Intrinsics(
+            focal,
+            focal,
+            cx - HALF_PIXEL,
+            cy - HALF_PIXEL,
+            intrinsics.width,
+            intrinsics.height,
+            (k1, k2, 0.0, 0.0, 0.0),
         )
-    return recon_from_camera, lens, np.asarray(found["inlier_mask"], bool)
+    return recon_from_camera, intrinsics, np.asarray(found["inlier_mask"], bool)
 
 
 def spread(shared: Shared) -> float:
     """Share of the image's area within which its points lie, as their standard deviations span it."""
     sides = 4 * np.sqrt(np.linalg.eigvalsh(np.cov(shared.x_px.T)))
-    return float(sides.prod() / (shared.lens.width * shared.lens.height))
+    return float(sides.prod() / (shared.intrinsics.width * shared.intrinsics.height))
 
 
 def distance(shared: Shared) -> float:

@@ -25,8 +25,8 @@ def base_from_camera(
     parent_from_camera = np.array(found.parent_from_camera)
     bases = {arm.name: np.array(arm.base_from_other_base) for arm in cameras.arms}
     out = {}
-    for k, picture in enumerate(found.pictures):
-        if not picture.used:
+    for k, image in enumerate(found.images):
+        if not image.used:
             continue
         if camera.mount == "base":
             out[k] = parent_from_camera

@@ -21,13 +21,13 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
-from jcr.cell.found import ArmFound, CameraFound, CellFound, PictureFound
+from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cell.localise import (
     LEAST_SPREAD,
     Known,
     Shared,
     distance,
-    guessed_lens,
+    guessed_intrinsics,
     known_images,
     localised,
     spread,
@@ -37,8 +37,17 @@ from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
-from jcr.records import Capture, CellCamera, HandEye, Intrinsics, Reconstruction
-from jcr.rounding import significant
+from jcr.records import (
+    Capture,
+    CellCamera,
+    Finding,
+    HandEye,
+    Intrinsics,
+    Kind,
+    Mend,
+    Reconstruction,
+    strongest_first,
+)
 
 SAME_PLACE = (0.02, np.radians(2.0))
 """m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
@@ -78,8 +87,9 @@ def place_cameras(
     if not others:
         return CellFound((), (), None)
     if not hand_eye.converged:
-        why = f"the {capture.camera_name} camera's own calibration is rejected"
-        return CellFound(tuple(_Seen.nothing_of(camera).refused(why) for camera in others), (), None)
+        seen = map(_Seen.nothing_of, others)
+        refused = [one.refused(Kind.OWN_REJECTED, camera=capture.camera_name) for one in seen]
+        return CellFound(tuple(refused), (), None)
     used = np.flatnonzero(hand_eye.inliers)
     rows = reconstruction.image_index[used]
     # In metres from the first: the equations that follow are better for it, and distances can be spoken of.
@@ -89,10 +99,10 @@ def place_cameras(
     found: dict[str, list[Shared | int]] = {camera.name: [] for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress, "other cameras", todo):
-        lens, _ = usable_lens(camera.intrinsics)
-        picture = read_image((camera.folder or capture.folder) / image)
-        start = lens or guessed_lens(camera.image_size)
-        found[camera.name].append(localised(known, picture, start, lens is not None))
+        intrinsics, _ = usable_lens(camera.intrinsics)
+        pixels = read_image((camera.folder or capture.folder) / image)
+        start = intrinsics or guessed_intrinsics(camera.image_size)
+        found[camera.name].append(localised(known, pixels, start, intrinsics is not None))
     rigs = _Rigs(capture, hand_eye, own, rows)
     placed: list[_Member] = []
     failed: list[CameraFound] = []
@@ -164,24 +174,38 @@ class _Seen:
         return float(np.median([distance(one) for one in self.shared if one is not None]))
 
     @property
-    def lens(self) -> Intrinsics:
+    def intrinsics(self) -> Intrinsics:
         """Given, or as the image with most points has it."""
-        lens, _ = usable_lens(self.camera.intrinsics)
+        intrinsics, _ = usable_lens(self.camera.intrinsics)
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
-        return lens or best.lens
+        return intrinsics or best.intrinsics
 
     def without(self, reasons: Mapping[int, str]) -> "_Seen":
         """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
 
-    def refused(self, why: str) -> CameraFound:
-        """The camera is not placed."""
+    def refused(
+        self,
+        kind: Kind,
+        mend: Mend = "none",
+        images: tuple[str, ...] = (),
+        value: float | None = None,
+        **details: float | str,
+    ) -> CameraFound:
+        """The camera is not placed, for this finding."""
+        why = Finding(kind=kind, severity="rejects", mend=mend, images=images, value=value, details=details)
+        return self.not_placed(why)
+
+    def not_placed(self, *why: Finding) -> CameraFound:
+        """The camera with why it is not placed."""
         camera = self.camera
-        pictures = [
-            PictureFound(image, False, count, None, reason or "the camera was not placed")
+        images = [
+            ImageFound(image, False, count, None, reason or "the camera was not placed")
             for image, count, reason in zip(camera.images, self.counts, self.reasons, strict=True)
         ]
-        return CameraFound(camera.name, camera.mount, camera.arm, tuple(pictures), warnings=(why,))
+        return CameraFound(
+            name=camera.name, mount=camera.mount, arm=camera.arm, images=tuple(images), findings=why
+        )
 
 
 @dataclass(frozen=True)
@@ -195,7 +219,7 @@ class _Member:
     """Where it is not the rig's first camera."""
     arm: int | None
     """Place of its arm among the ties; None: fixed."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def camera(self) -> CellCamera:
@@ -217,10 +241,8 @@ class _Rigs:
         """The camera's images among the rigs; or why it cannot be placed."""
         if not len(seen.rows):
             most = int(np.argmax(seen.counts))
-            return seen.refused(
-                f"{seen.camera.images[most]} shares {seen.counts[most]} points with the mapped scene, too few: it must "
-                "see the same scene, unchanged, from a direction not too different"
-            )
+            best, count = seen.camera.images[most], float(seen.counts[most])
+            return seen.refused(Kind.FEW_POINTS_SHARED, "images", (best,), count)
         if seen.camera.arm is not None:
             return self._on_other_arm(seen, seen.camera.arm)
         return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
@@ -235,29 +257,32 @@ class _Rigs:
             most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
         if metres.max() > most_m or radians.max() > most_rad:
             a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
-            return seen.refused(
-                f"{names[a]} and {names[b]} were taken from places {1e3 * metres[a, b]:.0f} mm and "
-                f"{np.degrees(radians[a, b]):.1f}° apart: it is not fixed; of a camera on the gripper write mount "
-                "gripper, of several cameras give each its own name"
-            )
+            apart_m, apart_rad = float(metres[a, b]), float(radians[a, b])
+            return seen.refused(Kind.NOT_FIXED, "mount", (names[a], names[b]), apart_m, rotation=apart_rad)
         middle = int(metres.sum(1).argmin())
         rig = np.full(len(seen.shared), -1)
         rig[seen.rows] = len(self.poses)
         self.poses.append(places[middle])
-        notes = []
-        own = np.stack(self.poses[: len(self._rows)])
-        off = step_between(own, places[middle])
+        return _Member(seen, rig, None, None, self._at_own_camera(places[middle]))
+
+    def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
+        """That a camera stands where the capture's own camera was at an image."""
+        off = step_between(np.stack(self.poses[: len(self._rows)]), place)
         near = np.flatnonzero(
             (np.linalg.norm(off[:, :3], axis=1) < AT_A_FRAME[0])
             & (np.linalg.norm(off[:, 3:], axis=1) < AT_A_FRAME[1])
         )
-        if len(near):
-            at = self._capture.images[self._rows[near[0]]]
-            notes.append(
-                f"it stands where the {self._capture.camera_name} camera was at {at}: if its image is one of that "
-                "camera, it is not fixed"
-            )
-        return _Member(seen, rig, None, None, tuple(notes))
+        if not len(near):
+            return ()
+        return (
+            Finding(
+                kind=Kind.AT_ANOTHER_CAMERA,
+                severity="warns",
+                mend="mount",
+                images=(self._capture.images[self._rows[near[0]]],),
+                details={"camera": self._capture.camera_name},
+            ),
+        )
 
     def _on_same_gripper(self, seen: _Seen) -> _Member | CameraFound:
         assert seen.camera.frame is not None
@@ -272,7 +297,7 @@ class _Rigs:
         seen = seen.without(unused)
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
-            return seen.refused("none of its images was taken with an image that is used")
+            return seen.refused(Kind.NO_COMMON_POSE, "images")
         on_rig = inverse(np.stack(self.poses)[rig[taken]]) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
@@ -281,11 +306,8 @@ class _Rigs:
             np.linalg.norm(off[:, 3:], axis=1) > SAME_PLACE[1]
         )
         if astray.mean() > 0.4:
-            return seen.refused(
-                f"its place beside the {self._capture.camera_name} camera differs by up to "
-                f"{1e3 * np.linalg.norm(off[:, :3], axis=1).max():.0f} mm between images: the two are not rigid, or "
-                "the images are not of the frames that they stand for"
-            )
+            most_m = float(np.linalg.norm(off[:, :3], axis=1).max())
+            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=self._capture.camera_name)
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
@@ -294,16 +316,16 @@ class _Rigs:
     def _on_other_arm(self, seen: _Seen, arm: str) -> _Member | CameraFound:
         assert seen.camera.base_from_gripper is not None
         if arm in self.arms:
-            return seen.refused(f"a second camera on arm {arm}: one each is supported")
+            return seen.refused(Kind.SECOND_ON_ARM, arm=arm)
         if len(seen.rows) < LEAST_POSES:
             return seen.refused(
-                f"{len(seen.rows)} of its images share enough of the mapped scene; {LEAST_POSES} are needed"
+                Kind.FEW_LOCALISED, "images", value=float(len(seen.rows)), needed=float(LEAST_POSES)
             )
         places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
         std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
         found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
         if not found.converged:
-            return seen.refused(str(found.doubt))
+            return seen.not_placed(*found.findings)
         rig = np.full(len(seen.shared), -1)
         used = np.flatnonzero(found.inliers)
         rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
@@ -352,7 +374,7 @@ def _adjusted(
     if hand_eye.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
     rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
-    picture, x_px, point = [own.image], [own.x_px], [own.point]
+    image, x_px, point = [own.image], [own.x_px], [own.point]
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
     count = len(own.points_in_recon)
     for c, member in enumerate(members, start=1):
@@ -361,7 +383,7 @@ def _adjusted(
                 continue
             number[member.camera.name, k] = len(rig)
             n = len(one.x_px)
-            picture += [np.full(n, len(rig)), one.row]
+            image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
             point += [count + np.arange(n), count + one.row_point]
             points.append(one.points_in_recon)
@@ -369,14 +391,7 @@ def _adjusted(
             rig.append(int(member.rig[k]))
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
-    lenses = [member.seen.lens for member in members]
-    priors = [
-        prior_about(lens, member.camera.intrinsics is not None, member.camera.intrinsics_std)
-        for lens, member in zip(lenses, members, strict=True)
-    ]
-    first = prior_about(reconstruction.intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
-    movable = np.array([False, *(member.rig_from_camera is not None for member in members)])
-    cameras = (reconstruction.intrinsics, *lenses)
+    cameras = (reconstruction.intrinsics, *(member.seen.intrinsics for member in members))
     adjusted = adjust(
         Scene(
             world_from_rig=np.stack(rigs.poses),
@@ -387,11 +402,11 @@ def _adjusted(
         Observations(
             rig=np.array(rig),
             camera=np.array(camera),
-            image=np.concatenate(picture),
+            image=np.concatenate(image),
             x_px=np.concatenate(x_px),
             point=np.concatenate(point),
         ),
-        Freedom.of(cameras, (first, *priors), len(rig), movable),
+        _freedom(capture, members, cameras, len(rig)),
         rigs.arm_poses(options),
         options.robot_noise_m_rad,
         prior,
@@ -399,6 +414,20 @@ def _adjusted(
     evidence = adjusted.given.evidence
     medians = median_reprojection_px(evidence.view, evidence.problem)
     return adjusted, {key: float(medians[row]) for key, row in number.items()}
+
+
+def _freedom(
+    capture: Capture, members: Sequence[_Member], cameras: Sequence[Intrinsics], images: int
+) -> Freedom:
+    """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig."""
+    sources = (capture, *(member.camera for member in members))
+    priors = [
+        prior_about(start, source.intrinsics is not None, source.intrinsics_std)
+        for start, source in zip(cameras, sources, strict=True)
+    ]
+    return Freedom.of(
+        cameras, priors, images, [False, *(member.rig_from_camera is not None for member in members)]
+    )
 
 
 def _as_given(reconstruction: Reconstruction, hand_eye: HandEye, known: Known) -> RigInformation:
@@ -436,33 +465,28 @@ def _found(
     camera = member.camera
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
-    lens_std = np.sqrt(np.diag(answer.intrinsics_covariance(c)))
-    pictures = tuple(
-        PictureFound(image, reason is None, count, medians.get((camera.name, k)), reason)
+    images = tuple(
+        ImageFound(image, reason is None, count, medians.get((camera.name, k)), reason)
         for k, (image, count, reason) in enumerate(
             zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
         )
     )
     found = CameraFound(
-        camera.name,
-        camera.mount,
-        camera.arm,
-        pictures,
-        transform,
-        covariance,
-        member.seen.distance * answer.placed.scale,
-        answer.placed.scene.cameras[c],
-        lens_std,
+        name=camera.name,
+        mount=camera.mount,
+        arm=camera.arm,
+        images=images,
+        parent_from_camera=transform,
+        covariance=covariance,
+        scene_distance=member.seen.distance * answer.placed.scale,
+        intrinsics=answer.placed.scene.cameras[c],
+        intrinsics_std=np.sqrt(np.diag(answer.intrinsics_covariance(c))),
     )
-    doubt = _doubt(found, member)
-    notes = list(member.notes)
-    widest = max(spread(one) for one in member.seen.shared if one is not None)
-    if widest < LEAST_SPREAD:
-        notes.append(
-            f"its points lie in {100 * widest:.0f} % of the image; more of the scene in view would help"
-        )
-    warnings = notes if doubt is None else [doubt, *notes]
-    return replace(found, converged=doubt is None, warnings=tuple(warnings))
+    # An image that contradicts the place also makes it uncertain.
+    doubt = _misses(found, member) or _uncertain(found, member)
+    checked = (doubt, *member.findings, _crowded(member))
+    findings = [finding for finding in checked if finding is not None]
+    return replace(found, findings=strongest_first(findings))
 
 
 def _by_faults(
@@ -480,27 +504,43 @@ def _by_faults(
     return follows @ root @ root.T @ follows.T
 
 
-def _doubt(found: CameraFound, member: _Member) -> str | None:
-    """Why the camera's place is rejected, and the remedy."""
-    missed = {picture.image: picture.reprojection_px or 0.0 for picture in found.pictures}
-    worst = max(missed, key=lambda image: missed[image])
-    if missed[worst] > MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
-        moved = "it is not fixed" if found.mount == "base" else "it is not rigid on the gripper"
-        return (
-            f"{worst} misses the place that fits its images together by {missed[worst]:.0f} px (median): {moved}, the "
-            "scene changed, or the intrinsics are wrong"
-        )
-    assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
-    std = np.sqrt(np.diag(found.covariance))
-    if std[:3].max() <= MAX_STD[0] and std[3:].max() <= MAX_STD[1]:
+def _misses(found: CameraFound, member: _Member) -> Finding | None:
+    """That an image contradicts the place that fits all of the camera's together."""
+    worst = max(found.images, key=lambda image: image.reprojection_px or 0.0)
+    px = worst.reprojection_px or 0.0
+    if px <= MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
         return None
-    known_to = (
-        f"its place is known to ±{1e3 * std[:3].max():.0f} mm and {np.degrees(std[3:].max()):.1f}° only"
+    return Finding(
+        kind=Kind.IMAGE_MISSES,
+        severity="rejects",
+        mend="mount",
+        images=(worst.image,),
+        value=px,
+        details={"mount": found.mount},
     )
-    if member.camera.intrinsics is None:
-        percent = 100 * found.intrinsics_std[0] / found.intrinsics.fx
-        return (
-            f"{known_to}, for its images do not show its intrinsics (focal length ± {significant(percent)} %): give "
-            "them, or images with more of the scene, at other depths"
-        )
-    return f"{known_to}; let it see more of the mapped scene, or add images to the wrist camera's capture"
+
+
+def _uncertain(found: CameraFound, member: _Member) -> Finding | None:
+    """That the camera's place is known too little; of unknown intrinsics with how well the focal length is known."""
+    assert found.covariance is not None and found.intrinsics is not None and found.intrinsics_std is not None
+    metres, radians = np.sqrt(np.diag(found.covariance)).reshape(2, 3).max(1).tolist()
+    if metres <= MAX_STD[0] and radians <= MAX_STD[1]:
+        return None
+    details, unknown = {"rotation": radians}, member.camera.intrinsics is None
+    if unknown:
+        details["focal_std"] = float(found.intrinsics_std[0] / found.intrinsics.fx)
+    return Finding(
+        kind=Kind.PLACE_UNCERTAIN,
+        severity="rejects",
+        mend="intrinsics" if unknown else "images",
+        value=metres,
+        details=details,
+    )
+
+
+def _crowded(member: _Member) -> Finding | None:
+    """That the points span little of every image."""
+    widest = max(spread(one) for one in member.seen.shared if one is not None)
+    if widest >= LEAST_SPREAD:
+        return None
+    return Finding(kind=Kind.POINTS_CROWDED, severity="warns", mend="images", value=widest)

@@ -51,5 +51,5 @@ def main(arguments: Arguments) -> int:
         result = add_camera(arguments.out, name, arguments.pictures, arguments.intrinsics, progress=progress)
     assert result.cameras is not None
     mine = result.cameras.model_copy(update={"cameras": result.cameras.cameras[-1:], "arms": []})
-    arguments.output.result("\n".join(in_words(mine)) + "\n", mine.cameras[0].model_dump())
+    arguments.output.result("\n".join(in_words(mine)) + "\n", mine.as_json()["cameras"][0])
     return 0

@@ -36,8 +36,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the difference, χ² and p where standard deviations are known, and what explains it."""
-    from jcr.calibration.calibration_json import read_hand_eye
     from jcr.calibration.difference import difference
+    from jcr.calibration.known_transform import read_hand_eye
 
     found = difference(read_hand_eye(arguments.out), read_hand_eye(arguments.reference))
     result: dict[str, object] = {

@@ -23,7 +23,7 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     content, cameras = result.calibration, getattr(result, "cameras", None)
     facts, text = content.model_dump(), summary(content)
     if cameras is not None:
-        facts |= {"cameras": cameras.model_dump()["cameras"], "arms": cameras.model_dump()["arms"]}
+        facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
         text += "\n".join(in_words(cameras)) + "\n"
     output.result(text + after, facts)
     for remark in content.remarks:

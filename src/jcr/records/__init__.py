@@ -47,6 +47,7 @@ from jcr.records.findings import (
     Mend,
     Severity,
     Verdict,
+    no_reconstruction,
     strongest_first,
     verdict_of,
 )
@@ -108,6 +109,7 @@ __all__ = [
     "Tracks",
     "Verdict",
     "coefficients_of",
+    "no_reconstruction",
     "strongest_first",
     "verdict_of",
 ]

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdict_of
-from jcr.records.words import remedy, sentence, unobservable
+from jcr.records.words import doubt_of, remedy, unobservable, warnings_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +211,12 @@ class Estimate:
     intrinsics_covariance: Float[ndarray, "q q"] | None = None
     """In the order of camera.parameters; None where they were not refined."""
 
+    @property
+    def intrinsics_std(self) -> Float[ndarray, " q"] | None:
+        """Standard deviation of each parameter, in the same order."""
+        known = self.intrinsics_covariance
+        return None if known is None else np.sqrt(np.diag(known))
+
     def with_fault(self, covariance: Float[ndarray, "7 7"]) -> "Estimate":
         """The same, as uncertain as a fault with this covariance makes it."""
         budget = self.budget
@@ -374,12 +380,12 @@ class HandEye:
     @property
     def doubt(self) -> str | None:
         """Why it is rejected, in words; None when it is not."""
-        return None if self.converged else sentence(self.findings[0])
+        return doubt_of(self.findings)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each finding that rejects or warns."""
-        return tuple(sentence(finding) for finding in self.findings if finding.severity != "informs")
+        return warnings_of(self.findings)
 
 
 @dataclass(frozen=True)

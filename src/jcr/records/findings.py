@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.errors import NotTrustedError
+
 Severity = Literal["rejects", "warns", "informs"]
 Mend = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
 """What would help: another reconstruction of the same images, other motions, more or other images, other intrinsics,
@@ -51,6 +53,18 @@ class Kind(StrEnum):
     RECONSTRUCTION = "reconstruction"
     NO_RECONSTRUCTION = "no reconstruction"
     EARLIER_VERSION = "from a file of an earlier version"
+    OWN_REJECTED = "the capture's own camera is rejected"
+    FEW_POINTS_SHARED = "few points shared with the scene"
+    FEW_LOCALISED = "few images localised"
+    NO_COMMON_POSE = "no image taken with one that is used"
+    SECOND_ON_ARM = "second camera on another arm"
+    NOT_FIXED = "camera not fixed"
+    NOT_RIGID = "camera not rigid on the gripper"
+    IMAGE_MISSES = "image contradicts the camera's place"
+    PLACE_UNCERTAIN = "camera's place too uncertain"
+    AT_ANOTHER_CAMERA = "camera stands where another was"
+    POINTS_CROWDED = "points crowded"
+    ANOTHER_SCENE = "camera sees another scene"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +95,16 @@ class Finding:
         """What it adds to that of the calibration."""
         shift = np.zeros(7) if self.shift is None else np.array(self.shift)
         return np.outer(shift, shift)
+
+
+def no_reconstruction(error: NotTrustedError) -> tuple[Finding, ...]:
+    """What a failure of every back end says, as findings."""
+    details = {"text": error.what, "remedy": "; ".join(error.remedies)}
+    failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)
+    more = (
+        Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text}) for text in error.also
+    )
+    return (failed, *more)
 
 
 CAMERA = frozenset(

@@ -31,20 +31,33 @@ PAIRS = (
 """Parameters of intrinsics that are named together, how, their unit and their decimals."""
 
 
+Words = str | Callable[[Finding], str]
+"""Of a kind: a template of the names in `_quantities`, or what makes the sentence of a finding."""
+
+
 def text(finding: Finding) -> str:
     """What was found, in one sentence."""
-    return _TEXT[finding.kind](finding)
+    return _said(_TEXT[finding.kind], finding)
 
 
 def remedy(finding: Finding) -> str:
     """What would help, in one sentence; empty where nothing would, or nothing need be done."""
-    say = _REMEDY.get(finding.kind, "")
-    return say if isinstance(say, str) else say(finding)
+    return _said(_REMEDY.get(finding.kind, ""), finding)
 
 
 def sentence(finding: Finding) -> str:
     """Both in one line."""
     return "; ".join(filter(None, (text(finding), remedy(finding))))
+
+
+def doubt_of(findings: Iterable[Finding]) -> str | None:
+    """The first reason why that is rejected of which these are the findings, strongest first; None where it is not."""
+    return next((sentence(finding) for finding in findings if finding.severity == "rejects"), None)
+
+
+def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
+    """A sentence for each finding that rejects or warns."""
+    return tuple(sentence(finding) for finding in findings if finding.severity != "informs")
 
 
 def reached_in_words(required: "Requirement") -> str:
@@ -80,40 +93,37 @@ def joined(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
+def _said(words: Words, finding: Finding) -> str:
+    return words.format(**_quantities(finding)) if isinstance(words, str) else words(finding)
+
+
+def _quantities(finding: Finding) -> dict[str, Any]:
+    """What templates name: the finding's details and its numbers in the units in which they are read."""
+    named = {"images": finding.images, "p": finding.p, "value": finding.value} | dict(finding.details)
+    if finding.p is not None:
+        named["chance"] = f"p = {finding.p:.0e}"
+        named["rough_chance"] = f"p = {finding.p:.1g}" if finding.p > 1e-6 else "p < 1e-6"
+    if finding.value is not None:
+        named |= {"mm": 1e3 * finding.value, "percent": 100 * finding.value}
+    if finding.std is not None:
+        named |= {"std": significant(finding.std), "std_percent": significant(100 * finding.std)}
+    if "rotation" in finding.details:
+        named["deg"] = np.degrees(_number(finding, "rotation"))
+    return named
+
+
 def _number(finding: Finding, name: str) -> float:
     value = finding.details[name]
     assert isinstance(value, int | float), name
     return float(value)
 
 
-def _value(finding: Finding) -> float:
-    assert finding.value is not None, finding.kind
-    return finding.value
+def _value_and_std(finding: Finding) -> tuple[float, float]:
+    assert finding.value is not None and finding.std is not None, finding.kind
+    return finding.value, finding.std
 
 
-def _std(finding: Finding) -> float:
-    assert finding.std is not None, finding.kind
-    return finding.std
-
-
-def _mm(finding: Finding, digits: str = ".1f") -> str:
-    return f"{1e3 * _value(finding):{digits}} mm"
-
-
-def _deg(finding: Finding, digits: str = ".2f") -> str:
-    return f"{np.degrees(_number(finding, 'rotation')):{digits}}°"
-
-
-def _chance(finding: Finding) -> str:
-    assert finding.p is not None, finding.kind
-    return f"p = {finding.p:.0e}"
-
-
-def _stated(finding: Finding) -> str:
-    return str(finding.details["text"])
-
-
-def _stated_remedy(finding: Finding) -> str:
+def _given_remedy(finding: Finding) -> str:
     return str(finding.details.get("remedy", ""))
 
 
@@ -195,29 +205,24 @@ _UNSEEN = {
 
 
 def _uncertain(finding: Finding) -> str:
-    part, std = str(finding.details["part"]), _value(finding)
-    size = {
-        "translation": f"{1e3 * std:.0f} mm",
-        "rotation": f"{np.degrees(std):.1f}°",
-        "scale": f"{100 * std:.0f} %",
-    }
-    return f"the {part} is known to ±{size[part]} only"
+    sizes = {"translation": "{mm:.0f} mm", "rotation": "{degrees:.1f}°", "scale": "{percent:.0f} %"}
+    size = sizes[str(finding.details["part"])]
+    degrees = np.degrees(finding.value or 0.0)
+    return f"the {{part}} is known to ±{size} only".format(degrees=degrees, **_quantities(finding))
 
 
 def _to_be_sure(finding: Finding) -> str:
-    tell = ", or give the robot's repeatability (--robot-noise MM DEG)"
+    more = ", or give the robot's repeatability (--robot-noise MM DEG)"
     return (
         "add images, rotated by 20° or more about different axes"
-        f"{tell if finding.details.get('noise_unknown') else ''}"
+        f"{more if finding.details.get('noise_unknown') else ''}"
     )
 
 
 def _noisier(finding: Finding) -> str:
     given = f"{1e3 * _number(finding, 'given'):.2g} mm, {np.degrees(_number(finding, 'given_rotation')):.2g}°"
-    return (
-        f"gripper poses and images disagree by {_mm(finding, '.2g')} and {_deg(finding, '.2g')} per axis, more than the "
-        f"given robot noise ({given}): the larger is used"
-    )
+    found = "gripper poses and images disagree by {mm:.2g} mm and {deg:.2g}° per axis"
+    return f"{_said(found, finding)}, more than the given robot noise ({given}): the larger is used"
 
 
 def _to_be_exact(finding: Finding) -> str:
@@ -232,35 +237,24 @@ def _to_be_exact(finding: Finding) -> str:
 
 
 def _left_out(finding: Finding) -> str:
-    typical = 1e3 * _number(finding, "residual")
-    return (
-        f"the leave-one-out error ({_mm(finding)}) is well above the fit's residual ({typical:.1f} mm): too few images "
-        "for this motion"
-    )
+    typical = f"{1e3 * _number(finding, 'residual'):.1f} mm"
+    much = "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual"
+    return f"{_said(much, finding)} ({typical}): too few images for this motion"
 
 
 # The camera.
 
 
 def _by_distance(finding: Finding) -> str:
-    percent = 100 * _value(finding)
-    return (
-        f"the focal length {'grows' if percent > 0 else 'shrinks'} by {abs(percent):.1f} ± "
-        f"{significant(100 * _std(finding))} % from the nearest view to the farthest ({_chance(finding)})"
-    )
-
-
-def _zoomed(finding: Finding) -> str:
-    return (
-        f"the focal length changes by {100 * _value(finding):+.1f} ± {significant(100 * _std(finding))} % after "
-        f"{finding.images[0]} ({_chance(finding)}): the zoom or focus was moved"
-    )
+    grows = "grows" if _value_and_std(finding)[0] > 0 else "shrinks"
+    size = f"{abs(100 * _value_and_std(finding)[0]):.1f} ± {_quantities(finding)['std_percent']} %"
+    return f"the focal length {grows} by {size} from the nearest view to the farthest ({_said('{chance}', finding)})"
 
 
 def _intrinsics(finding: Finding) -> str:
-    said = _of_image_parts(finding) if finding.p is None else _of_parameters(finding)
-    chance = "" if finding.p is None else f" ({_chance(finding)})"
-    return f"the images show {' and '.join(said)}{chance}"
+    if finding.p is None:
+        return f"the images show {' and '.join(_of_image_parts(finding))}"
+    return f"the images show {' and '.join(_of_parameters(finding))} ({_said('{chance}', finding)})"
 
 
 def _of_image_parts(finding: Finding) -> list[str]:
@@ -316,38 +310,25 @@ def _is_common(finding: Finding) -> bool:
 # The order of the images.
 
 
-def _slipped(finding: Finding) -> str:
-    size = f"{_mm(finding)} and {_deg(finding)}"
-    return f"the camera seems to have moved on the gripper by {size} after {finding.images[0]} ({_chance(finding)})"
-
-
 def _one_part(finding: Finding) -> str:
-    count = int(_number(finding, "count"))
-    before, after = finding.images
-    part = {
-        "before": f"the {count} images up to {before}",
-        "after": f"the {count} images from {after} on",
-    }[str(finding.details["longer"])]
-    return (
-        f"calibrate {part} alone, and those of the other part only where the camera still sits as it did then"
+    part = {"before": "up to {images[0]}", "after": "from {images[1]} on"}[str(finding.details["longer"])]
+    return _said(
+        f"calibrate the {{count:.0f}} images {part} alone, and those of the other part only where the camera still sits "
+        "as it did then",
+        finding,
     )
 
 
 def _delayed(finding: Finding) -> str:
-    value, error = _value(finding), _std(finding)
+    value, error = _value_and_std(finding)
     how = f"{abs(value):.3f} ± {significant(error)} of the time from one image to the next"
     if finding.details["unit"] == "s":
         how = f"{1e3 * abs(value):.0f} ± {significant(1e3 * error)} ms"
     late = "late" if value > 0 else "early"
-    return f"the gripper poses look as if read {how} too {late} ({_chance(finding)})"
+    return f"the gripper poses look as if read {how} too {late} ({_said('{chance}', finding)})"
 
 
 # The robot.
-
-
-def _rough_chance(finding: Finding) -> str:
-    assert finding.p is not None
-    return f"p = {finding.p:.1g}" if finding.p > 1e-6 else "p < 1e-6"
 
 
 def _joints_off(finding: Finding) -> str:
@@ -355,15 +336,16 @@ def _joints_off(finding: Finding) -> str:
         f"{np.degrees(_number(finding, f'joint_{k}')):+.2f} ± {np.degrees(_number(finding, f'joint_{k}_std')):.2f}°"
         for k in finding.joints
     )
-    named = joined(str(k) for k in finding.joints)
-    return f"robot: joint{'s' * (len(finding.joints) > 1)} {named} seem off by {sizes} ({_rough_chance(finding)})"
+    named = f"joint{'s' * (len(finding.joints) > 1)} {joined(str(k) for k in finding.joints)}"
+    return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
 
 
 def _angles_differ(finding: Finding) -> str:
-    off, std = _value(finding) - 1, _std(finding)
+    ratio, std = _value_and_std(finding)
+    off, more = ratio - 1, "more" if ratio > 1 else "less"
     return (
-        f"the camera rotates {100 * abs(off):.2f} ± {100 * std:.2f} % {'more' if off > 0 else 'less'} than the gripper: "
-        "the focal length or the robot's joints are off"
+        f"the camera rotates {100 * abs(off):.2f} ± {100 * std:.2f} % {more} than the gripper: the focal length or the "
+        "robot's joints are off"
     )
 
 
@@ -371,7 +353,7 @@ def _angles_differ(finding: Finding) -> str:
 
 
 def _board_size(finding: Finding) -> str:
-    off = _value(finding)
+    off, std = _value_and_std(finding)
     if finding.details.get("marker"):
         scale = 1 + off
         size = f"{100 * abs(1 / scale - 1):.1f} % too {'large' if scale < 1 else 'small'}"
@@ -380,86 +362,139 @@ def _board_size(finding: Finding) -> str:
             "focal length is off"
         )
     return (
-        f"by the robot's motion the board is {100 * abs(off):.1f} ± {100 * _std(finding):.1f} % "
+        f"by the robot's motion the board is {100 * abs(off):.1f} ± {100 * std:.1f} % "
         f"{'larger' if off > 0 else 'smaller'} than given"
     )
 
 
-def _board_in_view(finding: Finding) -> str:
-    board = str(finding.details["board"])
-    lengths = "SIDE of a square and MARKER" if "MARKER" in board else "SIDE"
-    return f"try --board {board} with its {lengths} in metres (jcr docs markers)"
+def _to_size(finding: Finding) -> str:
+    measure = "measure its squares, and check that the gripper poses are in metres"
+    return "" if finding.details.get("marker") else measure
 
 
-_TEXT: dict[Kind, Callable[[Finding], str]] = {
+def _board_lengths(finding: Finding) -> str:
+    lengths = "SIDE of a square and MARKER" if "MARKER" in str(finding.details["board"]) else "SIDE"
+    return _said(f"try --board {{board}} with its {lengths} in metres (jcr docs markers)", finding)
+
+
+# Further cameras of a cell.
+
+
+def _misses(finding: Finding) -> str:
+    moved = {"base": "it is not fixed", "gripper": "it is not rigid on the gripper"}
+    return _said(
+        "{images[0]} misses the place that fits its images together by {value:.0f} px (median): "
+        f"{moved[str(finding.details['mount'])]}, the scene changed, or the intrinsics are wrong",
+        finding,
+    )
+
+
+def _place_uncertain(finding: Finding) -> str:
+    size = _said("its place is known to ±{mm:.0f} mm and {deg:.1f}° only", finding)
+    if "focal_std" not in finding.details:
+        return size
+    percent = significant(100 * _number(finding, "focal_std"))
+    return f"{size}, for its images do not show its intrinsics (focal length ± {percent} %)"
+
+
+def _to_place(finding: Finding) -> str:
+    if finding.mend == "intrinsics":
+        return "give them, or images with more of the scene, at other depths"
+    return "let it see more of the mapped scene, or add images to the wrist camera's capture"
+
+
+def _another_scene(finding: Finding) -> str:
+    alone = ": calibrated by its own {value:.0f} images, and what it sees is not in the map"
+    return _said(
+        f"it shares nothing with the {{camera}} camera's images{'' if finding.value is None else alone}",
+        finding,
+    )
+
+
+_TEXT: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: lambda f: f"unobservable from these motions: {unobservable(f)}",
-    Kind.FEW_IMAGES: lambda f: f"with {_value(f):.0f} images a wrong one cannot be identified",
-    Kind.FEW_AGREE: lambda f: (
-        f"only {_value(f):.0f} of {_number(f, 'images'):.0f} images agree on one calibration"
-    ),
-    Kind.POSES_CONTRADICT_IMAGES: lambda f: (
-        f"gripper poses and images disagree by {_mm(f, '.0f')} and {_deg(f, '.1f')} per axis"
-    ),
-    Kind.POSE_CONVENTION: lambda f: (
-        f"the poses fit when read as {f.details['reading']}: {f.details['fits']}, instead of {f.details['given']}"
-    ),
+    Kind.FEW_IMAGES: "with {value:.0f} images a wrong one cannot be identified",
+    Kind.FEW_AGREE: "only {value:.0f} of {images:.0f} images agree on one calibration",
+    Kind.POSES_CONTRADICT_IMAGES: "gripper poses and images disagree by {mm:.0f} mm and {deg:.1f}° per axis",
+    Kind.POSE_CONVENTION: "the poses fit when read as {reading}: {fits}, instead of {given}",
     Kind.NOISE_ABOVE_GIVEN: _noisier,
     Kind.UNCERTAIN: _uncertain,
     Kind.LEAVE_ONE_OUT: _left_out,
     Kind.NOT_EXACT_ENOUGH: lambda f: f"{SHORT}: {_reached(f.details)}",
     Kind.FOCUS_BY_DISTANCE: _by_distance,
-    Kind.FOCUS_BY_IMAGE: lambda f: (
-        f"the focal length differs between images by {100 * _value(f):.1f} % (rms, each ± "
-        f"{significant(100 * _std(f))} %; {_chance(f)})"
+    Kind.FOCUS_BY_IMAGE: (
+        "the focal length differs between images by {percent:.1f} % (rms, each ± {std_percent} %; {chance})"
     ),
-    Kind.ZOOM: _zoomed,
-    Kind.ROLLING_SHUTTER: lambda f: (
-        f"the images are sheared by {_value(f):.1f} ± {significant(_std(f))} px from top to bottom ({_chance(f)}), as "
-        "by the rolling shutter of a moving camera"
+    Kind.ZOOM: (
+        "the focal length changes by {percent:+.1f} ± {std_percent} % after {images[0]} ({chance}): the zoom or focus "
+        "was moved"
     ),
-    Kind.ROLLING_SHUTTER_BY_IMAGE: lambda f: (
-        f"each image is sheared by itself, {_value(f):.1f} px from top to bottom (rms, {_chance(f)}), as by the rolling "
-        "shutter of a moving camera"
+    Kind.ROLLING_SHUTTER: (
+        "the images are sheared by {value:.1f} ± {std} px from top to bottom ({chance}), as by the rolling shutter of a "
+        "moving camera"
+    ),
+    Kind.ROLLING_SHUTTER_BY_IMAGE: (
+        "each image is sheared by itself, {value:.1f} px from top to bottom (rms, {chance}), as by the rolling shutter "
+        "of a moving camera"
     ),
     Kind.INTRINSICS: _intrinsics,
-    Kind.SLIP: _slipped,
-    Kind.DRIFT: lambda f: (
-        f"the camera seems to drift on the gripper by {_mm(f)} and {_deg(f)} from the first image to the last "
-        f"({_chance(f)})"
+    Kind.SLIP: (
+        "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]} ({chance})"
+    ),
+    Kind.DRIFT: (
+        "the camera seems to drift on the gripper by {mm:.1f} mm and {deg:.2f}° from the first image to the last "
+        "({chance})"
     ),
     Kind.DELAY: _delayed,
-    Kind.WRONG_MOUNT: lambda f: "the images fit a camera that the gripper carries, not a fixed one",
-    Kind.ROBOT_UNUSED: lambda f: f"the capture's robot is not used: {_stated(f)}",
-    Kind.SYSTEMATIC_ERRORS: lambda f: (
-        f"robot: neighbouring poses have similar errors, {_mm(f, '.2g')} and {_deg(f, '.2g')} per axis "
-        f"({_rough_chance(f)}): joint offsets or link errors"
+    Kind.WRONG_MOUNT: "the images fit a camera that the gripper carries, not a fixed one",
+    Kind.ROBOT_UNUSED: "the capture's robot is not used: {text}",
+    Kind.SYSTEMATIC_ERRORS: (
+        "robot: neighbouring poses have similar errors, {mm:.2g} mm and {deg:.2g}° per axis ({rough_chance}): joint "
+        "offsets or link errors"
     ),
     Kind.JOINT_OFFSETS: _joints_off,
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
-    Kind.NETWORK_SCALE: lambda f: network_scale(100 * _value(f), 100 * _std(f)),
-    Kind.SCALE_ASSUMED: lambda f: (
-        "the scale is unobservable from these motions: it is taken as 1, from the marker's size"
-    ),
-    Kind.SCALE_FROM_ROBOT: lambda f: (
+    Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
+    Kind.SCALE_ASSUMED: "the scale is unobservable from these motions: it is taken as 1, from the marker's size",
+    Kind.SCALE_FROM_ROBOT: (
         "the scale comes from the robot's positions alone: if all of them are wrong by one factor, no image shows it, "
         "and ± does not include it"
     ),
-    Kind.IMAGES_ROTATED: lambda f: (
-        f"EXIF orientation {_value(f):.0f}: the images are {f.details['rotated']}, as viewers show them, and "
-        "gripper_from_camera and the intrinsics are of the camera that would see them so"
+    Kind.IMAGES_ROTATED: (
+        "EXIF orientation {value:.0f}: the images are {rotated}, as viewers show them, and gripper_from_camera and the "
+        "intrinsics are of the camera that would see them so"
     ),
-    Kind.BOARD_IN_VIEW: lambda f: "a calibration board is in view",
-    Kind.RECONSTRUCTION: _stated,
-    Kind.NO_RECONSTRUCTION: _stated,
-    Kind.EARLIER_VERSION: _stated,
+    Kind.BOARD_IN_VIEW: "a calibration board is in view",
+    Kind.RECONSTRUCTION: "{text}",
+    Kind.NO_RECONSTRUCTION: "{text}",
+    Kind.EARLIER_VERSION: "{text}",
+    Kind.OWN_REJECTED: "the {camera} camera's own calibration is rejected",
+    Kind.FEW_POINTS_SHARED: "{images[0]} shares {value:.0f} points with the mapped scene, too few",
+    Kind.FEW_LOCALISED: "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
+    Kind.NO_COMMON_POSE: "none of its images was taken with an image that is used",
+    Kind.SECOND_ON_ARM: "a second camera on arm {arm}: one each is supported",
+    Kind.NOT_FIXED: (
+        "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not fixed"
+    ),
+    Kind.NOT_RIGID: (
+        "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not rigid, or "
+        "the images are not of the frames that they stand for"
+    ),
+    Kind.IMAGE_MISSES: _misses,
+    Kind.PLACE_UNCERTAIN: _place_uncertain,
+    Kind.AT_ANOTHER_CAMERA: (
+        "it stands where the {camera} camera was at {images[0]}: if its image is one of that camera, it is not fixed"
+    ),
+    Kind.POINTS_CROWDED: "its points lie in {percent:.0f} % of the image",
+    Kind.ANOTHER_SCENE: _another_scene,
 }
-_REMEDY: dict[Kind, str | Callable[[Finding], str]] = {
+_REMEDY: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _to_observe,
     Kind.FEW_IMAGES: "take 8 or more",
     Kind.FEW_AGREE: "check that images and poses are paired, and the convention of the poses (jcr check)",
     Kind.POSES_CONTRADICT_IMAGES: "check the pairing and the convention of the poses (jcr check)",
-    Kind.POSE_CONVENTION: _stated_remedy,
+    Kind.POSE_CONVENTION: _given_remedy,
     Kind.UNCERTAIN: _to_be_sure,
     Kind.LEAVE_ONE_OUT: "add some",
     Kind.NOT_EXACT_ENOUGH: _to_be_exact,
@@ -472,20 +507,22 @@ _REMEDY: dict[Kind, str | Callable[[Finding], str]] = {
     Kind.SLIP: _one_part,
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
     Kind.DELAY: "stop the arm at each image, or read pose and image by the same clock",
-    Kind.WRONG_MOUNT: lambda f: f"write mount gripper for {f.details['camera']}",
-    Kind.BOARD_SIZE: lambda f: (
-        ""
-        if f.details.get("marker")
-        else "measure its squares, and check that the gripper poses are in metres"
-    ),
+    Kind.WRONG_MOUNT: "write mount gripper for {camera}",
+    Kind.BOARD_SIZE: _to_size,
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",
     Kind.IMAGES_ROTATED: (
         "for a driver that gives the sensor's own images remove the tag (exiftool -Orientation= FILES) and calibrate "
         "again"
     ),
-    Kind.BOARD_IN_VIEW: _board_in_view,
-    Kind.RECONSTRUCTION: _stated_remedy,
-    Kind.NO_RECONSTRUCTION: _stated_remedy,
-    Kind.EARLIER_VERSION: _stated_remedy,
+    Kind.BOARD_IN_VIEW: _board_lengths,
+    Kind.RECONSTRUCTION: _given_remedy,
+    Kind.NO_RECONSTRUCTION: _given_remedy,
+    Kind.EARLIER_VERSION: _given_remedy,
+    Kind.FEW_POINTS_SHARED: "it must see the same scene, unchanged, from a direction not too different",
+    Kind.FEW_LOCALISED: "add images of the mapped scene",
+    Kind.NOT_FIXED: "of a camera on the gripper write mount gripper, of several cameras give each its own name",
+    Kind.PLACE_UNCERTAIN: _to_place,
+    Kind.POINTS_CROWDED: "more of the scene in view would help",
 }
+"""Of kinds that have one."""

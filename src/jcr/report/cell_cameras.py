@@ -4,7 +4,7 @@ from html import escape
 
 import numpy as np
 
-from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, Sureness
+from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, TransformUncertainty
 from jcr.report.markup import filled
 from jcr.report.transform import copy_button
 from jcr.rounding import significant
@@ -19,18 +19,18 @@ def cameras_section(cameras: CamerasFile) -> str:
 def _camera(camera: CameraPlaced) -> str:
     arm = "" if camera.arm is None else f" of arm {camera.arm}"
     name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
-    pictures = "".join(
-        f"<tr><td>{escape(picture.image)}</td><td>{picture.points} points</td><td>"
-        + ("" if picture.reprojection_px is None else f"{significant(picture.reprojection_px)} px")
-        + f"</td><td>{escape(picture.reason or 'used')}</td></tr>"
-        for picture in camera.pictures
+    images = "".join(
+        f"<tr><td>{escape(image.image)}</td><td>{image.points} points</td><td>"
+        + ("" if image.reprojection_px is None else f"{significant(image.reprojection_px)} px")
+        + f"</td><td>{escape(image.reason or 'used')}</td></tr>"
+        for image in camera.images
     )
     remarks = "".join(f"<li>{escape(text)}</li>" for text in camera.warnings)
     doubt = "" if camera.doubt is None else '<p class="why">Rejected.</p>'
     body = _transform(name, camera.parent_from_camera, camera.uncertainty)
     return (
         f'<div class="notation wide"><header><h3>{escape(camera.name)}: {escape(name)}</h3>'
-        f"{body}{doubt}<ul>{remarks}</ul><table>{pictures}</table></div>"
+        f"{body}{doubt}<ul>{remarks}</ul><table>{images}</table></div>"
     )
 
 
@@ -39,7 +39,7 @@ def _arm(arm: ArmPlaced) -> str:
     return f'<div class="notation wide"><header><h3>arm {escape(arm.name)}: base_from_other_base</h3>{body}</div>'
 
 
-def _transform(name: str, matrix: list[list[float]] | None, sure: Sureness | None) -> str:
+def _transform(name: str, matrix: list[list[float]] | None, sure: TransformUncertainty | None) -> str:
     """The rest of the header, the matrix and its standard deviations."""
     if matrix is None or sure is None:
         return "</header>"

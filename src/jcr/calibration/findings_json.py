@@ -1,0 +1,61 @@
+"""Findings in the files that jcr writes, and what is derived of them there: verdict, converged, warnings."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer
+
+from jcr.records import Finding, Kind, Severity, Verdict, verdict_of
+from jcr.records.words import remedy, text, warnings_of
+
+
+def _with_words(finding: Finding) -> dict[str, Any]:
+    return vars(finding) | {"text": text(finding), "remedy": remedy(finding)}
+
+
+def _without_words(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    # What was changed is a value of Python's, where a strict tuple is no list.
+    return {
+        name: tuple(part) if isinstance(part, list) else part
+        for name, part in value.items()
+        if name not in ("text", "remedy")
+    }
+
+
+FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(_with_words)]
+"""With its text and remedy, which are for people and made again when it is read."""
+
+
+def derived(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Findings, strongest first, as the fields of a file that every version reads."""
+    verdict = verdict_of(findings)
+    return {
+        "findings": list(findings),
+        "verdict": verdict,
+        "converged": verdict != "rejected",
+        "warnings": list(warnings_of(findings)),
+    }
+
+
+def require_one_verdict(
+    findings: Sequence[Finding], verdict: Verdict | None, converged: bool, warnings: Sequence[str]
+) -> None:
+    """ValueError where a part of a file is rejected without a reason, or contradicts its findings."""
+    if verdict is None:
+        if not converged and not warnings:
+            raise ValueError("not converged, and no warning says why")
+    elif verdict != verdict_of(findings) or converged is (verdict == "rejected"):
+        raise ValueError("converged, verdict and findings contradict one another")
+
+
+def findings_of_words(warnings: Sequence[str], converged: bool) -> list[Finding]:
+    """Warnings of a file of an earlier version, of which only the words are known; the first says why it is rejected."""
+    first: Severity = "warns" if converged else "rejects"
+    return [
+        Finding(
+            kind=Kind.EARLIER_VERSION, severity="warns" if k else first, details={"text": said, "remedy": ""}
+        )
+        for k, said in enumerate(warnings)
+    ]
