@@ -161,7 +161,7 @@ def _withheld(folder: Path) -> list[Row]:
     lens, rows = "estimated" if capture.intrinsics is None else "given", []
     rig = int(hand_eye.inliers.sum())
     for row, camera in zip(apart, found.cameras, strict=True):
-        points = camera.pictures[0].points
+        points = camera.images[0].points
         if camera.parent_from_camera is None or camera.covariance is None:
             rows.append(Row(folder.name, capture.images[row], lens, points, None, says=camera.warnings[0]))
             continue
