@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.simulated.cell import CellProblem, cell_problem
 from jcr.adjust.images import ImageProblem, derivatives, view_of
 from jcr.adjust.intrinsics_prior import MEASURED, prior_of
 from jcr.adjust.robots import adjust
 from jcr.adjust.scene import Freedom, NuisancePrior, Scene, at_start, stepped
-from jcr.simulate.cell import CellProblem, cell_problem
 
 COUNT = 6
 

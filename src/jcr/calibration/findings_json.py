@@ -51,7 +51,7 @@ def require_one_verdict(
 
 
 def findings_of_words(warnings: Sequence[str], converged: bool) -> list[Finding]:
-    """Warnings of a file of an earlier version, of which only the words are known; the first says why it is rejected."""
+    """Warnings of a file of an earlier version, whose words alone are known; the first says why it is rejected."""
     first: Severity = "warns" if converged else "rejects"
     return [
         Finding(

@@ -51,7 +51,7 @@ def sentence(finding: Finding) -> str:
 
 
 def doubt_of(findings: Iterable[Finding]) -> str | None:
-    """The first reason why that is rejected of which these are the findings, strongest first; None where it is not."""
+    """The first reason of a rejection, by findings that are strongest first; None where nothing rejects."""
     return next((sentence(finding) for finding in findings if finding.severity == "rejects"), None)
 
 
