@@ -40,6 +40,7 @@ class Bench:
 
 SOLVER = (
     "src/jcr/handeye",
+    "src/jcr/adjust",
     "src/jcr/calibration",
     "src/jcr/camera.py",
     "src/jcr/geometry.py",
