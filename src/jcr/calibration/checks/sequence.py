@@ -76,14 +76,13 @@ def sequence_fault(
     m = len(base_from_gripper)
     if m < MIN_IMAGES or not hand_eye.observability.observable:
         return None
+    # The residuals of camera poses have the errors that the fit to these poses found, not those that are left once
+    # features correct the cameras: these call a sound capture moved, and leave a moved one unsaid.
+    fit = hand_eye.before or hand_eye
     residual, by = residuals(
-        hand_eye.gripper_from_camera,
-        hand_eye.scale,
-        hand_eye.base_from_recon,
-        base_from_gripper,
-        recon_from_camera,
+        fit.gripper_from_camera, fit.scale, fit.base_from_recon, base_from_gripper, recon_from_camera
     )
-    robot = hand_eye.robot_noise
+    robot = fit.robot_noise
     white = np.diag(np.tile(np.repeat((robot.translation, robot.rotation), 3), m) ** 2)
     problem = _Problem(residual, by, white + robot.systematic**2 * systematic)
     # An image that is rejected between others that agree is wrong by itself; after a slip several in a row are.
