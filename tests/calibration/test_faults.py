@@ -47,7 +47,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     ),
     # Another TCP: the adjustment takes it for robot pose noise.
     "tool changed": (
-        Faults(slip=(0.03, 0.0)),
+        Faults(slip=(0.03, 0.0), robot_noise=(1e-4, 2e-4)),
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
         [30.0, 0.0],
         1.0,
