@@ -16,7 +16,7 @@ import jcr
 from jcr.capture.options import ReadOptions
 from jcr.check import check
 
-sys.path.append(str(Path(__file__).parents[1]))  # of the checkout, for what is simulated
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the checkout, for what is simulated
 from benchmarks.simulated.ros_bag import write_bag
 
 out = Path("out/ros_bag")
