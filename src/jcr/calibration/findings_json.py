@@ -1,10 +1,12 @@
 """Findings in the files that jcr writes, and what is derived of them there: verdict, converged, warnings."""
 
+import json
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import BeforeValidator, PlainSerializer, TypeAdapter, ValidationError
 
+from jcr.capture.plain_files import first_fault
 from jcr.records import Finding, Kind, Severity, Verdict, verdict_of
 from jcr.records.words import remedy, text, warnings_of
 
@@ -16,14 +18,15 @@ def _with_words(finding: Finding) -> dict[str, Any]:
 def _without_words(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
-    # What was changed is a value of Python's, where a strict tuple is no list.
-    return {
-        name: tuple(part) if isinstance(part, list) else part
-        for name, part in value.items()
-        if name not in ("text", "remedy")
-    }
+    numbers = {name: part for name, part in value.items() if name not in ("text", "remedy")}
+    try:
+        # As JSON again: there, and not among Python's values, a dict may stand for a record and a list for a tuple.
+        return _FINDING.validate_json(json.dumps(numbers), strict=True)
+    except ValidationError as error:
+        raise ValueError(first_fault(error)) from None
 
 
+_FINDING = TypeAdapter(Finding)
 FindingJson = Annotated[Finding, BeforeValidator(_without_words), PlainSerializer(_with_words)]
 """With its text and remedy, which are for people and made again when it is read."""
 
