@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.adjust.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
+from jcr.adjust.model_error import TYPICAL, displacements, size_of
 from jcr.adjust.pixel_noise import Layout, PixelNoise, pixel_noise, variance_ratios
 from jcr.adjust.scene import (
     Freedom,
@@ -66,6 +67,8 @@ class ImageProblem:
     seen: Sightings
     """By rigs."""
     layout: Layout
+    displacements: Float[ndarray, "k 2 e"]
+    """Of each observation by what its camera's model leaves (px); no column where intrinsics are exact."""
 
     @staticmethod
     def of(
@@ -82,14 +85,21 @@ class ImageProblem:
             observations, image=observations.image[order], x_px=observations.x_px[order], point=point
         )
         widths = np.array([camera.width for camera in freedom.start])
+        layout = Layout.of(used, widths)
+        by = displacements(freedom.start, freedom.intrinsics, used.x_px, layout.camera)
         return ImageProblem(
             observations=used,
             points=kept,
-            freedom=freedom,
+            freedom=replace(freedom, model_error_std=np.full(by.shape[2], TYPICAL)),
             prior=prior,
             seen=Sightings.of(point, used.rig[used.image], len(scene.world_from_rig)),
-            layout=Layout.of(used, widths),
+            layout=layout,
+            displacements=by,
         )
+
+    def with_model_error(self, std: Float[ndarray, " e"]) -> "ImageProblem":
+        """With displacements of another size."""
+        return replace(self, freedom=replace(self.freedom, model_error_std=std))
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,9 @@ def adjust_images(scene: Scene, observations: Observations, freedom: Freedom) ->
         before = noise
         scene, view, damping = minimised(scene, problem, noise, world, damping)
         noise = noise_of(scene, view, problem, before)
-        if noise.change(before) < SIZES_SETTLED:
+        resized, change = with_model_error_of(evidence(scene, problem, noise))
+        problem = resized
+        if max(noise.change(before), change) < SIZES_SETTLED:
             break
     unit = float(np.median(np.abs(depth / view.depth)))
     back = inverse(scale_translation(scene.world_from_rig[0], unit))
@@ -175,7 +187,7 @@ def posed(
     have their middle."""
     problem = ImageProblem.of(scene, observations, freedom, prior)
     seen = replace(scene, points_in_world=scene.points_in_world[problem.points])
-    return at_start(seen, freedom), problem
+    return at_start(seen, problem.freedom), problem
 
 
 def similarity_held(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
@@ -206,6 +218,7 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
         moved = np.exp(log_focal[rows])[:, None] * about
         moved[:, 0] += lens.fx / lens.height * shear[rows] * about[:, 1]
         residual[rows] = moved + centre - observations.x_px[rows]
+    residual += problem.displacements @ scene.camera_steps[problem.freedom.model_error_columns]
     return View(from_rig, from_camera, in_camera, from_centre, residual)
 
 
@@ -270,6 +283,17 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
     )
 
 
+def with_model_error_of(images: ImageEvidence) -> tuple[ImageProblem, float]:
+    """The problem with displacements as large as the images show them, and the relative change of that."""
+    freedom = images.problem.freedom
+    columns, std = freedom.model_error_columns, freedom.model_error_std
+    if len(std) == 0:
+        return images.problem, 0.0
+    variance = np.diag(np.linalg.inv(images.information))[columns]
+    size = size_of(images.scene.camera_steps[columns], variance, std)
+    return images.problem.with_model_error(size), abs(float(np.log(size[0] / std[0])))
+
+
 def median_reprojection_px(view: View, problem: ImageProblem) -> Float[ndarray, " n"]:
     """Median reprojection error of every image; not a number where it took no part."""
     length = np.linalg.norm(view.residual_px, axis=1)
@@ -323,8 +347,17 @@ def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarra
     ):
         rows = np.flatnonzero(camera == c)
         out[rows, :, columns] = by_parameters(lens, view.in_camera[rows]) @ prior.directions
-    if len(freedom.nuisance.std) == 0:
-        return out
+    if len(freedom.nuisance.std):
+        out = _with_nuisances(out, scene, view, problem)
+    out[:, :, freedom.model_error_columns] = problem.displacements
+    return out
+
+
+def _with_nuisances(
+    out: Float[ndarray, "k 2 l"], scene: Scene, view: View, problem: ImageProblem
+) -> Float[ndarray, "k 2 l"]:
+    """Derivatives by the intrinsics with those by the nuisances of each image."""
+    freedom, camera = problem.freedom, problem.layout.camera
     image, about = problem.observations.image, view.from_centre_px
     log_focal, shear = scene.nuisances(freedom)[:, image]
     # Nuisances are about the principal point, which they leave where it is; a shear counts in the focal length.

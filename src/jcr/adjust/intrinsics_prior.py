@@ -16,6 +16,7 @@ MEASURED = {
     "cy": 5e-3,
     "k1": 0.02,
     "k2": 0.05,
+    "k3": 0.1,
     "p1": 1e-3,
     "p2": 1e-3,
 }
@@ -29,22 +30,11 @@ ESTIMATED = {
     "cy": 0.02,
     "k1": 0.3,
     "k2": 0.3,
+    "k3": 0.3,
     "p1": 3e-3,
     "p2": 3e-3,
 }
 """Of a cheap camera that nobody calibrated, about what the reconstruction found."""
-FROM_FEATURES = {
-    "f": 2e-3,
-    "aspect": 2e-4,
-    "cx": 3e-3,
-    "cy": 3e-3,
-    "k1": 0.005,
-    "k2": 0.005,
-    "p1": 5e-4,
-    "p2": 5e-4,
-}
-"""By what intrinsics that images show are off, beside what their pixels' noise explains: those from a board and those
-from other features of the same images differ by the square root of two times that (jcr docs architecture)."""
 HELD: dict[str, float] = {}
 """Of intrinsics that are exact."""
 LEAST = 1e-12
@@ -94,12 +84,3 @@ def prior_about(found: Intrinsics, given: bool, std: Float[ndarray, " q"] | None
     if not given:
         return prior_of(found, ESTIMATED)
     return prior_of(found, MEASURED if std is None else std)
-
-
-def off_by(prior: IntrinsicsPrior, intrinsics: Intrinsics) -> Float[ndarray, "c c"]:
-    """Covariance, in the directions of the prior, by which what images show is off; no more than the prior's own."""
-    features = prior_of(intrinsics, FROM_FEATURES)
-    spread = (features.directions * features.std**2) @ features.directions.T
-    to_prior = np.linalg.pinv(prior.directions)
-    information = np.linalg.inv(to_prior @ spread @ to_prior.T + LEAST * np.diag(prior.std**2))
-    return np.linalg.inv(information + np.diag(prior.std**-2.0))

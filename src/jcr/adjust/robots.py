@@ -31,8 +31,8 @@ from jcr.adjust.images import (
     posed,
     similarity_held,
     view_of,
+    with_model_error_of,
 )
-from jcr.adjust.intrinsics_prior import off_by
 from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped
 from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import POSES, Equations, most_likely, posterior, solve
@@ -125,10 +125,19 @@ class Adjusted:
 
     def intrinsics_covariance(self, c: int) -> Float[ndarray, "q q"]:
         """Of the parameters of a camera, in the order of camera.parameters."""
-        freedom, first = self.given.evidence.problem.freedom, self.first_camera_column
-        columns, directions = freedom.intrinsics_columns[c], freedom.intrinsics[c].directions
-        own = slice(first + columns.start, first + columns.stop)
+        own, directions = self._intrinsics_of(c)
         return directions @ self.covariance[own, own] @ directions.T
+
+    def intrinsics_cross(self, c: int) -> Float[ndarray, "7 q"]:
+        """Of the first arm's X and scale with the parameters of a camera."""
+        own, directions = self._intrinsics_of(c)
+        return self.covariance[:7, own] @ directions.T
+
+    def _intrinsics_of(self, c: int) -> tuple[slice, Float[ndarray, "q e"]]:
+        """The columns of a camera's intrinsics, and the directions that they are of."""
+        freedom, first = self.given.evidence.problem.freedom, self.first_camera_column
+        columns = freedom.intrinsics_columns[c]
+        return slice(first + columns.start, first + columns.stop), freedom.intrinsics[c].directions
 
     def moved(self, step: Float[ndarray, " p"]) -> Placed:
         """Everything after a step: X, log scale, base of the first arm; X and base of others; then the `free` ones."""
@@ -209,12 +218,13 @@ def adjust(
         before = pixels, log_sizes
         scene, view, damping = minimised(placed.scene, problem, pixels, robots, damping)
         pixels = noise_of(scene, view, problem, pixels)
+        problem, resized = with_model_error_of(evidence(scene, problem, pixels))
         given = replace(given, evidence=evidence(scene, problem, pixels))
         placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
         equations, _ = equations_of(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
         change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
-        if max(change, pixels.change(before[0])) < SIZES_SETTLED and moved < STEP_SETTLED:
+        if max(change, resized, pixels.change(before[0])) < SIZES_SETTLED and moved < STEP_SETTLED:
             break
     return tied(given, placed, log_sizes)
 
@@ -225,11 +235,10 @@ def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = 
     equations, region = equations_of(placed, given)
     log_sizes, information = most_likely(equations, log_sizes)
     found = posterior(equations, log_sizes, information, region)
-    more = _by_features(found.covariance, given)
     return Adjusted(
         placed=_moved(placed, found.step, given),
-        covariance=found.covariance + more,
-        budget=replace(found.budget, intrinsics=found.budget.intrinsics + more[:7, :7]),
+        covariance=found.covariance,
+        budget=found.budget,
         most_likely=placed,
         log_sizes=log_sizes,
         equations=equations,
@@ -271,7 +280,7 @@ def _columns(arm: int) -> Int[ndarray, "12"]:
     return np.delete(np.arange(POSES), SCALE) if arm == 0 else np.arange(1 + 12 * arm, POSES + 12 * arm)
 
 
-def _of_poses(
+def of_poses(
     placed: Placed, arms: Sequence[ArmPoses]
 ) -> tuple[Float[ndarray, " s"], Float[ndarray, "s u"], Float[ndarray, "s s"], Float[ndarray, "s s"]]:
     """Residuals of the reported poses, their derivatives by the arms' unknowns and by the rigs, and the covariance of
@@ -313,11 +322,20 @@ def _prior(arms: Sequence[ArmPoses]) -> Float[ndarray, "u u"]:
     return prior
 
 
-def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
-    """Residuals of the reported gripper poses, linear in all unknowns; what the images show of the rigs is in them."""
+@dataclass(frozen=True)
+class RigsGivenCameras:
+    """What the images show of the rigs that arms move, with everything else of the scene where it is."""
+
+    follow: Float[ndarray, "s e"]
+    """By how much the rigs step back with each free column."""
+    step: Float[ndarray, " s"]
+    """To where they are likeliest, with the sign reversed."""
+    covariance: Float[ndarray, "s s"]
+
+
+def rigs_given_cameras(given: Given) -> RigsGivenCameras:
+    """From the evidence of the images alone."""
     images, by_arm, free = given.evidence, given.by_arm, given.free
-    residual, jacobian, by_rig, systematic = _of_poses(placed, given.arms)
-    # With the free columns where they are, the rigs of the arms are known to this covariance about this step.
     own = images.information[np.ix_(by_arm, by_arm)]
     size = 1 / np.sqrt(own.diagonal())
     factor = cho_factor(size[:, None] * own * size, lower=True)
@@ -325,9 +343,17 @@ def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     solved = size[:, None] * cho_solve(
         factor, size[:, None] * np.column_stack([coupling, images.gradient[by_arm], np.diag(1 / size)])
     )
-    follow, step = solved[:, : len(free)], solved[:, len(free)]
-    covariance = solved[:, len(free) + 1 :] * size
-    known = by_rig @ covariance @ by_rig.T
+    return RigsGivenCameras(solved[:, : len(free)], solved[:, len(free)], solved[:, len(free) + 1 :] * size)
+
+
+def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
+    """Residuals of the reported gripper poses, linear in all unknowns; what the images show of the rigs is in them."""
+    images, free = given.evidence, given.free
+    residual, jacobian, by_rig, systematic = of_poses(placed, given.arms)
+    rigs = rigs_given_cameras(given)
+    follow, step = rigs.follow, rigs.step
+    coupling = images.information[np.ix_(given.by_arm, free)]
+    known = by_rig @ rigs.covariance @ by_rig.T
     robots = _of_robots(given.arms)
     count = robots + len(free)
     prior, gradient = np.zeros((count, count)), np.zeros(count)
@@ -353,7 +379,7 @@ def _rig_information(
     placed: Placed, arms: Sequence[ArmPoses], covariance: Float[ndarray, "s s"]
 ) -> RigInformation:
     """What reported poses with errors of this covariance know of the rigs, X, scale and bases eliminated."""
-    residual, jacobian, by_rig, _ = _of_poses(placed, arms)
+    residual, jacobian, by_rig, _ = of_poses(placed, arms)
     factor = cho_factor(covariance, lower=True)
     weighed = cho_solve(factor, np.column_stack([jacobian, by_rig, residual]))
     u, s = jacobian.shape[1], len(residual)
@@ -391,17 +417,3 @@ def _moved(placed: Placed, step: Float[ndarray, " p"], given: Given) -> Placed:
         z=retract(placed.z, own[:, 6:]),
         scene=stepped(placed.scene, freedom, of_images) if of_images.any() else placed.scene,
     )
-
-
-def _by_features(covariance: Float[ndarray, "p p"], given: Given) -> Float[ndarray, "p p"]:
-    """Covariance of what features of the images leave wrong in the intrinsics, and all that follows them."""
-    freedom, first = given.evidence.problem.freedom, _of_robots(given.arms)
-    size = freedom.nuisance_columns.start
-    off = np.zeros((size, size))
-    for prior, camera, columns in zip(
-        freedom.intrinsics, given.evidence.scene.cameras, freedom.intrinsics_columns, strict=True
-    ):
-        off[columns, columns] = off_by(prior, camera)
-    own = slice(first, first + size)
-    follows = np.linalg.solve(covariance[own, own], covariance[own]).T
-    return follows @ off @ follows.T

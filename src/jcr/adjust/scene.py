@@ -49,8 +49,8 @@ class NuisancePrior:
 class Freedom:
     """What may move beside rigs and points: the cameras' parameters, and where cameras are mounted on their rig.
 
-    The columns of all equations are, in this order: the intrinsics of each camera, nuisances, mounts (six each, rig
-    axes), rigs (six each, world axes).
+    The columns of all equations are, in this order: the intrinsics of each camera, nuisances, what the cameras' models
+    leave (model_error.py), mounts (six each, rig axes), rigs (six each, world axes).
     """
 
     intrinsics: tuple[IntrinsicsPrior, ...]
@@ -60,6 +60,8 @@ class Freedom:
     nuisance: NuisancePrior
     start: tuple[Intrinsics, ...]
     """Of each camera, where its prior has its middle."""
+    model_error_std: Float[ndarray, " e"] = field(default_factory=lambda: np.zeros(0))
+    """Of each displacement, in widths of the image."""
 
     @staticmethod
     def of(
@@ -79,7 +81,9 @@ class Freedom:
     @property
     def std(self) -> Float[ndarray, " l"]:
         """Of all camera columns."""
-        return np.concatenate([*(prior.std for prior in self.intrinsics), self.nuisance.std])
+        return np.concatenate(
+            [*(prior.std for prior in self.intrinsics), self.nuisance.std, self.model_error_std]
+        )
 
     @property
     def intrinsics_columns(self) -> list[slice]:
@@ -94,9 +98,15 @@ class Freedom:
         return slice(begin, begin + len(self.nuisance.std))
 
     @property
+    def model_error_columns(self) -> slice:
+        """After the nuisances."""
+        begin = self.nuisance_columns.stop
+        return slice(begin, begin + len(self.model_error_std))
+
+    @property
     def mount_columns(self) -> list[slice | None]:
         """Of each camera; None where it does not move."""
-        begin, out = self.nuisance_columns.stop, list[slice | None]()
+        begin, out = self.model_error_columns.stop, list[slice | None]()
         for free in self.mounts:
             out.append(slice(begin, begin + 6) if free else None)
             begin += 6 * int(free)
@@ -105,7 +115,7 @@ class Freedom:
     @property
     def first_rig(self) -> int:
         """Column; six for each rig follow."""
-        return self.nuisance_columns.stop + 6 * int(self.mounts.sum())
+        return self.model_error_columns.stop + 6 * int(self.mounts.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +127,8 @@ class Scene:
     cameras: tuple[Intrinsics, ...]
     points_in_world: Float[ndarray, "p 3"]
     camera_steps: Float[ndarray, " l"] = field(default_factory=lambda: np.zeros(0))
-    """Of the intrinsics from where they start, along the directions of their priors, then of the nuisances; empty: all
-    are where they start."""
+    """Of the intrinsics from where they start, along the directions of their priors, of the nuisances, and of what the
+    models leave; empty: all are where they start."""
 
     def nuisances(self, freedom: Freedom) -> Float[ndarray, "2 n"]:
         """Of each image: logarithm of its focal length over the camera's, and its shear."""

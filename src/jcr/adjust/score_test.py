@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.stats import f as f_distribution
 
 from jcr.adjust.images import ImageEvidence, evidence
-from jcr.adjust.intrinsics_prior import IntrinsicsPrior, off_by
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.robots import Adjusted, equations_of
 from jcr.adjust.scene import Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
@@ -113,10 +113,14 @@ def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
         mounts=freedom.mounts,
         nuisance=NuisancePrior(np.eye(2 * m), weak[len(names) :]),
         start=freedom.start,
+        model_error_std=freedom.model_error_std,
     )
     scene = given.evidence.scene
     steps = np.r_[
-        scene.camera_steps[:own], beyond_prior(adjusted, prior) / units, scene.nuisances(freedom).ravel()
+        scene.camera_steps[:own],
+        beyond_prior(adjusted, prior) / units,
+        scene.nuisances(freedom).ravel(),
+        scene.camera_steps[freedom.model_error_columns],
     ]
     wider = evidence(
         replace(scene, camera_steps=steps), replace(problem, freedom=all_free), given.evidence.noise
@@ -126,16 +130,17 @@ def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
     solution = solve(equations, adjusted.log_sizes)
     hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
     right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
-    # What was adjusted: X, scale, base_from_world, and the camera as far as it was free.
-    base = POSES + own
+    # What was adjusted: X, scale, base_from_world, the camera as far as it was free, and what its model leaves.
+    base, end = POSES + own, POSES + all_free.nuisance_columns.stop
     size = 1 / np.sqrt(hessian.diagonal())
-    kept, rest = slice(0, base), slice(base, None)
-    scaled = size[kept, None] * hessian[kept, kept] * size[kept]
-    by_column = size[kept, None] * np.linalg.solve(scaled, size[kept, None] * hessian[kept, rest])
+    kept, rest = np.r_[0:base, end : len(hessian)], np.arange(base, end)
+    scaled = size[kept, None] * hessian[np.ix_(kept, kept)] * size[kept]
+    coupling = hessian[np.ix_(kept, rest)]
+    by_column = size[kept, None] * np.linalg.solve(scaled, size[kept, None] * coupling)
     depth, image = wider.view.depth, problem.observations.image
     distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(m)])
     return Alternatives(
-        hessian=hessian[rest, rest] - hessian[rest, kept] @ by_column,
+        hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
         x_by_column=-by_column[:6],
         images=m,
@@ -155,7 +160,7 @@ def freed_intrinsics(
     problem, scene = given.evidence.problem, given.evidence.scene
     freedom = replace(problem.freedom, intrinsics=(prior,))
     off = parameters(scene.cameras[0]) - parameters(start)
-    steps = scene.camera_steps[problem.freedom.nuisance_columns]
+    steps = scene.camera_steps[problem.freedom.nuisance_columns.start :]
     wider = evidence(
         replace(scene, camera_steps=np.r_[np.linalg.pinv(prior.directions) @ off, steps]),
         replace(problem, freedom=freedom),
@@ -164,7 +169,7 @@ def freed_intrinsics(
     equations, _ = equations_of(adjusted.most_likely, replace(given, evidence=wider))
     solution = solve(equations, adjusted.log_sizes)
     own = slice(POSES, POSES + len(prior.std))
-    covariance = solution.covariance[own, own] + off_by(prior, start)
+    covariance = solution.covariance[own, own]
     found = parameters(scene.cameras[0]) + prior.directions @ solution.step[own]
     return found, prior.directions @ covariance @ prior.directions.T
 

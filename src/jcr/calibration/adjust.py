@@ -48,7 +48,7 @@ def adjusted(case: Case) -> Case:
     case = replace(case, adjusted=found)
     if not case.hand_eye.converged:
         return case
-    refined = judged(_refined(case, found))
+    refined = judged(refined_by(case, found))
     if case.tracks.from_pointmaps and not _is_nearer(refined.held_out, case.hand_eye.held_out):
         return case
     return replace(case, hand_eye=refined)
@@ -96,6 +96,7 @@ def estimate_of(found: Adjusted, case: Case) -> Estimate:
         budget=found.budget,
         intrinsics=found.placed.scene.cameras[0],
         intrinsics_covariance=found.intrinsics_covariance(0),
+        intrinsics_cross=found.intrinsics_cross(0),
     )
 
 
@@ -130,9 +131,9 @@ def _is_nearer(one: HeldOut | None, other: HeldOut | None) -> bool:
     return one is not None and other is not None and one.length_m < other.length_m
 
 
-def _refined(case: Case, found: Adjusted) -> HandEye:
-    """The calibration as an adjustment has it; not judged yet."""
-    before, used = case.hand_eye, case.used
+def refined_by(case: Case, found: Adjusted) -> HandEye:
+    """The calibration of a case as an adjustment has it; not judged yet."""
+    before, used = case.hand_eye.before or case.hand_eye, case.used
     estimate = estimate_of(found, case)
     x = estimate.gripper_from_camera
     gripper, camera = case.base_from_gripper, case.recon_from_camera

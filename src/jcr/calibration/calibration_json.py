@@ -228,7 +228,7 @@ def calibration_file(
         backend=reconstruction.backend,
         images=image_verdicts(capture, reconstruction, hand_eye),
         residuals=hand_eye.residuals,
-        uncertainty=Uncertainty.of(hand_eye.estimate),
+        uncertainty=Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
         held_out=hand_eye.held_out,
         observability=Observed.model_validate(hand_eye.observability, from_attributes=True),
         robot_noise=Noise.of(hand_eye.robot_noise),

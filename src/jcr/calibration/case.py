@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
+from jcr.adjust.points import points_in_base
 from jcr.adjust.robots import Adjusted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
+from jcr.calibration.seen import Scene, within_95
 from jcr.handeye.fit import Cues
 from jcr.records import Capture, HandEye, Reconstruction, Tracks
 
@@ -81,6 +83,15 @@ class Case:
     def with_tracks(self, tracks: Tracks) -> "Case":
         """The case with some of its observations."""
         return replace(self, chosen_tracks=tracks)
+
+    @property
+    def scene_in_base(self) -> Scene | None:
+        """What the camera sees, and how well its points are known; None where the images were not adjusted."""
+        if self.adjusted is None or self.hand_eye.before is None:
+            return None
+        _, covariance = points_in_base(self.adjusted)
+        distance = float(np.median(self.adjusted.given.evidence.view.depth)) * self.adjusted.placed.scale
+        return Scene(distance, float(np.median([within_95(one) for one in covariance])))
 
     @property
     def is_adjustable(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.errors import InputError
+from jcr.records import Where
 
 
 @dataclass(frozen=True)
@@ -14,11 +15,11 @@ class CalibrateOptions:
     """How the hand-eye calibration is found."""
 
     require: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Required accuracy of the camera on the gripper: 95 % of errors must be below this, else exit status 3. Unset: a
-    calibration worse than 5 mm and 1°, which are enough for grasping, only gives a warning."""
-    require_at: Literal["camera", "scene"] = "camera"
-    """Where the millimetres of --require apply: at the camera, or in the scene it looks at, where a rotation error
-    also displaces points."""
+    """Required accuracy: 95 % of errors must be below this, else exit status 3. Unset: a calibration worse than 5 mm and
+    1°, which are enough for grasping, only gives a warning."""
+    require_at: Where = "seen"
+    """What must be as accurate. seen: a point at the centre of an image, at the working distance, placed by intrinsics
+    and transform together; camera: the camera on the gripper by itself; scene: the mapped points in the base frame."""
     robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
     """Lower bound on the noise (1 sigma per axis) of the gripper poses; a larger value may be estimated."""
     scale: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None

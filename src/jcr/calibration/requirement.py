@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.options import CalibrateOptions
-from jcr.geometry import skew
-from jcr.handeye.equation import ASSUMED_NOISE, PRIOR_STD, pose_information
+from jcr.calibration.seen import Scene, in_use, within_95
+from jcr.handeye.equation import ASSUMED_NOISE, expected_covariance, point_ahead, pose_information
 from jcr.handeye.next_poses import looked_at, next_poses
 from jcr.handeye.observability import excitation
 from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement
@@ -28,14 +27,18 @@ def advised(
     gripper: Float[ndarray, "m 4 4"],
     options: CalibrateOptions,
     scale_std: float | None = None,
+    scene: Scene | None = None,
 ) -> HandEye:
-    """With what the motions show of each direction, the requirement, and the gripper poses to add.
+    """With what the motions show of each direction, how exact it is in use, the requirement, and the poses to add.
 
-    `gripper` are the poses that the solver was given, in its order; `scale_std` is how well the scale was
-    known beforehand (relative).
+    `gripper` are the poses that the solver was given, in its order; `scale_std` is how well the scale was known
+    beforehand (relative); `scene` is what the camera sees, where images were adjusted.
     """
     used = gripper[hand_eye.inliers]
-    required = _required(hand_eye, used, options)
+    if scene is None:
+        scene = Scene(float(np.median(looked_at(used @ hand_eye.gripper_from_camera)[1])))
+    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene))
+    required = _required(hand_eye, options)
     if hand_eye.converged:
         reach, proposed = _worthwhile(hand_eye, used, required, scale_std)
         required = replace(required, more_images=reach)
@@ -43,7 +46,7 @@ def advised(
         # An X that is not trusted is not used, nor a robot that is worse than assumed promised away.
         metres, radians = hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation
         at_least = max(metres, ASSUMED_NOISE[0]), max(radians, ASSUMED_NOISE[1])
-        _, proposed = next_poses(used, PROPOSED, noise=at_least)
+        _, proposed = next_poses(used, PROPOSED, noise=at_least, distance_m=1e-3 * required.distance_mm)
         by_lens = np.sqrt(np.diag(_by_intrinsics(hand_eye)))
         proposed = [replace(pose, expected_std=np.hypot(pose.expected_std, by_lens)) for pose in proposed]
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
@@ -58,7 +61,11 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     if required.is_met:
         return None
     mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
-    numbers = {name: float(value) for name, value in vars(required).items() if value is not None}
+    numbers = {
+        name: value if isinstance(value, str) else float(value)
+        for name, value in vars(required).items()
+        if value is not None
+    }
     return Finding(
         kind=Kind.NOT_EXACT_ENOUGH,
         severity="warns",
@@ -76,32 +83,21 @@ def mostly_systematic(budget: Budget | None) -> bool:
     return bool(np.trace(budget.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
-def within_95(covariance: Float[ndarray, "3 3"]) -> float:
-    """The length that 95 % of normal errors of this covariance stay below, to 1 % (Imhof 1961, Pearson's moments)."""
-    spread = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
-    mean, second, third = (float((spread**power).sum()) for power in (1, 2, 3))
-    if third <= 0:
-        return 0.0
-    freedom = second**3 / third**2
-    return float(np.sqrt(mean + (chi2.ppf(0.95, freedom) - freedom) * np.sqrt(second / freedom)))
-
-
-def _required(hand_eye: HandEye, used: Float[ndarray, "k 4 4"], options: CalibrateOptions) -> Requirement:
-    distance = 0.0
-    if options.require_at == "scene":
-        distance = float(np.median(looked_at(used @ hand_eye.gripper_from_camera)[1]))
-    reached = _reached(hand_eye.covariance, hand_eye.gripper_from_camera, distance)
-    return Requirement(*(options.require or GRASPING), options.require is not None, 1e3 * distance, *reached)
-
-
-def _reached(
-    covariance: Float[ndarray, "7 7"], x: Float[ndarray, "4 4"], distance: float
-) -> tuple[float, float]:
-    """mm, degrees: 95 % of the errors of a point so far (m) ahead of the camera, and of the rotation."""
-    # geometry.retract: the origin moves by v, a point p from it by v + w × p.
-    ahead = np.hstack([np.eye(3), -skew(distance * x[:3, 2])])
-    moved = ahead @ covariance[:6, :6] @ ahead.T
-    return 1e3 * within_95(moved), float(np.degrees(within_95(covariance[3:6, 3:6])))
+def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
+    found, at = hand_eye.in_use, options.require_at
+    assert found is not None
+    seen = found.seen
+    if at == "camera":
+        covariance = hand_eye.covariance
+        distance_mm, reached_mm = 0.0, 1e3 * within_95(covariance[:3, :3])
+        reached_deg = float(np.degrees(within_95(covariance[3:6, 3:6])))
+    else:
+        distance_mm, reached_mm, reached_deg = seen.distance_mm, seen.within_95_mm, seen.rotation_95_deg
+    # Of camera poses that were given there is no scene but the point ahead.
+    if at == "scene" and found.scene_95_mm is not None:
+        reached_mm = found.scene_95_mm
+    asked = options.require is not None
+    return Requirement(*(options.require or GRASPING), asked, distance_mm, reached_mm, reached_deg, at=at)
 
 
 def _worthwhile(
@@ -109,26 +105,24 @@ def _worthwhile(
 ) -> tuple[int | None, list[NextPose]]:
     """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
 
-    What they leave is the reported covariance, less by the share by which their information shrinks that expected of
-    the poses alone: bundle adjustment, intrinsics and correlated errors make the two differ. No views make up for
-    given intrinsics that are
-    wrong, nor for systematic errors of the robot where they are most of it; a smaller part may be that
-    their size is hardly known, and more views tell it.
+    Errors shrink by the share by which the expected ones of the poses alone do: images, intrinsics and correlated errors
+    make the two differ. No views make up for given intrinsics that are wrong, nor for systematic errors of the robot
+    where they are most of it; a smaller part may be that their size is hardly known, and more views tell it.
     """
     x, noise = hand_eye.gripper_from_camera, (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
     stays = _by_intrinsics(hand_eye)
     systematic = None if hand_eye.budget is None else hand_eye.budget.robot_systematic
     if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
         stays = stays + systematic
-    _, proposed = next_poses(used, PROPOSED if required.is_met else MOST, x, noise)
+    distance = 1e-3 * required.distance_mm
+    _, proposed = next_poses(used, PROPOSED if required.is_met else MOST, x, noise, distance_m=distance)
     added = np.stack([pose.base_from_gripper for pose in proposed])
     information = np.cumsum(
         np.concatenate([pose_information(used, x, noise).sum(0)[None], pose_information(added, x, noise)]), 0
     )
-    information[:, range(7), range(7)] += PRIOR_STD**-2.0
     if scale_std is not None:
         information[:, 6, 6] += scale_std**-2.0
-    expected = np.linalg.inv(information)[:, :7, :7]
+    expected = expected_covariance(information)
     shrinks = np.sqrt(np.maximum(np.diag(hand_eye.covariance - stays), 0.0))
     share = shrinks / np.sqrt(np.diag(expected[0]))
     left = expected[1:] * np.outer(share, share) + stays
@@ -137,11 +131,21 @@ def _worthwhile(
     ]
     if required.is_met:
         return 0, proposed
-    for count, then in enumerate(left, start=1):
-        millimetres, degrees = _reached(then, x, 1e-3 * required.distance_mm)
-        if replace(required, reached_mm=millimetres, reached_deg=degrees).is_met:
+    point = point_ahead(x, distance)
+    mm = _shrunk(required.reached_mm, 1e3 * within_95(point @ stays @ point.T), point @ expected @ point.T)
+    deg_stays = np.degrees(within_95(stays[3:6, 3:6]))
+    deg = _shrunk(required.reached_deg, float(deg_stays), expected[:, 3:6, 3:6])
+    for count, (millimetres, degrees) in enumerate(zip(mm, deg, strict=True), start=1):
+        if replace(required, reached_mm=float(millimetres), reached_deg=float(degrees)).is_met:
             return count, proposed[: max(PROPOSED, count)]
     return None, proposed[:PROPOSED]
+
+
+def _shrunk(now: float, stays: float, expected: Float[ndarray, "k n n"]) -> Float[ndarray, " j"]:
+    """An error with each number of further poses, j = k - 1: of its square what does not stay shrinks as expected."""
+    variance = np.trace(expected, axis1=1, axis2=2)
+    stays = min(stays, now)
+    return np.sqrt(stays**2 + (now**2 - stays**2) * variance[1:] / variance[0])
 
 
 def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:

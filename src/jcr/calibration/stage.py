@@ -1,11 +1,14 @@
 """The calibration of a capture: fit, adjust, checks, verdict, requirement."""
 
+from dataclasses import replace
+
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.seen import with_given_intrinsics
 from jcr.calibration.verdict import with_checked
 from jcr.least_squares import one_blas_thread
 from jcr.records import Capture, HandEye, Reconstruction
@@ -28,4 +31,9 @@ def calibrate(
     for check in CHECKS:
         if check.needs(case):
             case = with_checked(case, check.run(case))
-    return advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std)
+    scene = case.scene_in_base
+    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std, scene)
+    if capture.intrinsics is None or scene is None:
+        return hand_eye
+    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)
+    return replace(hand_eye, with_given_intrinsics=pair)

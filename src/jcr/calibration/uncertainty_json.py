@@ -5,11 +5,13 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator
+from pydantic import AfterValidator, model_validator
 
 from jcr.arrays_json import Covariance7, Part, Spread, Spread3
+from jcr.calibration.seen import joint_covariance
 from jcr.calibration.words import worst_direction
-from jcr.records import COVARIANCE_ORDER, Budget, Estimate
+from jcr.camera import parameter_names
+from jcr.records import COVARIANCE_ORDER, Budget, Estimate, InUse
 
 
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
@@ -56,6 +58,50 @@ class UncertaintyBudget(Part):
         return cls(**{name: Share.of(part) for name, part in vars(budget).items()})
 
 
+class SeenJson(Part):
+    """How exactly a point that the camera sees is placed; 95 % of errors are smaller."""
+
+    distance_mm: Spread
+    within_95_mm: Spread
+    lateral_95_mm: Spread
+    along_95_mm: Spread
+    ray_95_deg: Spread
+    rotation_95_deg: Spread
+
+
+class SeenAndCorners(SeenJson):
+    """At the centre of the image, and at its worst corner."""
+
+    corners: SeenJson
+
+    @classmethod
+    def of(cls, found: InUse) -> "SeenAndCorners":
+        """Those of a calibration in use."""
+        return cls(**vars(found.seen), corners=SeenJson(**vars(found.corners)))
+
+
+class Joint(Part):
+    """Covariance of X, scale and intrinsics together, from which the place of any seen point follows."""
+
+    covariance: list[list[float]]
+    order: list[str]
+    """Of `uncertainty`, then fx, fy, cx, cy and the distortion."""
+
+    @model_validator(mode="after")
+    def _is_square(self) -> "Joint":
+        if {len(self.order)} != {len(self.covariance), *(len(row) for row in self.covariance)}:
+            raise ValueError(f"a covariance that is not {len(self.order)} x {len(self.order)}")
+        return self
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> "Joint | None":
+        """That of an estimate; None where its intrinsics were not estimated."""
+        if estimate.intrinsics is None or estimate.intrinsics_cross is None:
+            return None
+        order = [*COVARIANCE_ORDER, *parameter_names(estimate.intrinsics)]
+        return cls(covariance=joint_covariance(estimate).tolist(), order=order)
+
+
 class Uncertainty(Part):
     """One-sigma uncertainty; axes of the gripper frame."""
 
@@ -67,10 +113,16 @@ class Uncertainty(Part):
     worst: str
     """The least certain direction of the translation in words, and its size."""
     budget: UncertaintyBudget | None = None
+    seen: SeenAndCorners | None = None
+    """Null in files of earlier versions."""
+    scene_95_mm: Spread | None = None
+    """95 % of the errors of points of the reconstruction in the base frame are smaller, at the median point."""
+    joint: Joint | None = None
+    """Null in files of earlier versions, and where the intrinsics were not estimated."""
 
     @classmethod
-    def of(cls, estimate: Estimate) -> "Uncertainty":
-        """That of an estimate."""
+    def of(cls, estimate: Estimate, in_use: InUse | None) -> "Uncertainty":
+        """That of an estimate, and how exact it is in use."""
         std = np.sqrt(np.diag(estimate.covariance))
         return cls(
             translation_std_mm=(1e3 * std[:3]).tolist(),
@@ -80,4 +132,7 @@ class Uncertainty(Part):
             order=list(COVARIANCE_ORDER),
             worst=worst_direction(estimate),
             budget=UncertaintyBudget.of(estimate.budget),
+            seen=None if in_use is None else SeenAndCorners.of(in_use),
+            scene_95_mm=None if in_use is None else in_use.scene_95_mm,
+            joint=Joint.of(estimate),
         )

@@ -10,8 +10,8 @@ from jcr.records import Finding, HandEye, verdict_of
 
 def with_checked(case: Case, checked: Checked) -> Case:
     """The case after a check."""
-    hand_eye = checked.hand_eye or case.hand_eye
-    return replace(case, hand_eye=with_findings(hand_eye, checked.findings))
+    hand_eye, adjusted = checked.hand_eye or case.hand_eye, checked.adjusted or case.adjusted
+    return replace(case, hand_eye=with_findings(hand_eye, checked.findings), adjusted=adjusted)
 
 
 def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:

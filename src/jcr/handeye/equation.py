@@ -86,27 +86,46 @@ def pose_information(
     return np.swapaxes(j, 1, 2) @ j
 
 
-def expected_std(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7"]:
-    """Standard deviations that information leaves, in records.COVARIANCE_ORDER; the prior is added here."""
+def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7 7"]:
+    """Covariance that information leaves, in records.COVARIANCE_ORDER; the prior is added here."""
     with_prior = hessian.copy()
     with_prior[..., range(7), range(7)] += PRIOR_STD**-2.0
-    return np.sqrt(np.diagonal(np.linalg.inv(with_prior), axis1=-2, axis2=-1)[..., :7])
+    return np.linalg.inv(with_prior)[..., :7, :7]
+
+
+def expected_std(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7"]:
+    """Its standard deviations."""
+    return np.sqrt(np.diagonal(expected_covariance(hessian), axis1=-2, axis2=-1))
+
+
+def point_ahead(x: Float[ndarray, "4 4"], distance_m: float) -> Float[ndarray, "3 7"]:
+    """By how much a point on the optical axis moves on the gripper, in gripper axes, with X and scale."""
+    p = distance_m * x[:3, 2]
+    return np.hstack([np.eye(3), -skew(p), p[:, None]])
 
 
 def most_informative(
-    known: Float[ndarray, "13 13"], gain: Float[ndarray, "k 13 13"], count: int
+    known: Float[ndarray, "13 13"],
+    gain: Float[ndarray, "k 13 13"],
+    count: int,
+    point: Float[ndarray, "3 7"] | None = None,
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, "c 7"]]:
     """The `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
 
-    Returns their rows, and the standard deviations expected with each and those before it.
+    What counts is the position of a point (`point_ahead`; by default the camera), the rotation and the scale. Returns the
+    candidates' rows, and the standard deviations expected with each and those before it.
     """
+    counted = np.eye(7)
+    if point is not None:
+        counted[:3] = point
+    counted /= UNIT[:, None]
     rows: list[int] = []
     left = np.arange(len(gain))
     stds = np.zeros((min(count, len(gain)), 7))
     for k in range(len(stds)):
-        std = expected_std(known + gain[left])
-        best = int(((std / UNIT) ** 2).sum(1).argmin())
-        stds[k] = std[best]
+        covariance = expected_covariance(known + gain[left])
+        best = int(np.einsum("ri,kij,rj->k", counted, covariance, counted).argmin())
+        stds[k] = np.sqrt(np.diag(covariance[best]))
         known = known + gain[left[best]]
         rows.append(int(left[best]))
         left = np.delete(left, best)

@@ -9,7 +9,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_angle, rotation_exp, transform
-from jcr.handeye.equation import ASSUMED_NOISE, Poses, expected_std, most_informative, pose_information
+from jcr.handeye.equation import (
+    ASSUMED_NOISE,
+    Poses,
+    expected_std,
+    most_informative,
+    point_ahead,
+    pose_information,
+)
 from jcr.records import NextPose
 
 CANDIDATES = 600
@@ -22,16 +29,21 @@ def next_poses(
     noise: tuple[float, float] = ASSUMED_NOISE,
     reach: Float[ndarray, "2 3"] | None = None,
     seed: int = 0,
+    distance_m: float | None = None,
 ) -> tuple[Float[ndarray, "7"], list[NextPose]]:
     """Standard deviations expected now, and `count` poses to add, best first.
 
     `reach` is the box (m, base) that gripper positions stay in; by default that of the capture and a quarter
-    more. Without a hand-eye transform the camera is taken to sit at the gripper and look along its z axis.
+    more. Without a hand-eye transform the camera is taken to sit at the gripper and look along its z axis. They are best
+    for a point so far ahead of the camera; by default as far as the scene.
     """
     x = np.eye(4) if gripper_from_camera is None else gripper_from_camera
     candidates = _candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
     known = pose_information(base_from_gripper, x, noise).sum(0)
-    rows, stds = most_informative(known, pose_information(candidates, x, noise), count)
+    if distance_m is None:
+        distance_m = float(np.median(looked_at(base_from_gripper @ x)[1]))
+    point = point_ahead(x, distance_m)
+    rows, stds = most_informative(known, pose_information(candidates, x, noise), count, point)
     described = zip(candidates[rows], stds, strict=True)
     return expected_std(known), [_described(pose, std, base_from_gripper) for pose, std in described]
 

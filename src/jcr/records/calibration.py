@@ -1,6 +1,7 @@
 """Where the camera sits on the gripper, how well that is known, and what was found on the way."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -172,20 +173,70 @@ class DepthCheck:
         return np.sqrt(self.noise_m**2 + (self.noise_per_m * depth**2) ** 2 + common**2)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """How exactly a point that the camera sees is placed: 95 % of errors are smaller."""
+
+    distance_mm: float
+    """From the camera, along the ray."""
+    within_95_mm: float
+    """Distance of the point from where it is, in three dimensions."""
+    lateral_95_mm: float
+    """Across the ray."""
+    along_95_mm: float
+    """Along the ray, of a distance that was measured in the reconstruction."""
+    ray_95_deg: float
+    """Direction of the ray."""
+    rotation_95_deg: float
+    """Of the directions of things seen there, the rotation about the ray included."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InUse:
+    """How exact a calibration is in use, by its intrinsics, X and scale together; without the robot's own pose errors."""
+
+    seen: Seen
+    """At the centre of the image, at the median distance of the scene."""
+    corners: Seen
+    """The same at the worst corner of the image."""
+    scene_95_mm: float | None = None
+    """Of the points of the reconstruction in the base frame, the median; None where no image was adjusted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithGivenIntrinsics:
+    """The transform for who keeps the intrinsics that were given: the likeliest one where these are exact."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    covariance: Float[ndarray, "7 7"]
+    """In COVARIANCE_ORDER; with its distance from the transform that belongs to the estimated intrinsics."""
+    intrinsics: Intrinsics
+    seen: Seen
+    """With what the given intrinsics place wrongly."""
+    differs_mm: float
+    """How far apart the two pairs place a point at the centre of the image, at the same distance."""
+
+
+Where = Literal["seen", "camera", "scene"]
+"""What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
+
+
 @dataclass(frozen=True)
 class Requirement:
-    """How exact the camera on the gripper must be known, and how exact it is; 95 % of errors are smaller."""
+    """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
 
     translation_mm: float
     rotation_deg: float
     asked: bool
     """By the user; else the default, for grasping."""
     distance_mm: float
-    """Of the point that the translation is of, ahead of the camera; 0: the camera itself."""
+    """From the camera to the point that the translation is of; 0: the camera itself."""
     reached_mm: float
     reached_deg: float
     more_images: int | None = None
     """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
+    at: Where = "camera"
+    """What the millimetres and degrees are of."""
 
     @property
     def is_met(self) -> bool:
@@ -210,6 +261,8 @@ class Estimate:
     """Refined by bundle adjustment; None when poses alone were given."""
     intrinsics_covariance: Float[ndarray, "q q"] | None = None
     """In the order of camera.parameters; None where they were not refined."""
+    intrinsics_cross: Float[ndarray, "7 q"] | None = None
+    """Covariance of COVARIANCE_ORDER (rows) with camera.parameters (columns); None where these were not refined."""
 
     @property
     def intrinsics_std(self) -> Float[ndarray, " q"] | None:
@@ -303,6 +356,10 @@ class HandEye:
     held_out: HeldOut | None = None
     scale_evidence: ScaleEvidence = ScaleEvidence()
     plan: Plan = Plan()
+    in_use: InUse | None = None
+    """How exactly it places points; None where the solver was asked and not the calibration stage."""
+    with_given_intrinsics: WithGivenIntrinsics | None = None
+    """None where no intrinsics were given, or they were not estimated beside that."""
     findings: tuple[Finding, ...] = ()
     """Strongest first; of the same severity causes before consequences."""
     before: "HandEye | None" = None

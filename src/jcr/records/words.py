@@ -66,11 +66,17 @@ def reached_in_words(required: "Requirement") -> str:
 
 
 def _reached(required: Mapping[str, Any]) -> str:
+    # Findings of earlier versions do not say of what: of the camera, or of a point ahead of it.
     far = required["distance_mm"]
-    where = f" {significant(far, 3)} mm ahead of the camera" if far else ""
+    at = required.get("at", "seen" if far else "camera")
     asked = "asked for" if required["asked"] else "needed to grasp"
+    of = {
+        "seen": f"a point seen at {significant(1e-3 * far)} m",
+        "camera": "the camera on the gripper",
+        "scene": "mapped points in the base frame",
+    }
     return (
-        f"95 % of errors are below {significant(required['reached_mm'])} mm{where} and "
+        f"{of[at]}: 95 % of errors are below {significant(required['reached_mm'])} mm and "
         f"{significant(required['reached_deg'])}°; {required['translation_mm']:g} mm and "
         f"{required['rotation_deg']:g}° are {asked}"
     )

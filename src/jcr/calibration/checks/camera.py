@@ -67,15 +67,14 @@ def check_camera(case: Case) -> Checked:
     of_intrinsics = next((one for one in faults if one.kind is Kind.INTRINSICS), None)
     if faults and of_intrinsics is None:
         return Checked(faults)
-    contradiction = intrinsics_contradiction(case)
-    if contradiction is None:
+    checked = intrinsics_contradiction(case)
+    if not checked.findings:
         return Checked(faults)
+    (contradiction,) = checked.findings
     if of_intrinsics is not None:
         contradiction = replace(of_intrinsics, shift=contradiction.shift)
     others = [one for one in faults if one.kind is not Kind.INTRINSICS]
-    # Where the intrinsics are wrong, bundle adjustment bends the robot's poses to them: the fit to camera poses bends
-    # least.
-    return Checked((*others, contradiction), case.hand_eye.before)
+    return replace(checked, findings=(*others, contradiction))
 
 
 @dataclass(frozen=True)

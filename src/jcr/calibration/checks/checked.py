@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from jcr.adjust.robots import Adjusted
 from jcr.records import Finding, HandEye
 
 
@@ -13,3 +14,5 @@ class Checked:
     """Strongest first."""
     hand_eye: HandEye | None = None
     """The calibration with what was measured in it, or the one to keep in place of the present one; None: it stays."""
+    adjusted: Adjusted | None = None
+    """The adjustment that it is made of, where that is another one."""

@@ -1,9 +1,11 @@
 """Are the intrinsics that were given those of the images?
 
-Given intrinsics are held. The images and the robot's motion determine them all the same: freed in the bundle
+Given intrinsics are measurements with a small error. The images and the robot's motion determine them all the same: freed in the bundle
 adjustment, focal length, principal point and two radial coefficients have an estimate and a covariance, in which what
 few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -12,10 +14,12 @@ from numpy import ndarray
 from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import freed_intrinsics
-from jcr.calibration.adjust import adjust_case, estimate_of
+from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
 from jcr.calibration.case import Case
+from jcr.calibration.checks.checked import Checked
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
+from jcr.handeye.solve import judged
 from jcr.records import Estimate, Finding, Intrinsics, Kind, Tracks
 
 SURE = 5.0
@@ -29,20 +33,24 @@ right where it is used with the same."""
 CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 
 
-def intrinsics_contradiction(case: Case) -> Finding | None:
-    """What the used images show against the intrinsics that were given; None where they show nothing.
+def intrinsics_contradiction(case: Case) -> Checked:
+    """What the used images show against the intrinsics that were given; nothing where they agree.
 
     Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
-    intrinsics adjusted until they settle.
+    intrinsics adjusted until they settle. The calibration is then the one with the intrinsics that the images show, which
+    those that were given are no part of; one that was rejected stays, and the finding says by how much they move it.
     """
     held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
     assert case.adjusted is not None
     if case.hand_eye.converged and not _found_off(case.adjusted, held, case.tracks, SURE / 2, 0.5):
-        return None
+        return Checked()
     freed = adjust_case(case, prior=prior_of(held, ESTIMATED))
     found = _found_off(freed, held, case.tracks, SURE, 1.0)
     if not found:
-        return None
+        return Checked()
+    contradicted = Finding(kind=Kind.INTRINSICS, severity="warns", mend="intrinsics", details=found)
+    if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
+        return Checked((contradicted,), refined, freed)
     with_found, as_given = (
         estimate_of(one, case) for one in (freed, adjust_case(case, prior=prior_of(held, HELD)))
     )
@@ -51,13 +59,9 @@ def intrinsics_contradiction(case: Case) -> Finding | None:
         (_shift(start, with_found) for start in (fit.estimate, as_given)),
         key=lambda by: float(np.linalg.norm(by[:6] * [1, 1, 1, ARM, ARM, ARM])),
     )
-    return Finding(
-        kind=Kind.INTRINSICS,
-        severity="warns",
-        mend="intrinsics",
-        shift=tuple(shift.tolist()),
-        details=found,
-    )
+    # Where the intrinsics are wrong, bundle adjustment bends the robot's poses to them: the fit to camera poses bends
+    # least.
+    return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
 
 
 def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:

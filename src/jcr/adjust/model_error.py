@@ -1,0 +1,73 @@
+"""What a camera's model leaves of its distortion: a displacement that is smooth over the image, the same in all images.
+
+A few coefficients do not bend every ray as a cheap lens does. What they leave is common to all images: it does not
+average out, it hardly shows in the pixels' noise, and it moves the intrinsics that are fitted with it. It is a random
+effect here as the systematic errors of the robot are: polynomials over the image, of one size that is estimated with the
+rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9). What the intrinsics can express is taken out
+of them, so that the intrinsics are those that fit the image best.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from numpy.polynomial.legendre import legvander2d
+
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.camera import by_parameters, unproject
+from jcr.records import Intrinsics
+
+DEGREE = 5
+"""Of the polynomials: what a seventh power of the radius leaves beside k1, k2 and k3 has this."""
+TYPICAL = 1e-4
+"""Of the width, per polynomial: the middle of the prior of their size, a weak one."""
+WORTH = 2.0
+"""Polynomials that the typical size counts for, beside those that the images determine."""
+
+
+def displacements(
+    cameras: tuple[Intrinsics, ...],
+    priors: tuple[IntrinsicsPrior, ...],
+    x_px: Float[ndarray, "k 2"],
+    camera: Int[ndarray, " k"],
+) -> Float[ndarray, "k 2 e"]:
+    """Of each observation by each polynomial, in widths of the image; none for a camera whose intrinsics are exact."""
+    blocks = [np.zeros((len(camera), 2, 0))]
+    for c, (intrinsics, prior) in enumerate(zip(cameras, priors, strict=True)):
+        rows = np.flatnonzero(camera == c)
+        if len(prior.std) == 0 or len(rows) <= _polynomials_count():
+            continue
+        by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px[rows])) @ prior.directions
+        block = np.zeros((len(camera), 2, 2 * _polynomials_count()))
+        block[rows] = intrinsics.width * _beside(_polynomials(x_px[rows], intrinsics), by_prior)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=2)
+
+
+def size_of(
+    steps: Float[ndarray, " e"], variance: Float[ndarray, " e"], std: Float[ndarray, " e"]
+) -> Float[ndarray, " e"]:
+    """The size of displacements from where they are and how well that is known, given the size that was assumed."""
+    determined = float((1 - np.minimum(variance / std**2, 1.0)).sum())
+    size = np.sqrt((steps @ steps + WORTH * TYPICAL**2) / (determined + WORTH))
+    return np.full(len(steps), size)
+
+
+def _polynomials_count() -> int:
+    return (DEGREE + 1) * (DEGREE + 2) // 2
+
+
+def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
+    """Of x, then of y: products of Legendre polynomials, up to a total degree, over a square about the image."""
+    u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
+    every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
+    i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
+    kept = every[:, i, j]
+    nothing = np.zeros_like(kept)
+    return np.stack([np.hstack([kept, nothing]), np.hstack([nothing, kept])], axis=1)
+
+
+def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:
+    """Displacements without what others express, over these observations."""
+    flat, basis = by.reshape(-1, by.shape[2]), expressed.reshape(-1, expressed.shape[2])
+    orthonormal = np.linalg.qr(basis)[0]
+    return (flat - orthonormal @ (orthonormal.T @ flat)).reshape(by.shape)

@@ -1,0 +1,80 @@
+"""Where the points of an adjusted scene are in the arm's frame, and how well that is known.
+
+The mixed model of robots.py has eliminated the rigs and the points. What is left unknown of them follows backwards: of
+the rigs given everything else, then of the points given rigs and cameras.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.adjust.elimination import point_blocks
+from jcr.adjust.images import derivatives
+from jcr.adjust.robots import Adjusted, of_poses, rigs_given_cameras
+from jcr.geometry import skew
+from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE
+
+SOME = 300
+"""Points whose uncertainty stands for that of all."""
+
+
+def points_in_base(
+    adjusted: Adjusted, seed: int = 0
+) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 3"]]:
+    """Some of the adjusted points in the frame that the first arm's poses are in, and the covariance (m²) of each."""
+    placed, images = adjusted.most_likely, adjusted.given.evidence
+    count = len(images.scene.points_in_world)
+    some = np.sort(np.random.default_rng(seed).permutation(count)[:SOME])
+    base_from_world, scale = placed.z[0][:3, :3], placed.scale
+    ahead = scale * images.scene.points_in_world[some] @ base_from_world.T
+    by_column, left = _of_points(adjusted, some)
+    by_column = scale * base_from_world @ by_column
+    by_unknown, of_columns = _of_columns(adjusted)
+    j = by_column @ by_unknown
+    j[:, :, SCALE] += ahead[..., None]
+    j[:, :, BASE_TRANSLATION] += np.eye(3)
+    j[:, :, BASE_ROTATION] -= skew(ahead)
+    covariance = j @ adjusted.covariance @ np.swapaxes(j, 1, 2)
+    covariance += by_column @ of_columns @ np.swapaxes(by_column, 1, 2)
+    covariance += scale**2 * base_from_world @ left @ base_from_world.T
+    return ahead + placed.z[0][:3, 3], covariance
+
+
+def _of_points(
+    adjusted: Adjusted, some: Int[ndarray, " n"]
+) -> tuple[Float[ndarray, "n 3 d"], Float[ndarray, "n 3 3"]]:
+    """How points move with the columns of the images' evidence, and their covariance where these stand still."""
+    images = adjusted.given.evidence
+    problem = images.problem
+    observations = problem.observations
+    rows = np.flatnonzero(np.isin(observations.point, some))
+    point = np.searchsorted(some, observations.point[rows])
+    weight = images.noise.weights(images.view.residual_px, images.view.depth, problem.layout.camera)
+    by = derivatives(images.scene, images.view, problem, weight)
+    by_point = by.by_point[rows]
+    starts = np.flatnonzero(np.diff(point, prepend=-1))
+    blocks = point_blocks(by_point, starts)
+    first = problem.freedom.first_rig
+    columns = np.zeros((len(rows), 2, len(images.gradient)))
+    columns[:, :, :first] = by.shared[rows]
+    rig = observations.rig[observations.image[rows]]
+    own = first + 6 * rig[:, None] + np.arange(6)
+    columns[np.arange(len(rows))[:, None, None], np.arange(2)[:, None], own[:, None]] = by.own[rows]
+    coupling = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ columns, starts)
+    return -np.linalg.solve(blocks, coupling), np.linalg.inv(blocks)
+
+
+def _of_columns(adjusted: Adjusted) -> tuple[Float[ndarray, "d p"], Float[ndarray, "d d"]]:
+    """How the columns of the images' evidence step with the unknowns of the mixed model, and their covariance where
+    these stand still: of rigs, what the reported poses and the images leave."""
+    given, equations = adjusted.given, adjusted.equations
+    rigs, (_, _, by_rig, _) = rigs_given_cameras(given), of_poses(adjusted.most_likely, given.arms)
+    gain = np.linalg.solve(equations.covariance(adjusted.log_sizes), by_rig @ rigs.covariance).T
+    robots, columns = adjusted.first_camera_column, len(given.evidence.gradient)
+    by_unknown = np.zeros((columns, len(adjusted.covariance)))
+    by_unknown[given.free, robots + np.arange(len(given.free))] = 1.0
+    by_unknown[given.by_arm] = -gain @ equations.jacobian
+    by_unknown[given.by_arm, robots:] -= rigs.follow
+    left = np.zeros((columns, columns))
+    left[np.ix_(given.by_arm, given.by_arm)] = rigs.covariance - gain @ by_rig @ rigs.covariance
+    return by_unknown, left

@@ -1,0 +1,213 @@
+"""How well a point that the camera sees is placed: what a calibration is used for.
+
+A pixel x at a distance d is the point p = d·u(K, x) in the camera, u being the unit ray, and X·p in the gripper. Its error
+comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale; the three were
+estimated together, and a principal point that is off by what a rotation of the camera makes good harms nobody who uses
+both. Each alone says too much, therefore; this is their joint covariance, carried to the point (projection uncertainty,
+as mrcal has it for a camera by itself: Kogan, "mrcal", documentation, "Projection uncertainty").
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.stats import chi2
+
+from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
+from jcr.geometry import retract, skew
+from jcr.records import Estimate, HandEye, InUse, Intrinsics, Seen, WithGivenIntrinsics
+
+Pixels = Float[ndarray, "*points 2"]
+Distances = Float[ndarray, "*#points"] | float
+Covariances = Float[ndarray, "*points 3 3"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the camera sees, as far as the accuracy in use depends on it."""
+
+    distance_m: float
+    """Median distance from the camera."""
+    within_95_m: float | None = None
+    """Distance that 95 % of the errors of its points in the base frame stay below, the median point; None: not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenInBase:
+    """Covariances (m²) of the place of points in the robot's base frame, along its axes, by what they come from."""
+
+    calibration: Covariances
+    """Intrinsics, X and scale together: common to all points that are seen from one gripper pose."""
+    robot_random: Covariances
+    """The random error of the gripper pose from which the points are seen."""
+    robot_systematic: Covariances
+    """Its systematic error, beside what the effective X has taken up; of poses in the region of the capture."""
+
+    @property
+    def together(self) -> Covariances:
+        """Of the place as a whole."""
+        return self.calibration + self.robot_random + self.robot_systematic
+
+
+def seen_uncertainty(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+) -> Covariances:
+    """Covariance (m²), in camera axes, of where on the gripper a point is that is seen at a pixel at a distance.
+
+    `intrinsics` are those that belong to the estimate, `x_px` (...,2) pixels of the distorted image, `distance_m` (...) is
+    along the ray, in the metres of the reconstruction. The robot's pose errors are not in it.
+    """
+    by = _derivatives(estimate, intrinsics, x_px, distance_m)
+    return by @ joint_covariance(estimate) @ np.swapaxes(by, -1, -2)
+
+
+def seen_in_base(
+    hand_eye: HandEye,
+    intrinsics: Intrinsics,
+    x_px: Pixels,
+    distance_m: Distances,
+    base_from_gripper: Float[ndarray, "4 4"],
+) -> SeenInBase:
+    """The same in the base frame, seen from a reported gripper pose, whose errors stand beside those of the calibration."""
+    x = hand_eye.gripper_from_camera
+    p_in_gripper = _in_camera(intrinsics, x_px, distance_m) @ x[:3, :3].T + x[:3, 3]
+    base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
+    in_camera = seen_uncertainty(hand_eye.estimate, intrinsics, x_px, distance_m)
+    noise = hand_eye.robot_noise
+    lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
+    square = lever @ np.swapaxes(lever, -1, -2)
+    random, systematic = (
+        metres**2 * np.eye(3) + radians**2 * square
+        for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left)
+    )
+    return SeenInBase(
+        calibration=base_from_camera_axes @ in_camera @ base_from_camera_axes.T,
+        robot_random=random,
+        robot_systematic=systematic,
+    )
+
+
+def seen(estimate: Estimate, intrinsics: Intrinsics, x_px: Float[ndarray, "2"], distance_m: float) -> Seen:
+    """What 95 % of the errors of a point seen there are below: across the ray, along it, and in direction."""
+    by = _derivatives(estimate, intrinsics, x_px, distance_m)
+    ray = unproject(intrinsics, x_px)
+    # Two directions across the ray, and the ray: rows.
+    axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
+    joint = joint_covariance(estimate)
+    moved = axes @ by @ joint @ by.T @ axes.T
+    # Of the direction, what moves the camera as a whole is left out; the rotation about the ray stands beside.
+    by_direction = axes @ by
+    by_direction[:, :3] = 0.0
+    by_direction /= distance_m
+    by_direction[2] = 0.0
+    by_direction[2, 3:6] = axes[2] @ estimate.gripper_from_camera[:3, :3].T
+    rotated = by_direction @ joint @ by_direction.T
+    return Seen(
+        distance_mm=1e3 * distance_m,
+        within_95_mm=1e3 * within_95(moved),
+        lateral_95_mm=1e3 * within_95(moved[:2, :2]),
+        along_95_mm=1e3 * within_95(moved[2:, 2:]),
+        ray_95_deg=float(np.degrees(within_95(rotated[:2, :2]))),
+        rotation_95_deg=float(np.degrees(within_95(rotated))),
+    )
+
+
+def in_use(estimate: Estimate, scene: Scene) -> InUse:
+    """How exact an estimate is where it is used: at the centre and the worst corner of the image, and in the scene.
+
+    Of camera poses that were given there are no intrinsics: the ray along the optical axis is then exact.
+    """
+    camera, distance = estimate.intrinsics, scene.distance_m
+    if camera is None:
+        at_centre = seen(estimate, NORMALIZED, np.zeros(2), distance)
+        return InUse(seen=at_centre, corners=at_centre)
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    corners = [np.array([u, v]) for u in (0.0, right) for v in (0.0, bottom)]
+    return InUse(
+        seen=seen(estimate, camera, np.array([right, bottom]) / 2, distance),
+        corners=max(
+            (seen(estimate, camera, corner, distance) for corner in corners), key=lambda one: one.within_95_mm
+        ),
+        scene_95_mm=None if scene.within_95_m is None else 1e3 * scene.within_95_m,
+    )
+
+
+def with_given_intrinsics(
+    estimate: Estimate, given: Intrinsics, distance_m: float
+) -> WithGivenIntrinsics | None:
+    """The pair with intrinsics that were given beside the estimated one, compared at the centre of the image.
+
+    The transform is the mean of the joint distribution where the intrinsics are `given`, of the same model. What such a
+    pair places elsewhere than the estimated one counts as uncertainty. None where nothing was estimated.
+    """
+    camera, cross = estimate.intrinsics, estimate.intrinsics_cross
+    if camera is None or cross is None or estimate.intrinsics_covariance is None:
+        return None
+    off = parameters(given) - parameters(camera)
+    step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
+    pair = replace(
+        estimate,
+        covariance=estimate.covariance + np.outer(step, step),
+        intrinsics_cross=cross + np.outer(step, off),
+        intrinsics_covariance=estimate.intrinsics_covariance + np.outer(off, off),
+    )
+    x_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
+    apart = _derivatives(estimate, camera, x_px, distance_m) @ np.r_[step, off]
+    return WithGivenIntrinsics(
+        gripper_from_camera=retract(estimate.gripper_from_camera, step[:6]),
+        covariance=pair.covariance,
+        intrinsics=given,
+        seen=seen(pair, camera, x_px, distance_m),
+        differs_mm=1e3 * float(np.linalg.norm(apart)),
+    )
+
+
+def joint_covariance(estimate: Estimate) -> Float[ndarray, "j j"]:
+    """Of COVARIANCE_ORDER and the parameters of the intrinsics; of X and scale alone where no intrinsics were estimated."""
+    if estimate.intrinsics_covariance is None or estimate.intrinsics_cross is None:
+        return estimate.covariance
+    cross = estimate.intrinsics_cross
+    return np.block([[estimate.covariance, cross], [cross.T, estimate.intrinsics_covariance]])
+
+
+def within_95(covariance: Float[ndarray, "n n"]) -> float:
+    """The length that 95 % of normal errors of this covariance stay below, to 1 % (Imhof 1961, Pearson's moments)."""
+    spread = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    mean, second, third = (float((spread**power).sum()) for power in (1, 2, 3))
+    if third <= 0:
+        return 0.0
+    freedom = second**3 / third**2
+    return float(np.sqrt(mean + (chi2.ppf(0.95, freedom) - freedom) * np.sqrt(second / freedom)))
+
+
+def _in_camera(intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances) -> Float[ndarray, "*points 3"]:
+    ray = unproject(intrinsics, np.asarray(x_px, float))
+    return np.asarray(distance_m)[..., None] * ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+
+
+def _derivatives(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+) -> Float[ndarray, "*points 3 j"]:
+    """Of the point on the gripper, in camera axes, by what `joint_covariance` is of."""
+    camera_from_gripper_axes = estimate.gripper_from_camera[:3, :3].T
+    p = _in_camera(intrinsics, x_px, distance_m)
+    by_x = np.concatenate(
+        [
+            np.broadcast_to(camera_from_gripper_axes, (*p.shape, 3)),
+            -skew(p) @ camera_from_gripper_axes,
+            p[..., None],
+        ],
+        axis=-1,
+    )
+    if estimate.intrinsics_cross is None:
+        return by_x
+    ray = unproject(intrinsics, np.asarray(x_px, float))
+    length = np.linalg.norm(ray, axis=-1)[..., None, None]
+    unit = ray / length[..., 0]
+    # The pixel stays: what the parameters add to the projection, the ray takes back.
+    of_ray = np.zeros((*p.shape[:-1], 3, len(estimate.intrinsics_cross.T)))
+    of_ray[..., :2, :] = -np.linalg.solve(by_point(intrinsics, ray)[..., :2], by_parameters(intrinsics, ray))
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    by_intrinsics = np.asarray(distance_m)[..., None, None] * across @ of_ray / length
+    return np.concatenate([by_x, by_intrinsics], axis=-1)
