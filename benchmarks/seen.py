@@ -28,7 +28,9 @@ POINTS, PIXEL_STD = 400, 0.3
 DISTANCE_M = 0.45
 OFF = 0.005
 """Of a given focal length, relative; its principal point is 3 px off."""
-BENT = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (0.9, 0.3, 1e-3, -5e-4, 0.05, 1.05, 0.45, 0.02), "rational")
+BENT = Intrinsics(
+    620.0, 618.0, 322.0, 236.0, 640, 480, (0.9, 0.3, 1e-3, -5e-4, 0.05, 1.05, 0.45, 0.02), "rational"
+)
 """A camera whose distortion five coefficients do not describe, as cheap ones have it."""
 
 
@@ -50,7 +52,8 @@ def _off(rng: np.random.Generator) -> Intrinsics:
 
 
 def _found(rng: np.random.Generator) -> Intrinsics:
-    """As a reconstruction without given intrinsics begins with them: no tangential distortion, the centre the image's."""
+    """As a reconstruction without given intrinsics begins with them: no tangential distortion, the centre the
+    image's."""
     focal = 619.0 * (1 + 0.01 * rng.normal())
     return Intrinsics(focal, focal, 319.5, 239.5, 640, 480)
 
@@ -59,7 +62,9 @@ WAYS = (
     Knowledge("given", lambda rng: LENS, prior_of),
     Knowledge("given, 0.5 % and 3 px off", _off, prior_of),
     Knowledge("not given", _found, lambda found: prior_of(found, ESTIMATED)),
-    Knowledge("not given, more distortion than the model", _found, lambda found: prior_of(found, ESTIMATED), BENT),
+    Knowledge(
+        "not given, more distortion than the model", _found, lambda found: prior_of(found, ESTIMATED), BENT
+    ),
 )
 
 
@@ -90,9 +95,7 @@ def measure(
     draws: int = DRAWS,
 ) -> list[Row]:
     """A row per robot, number of images and knowledge of the intrinsics."""
-    return [
-        _row(preset, count, known, draws) for preset in presets for count in counts for known in ways
-    ]
+    return [_row(preset, count, known, draws) for preset in presets for count in counts for known in ways]
 
 
 def run(long: bool = False) -> str:

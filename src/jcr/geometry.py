@@ -61,6 +61,12 @@ def skew(v: Vectors) -> Rotations:
     return out - np.swapaxes(out, -1, -2)
 
 
+def by_similarity(v: Vectors) -> Float[ndarray, "*batch 3 7"]:
+    """How points v from an origin move with a step (v, w) of it and the logarithm of a scale about it."""
+    identity = np.broadcast_to(np.eye(3), (*v.shape, 3))
+    return np.concatenate([identity, -skew(v), v[..., None]], axis=-1)
+
+
 def transform(
     rotation: Float[ndarray, "*#batch 3 3"], translation: Float[ndarray, "*#batch 3"]
 ) -> Float[ndarray, "... 4 4"]:

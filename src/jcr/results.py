@@ -24,6 +24,7 @@ from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
 if TYPE_CHECKING:
+    from jcr.calibration.seen import SeenInBase
     from jcr.represent.scene import SceneMap
 
 
@@ -126,6 +127,30 @@ class RunResult:
     def covariance(self) -> Float[ndarray, "7 7"]:
         """In records.COVARIANCE_ORDER."""
         return self.hand_eye.covariance
+
+    def seen_uncertainty(
+        self, x_px: Float[ndarray, "*points 2"], distance_m: Float[ndarray, "*points"] | float
+    ) -> Float[ndarray, "*points 3 3"]:
+        """Covariance (m², camera axes) of where on the gripper points are that are seen at pixels at distances.
+
+        `x_px` (...,2) are pixels of the distorted image, `distance_m` is along the ray. It is that of `lens`,
+        `gripper_from_camera` and the scale together; the robot's pose errors are not in it.
+        """
+        from jcr.calibration.seen import seen_uncertainty
+
+        return seen_uncertainty(self.hand_eye.estimate, self.lens, np.asarray(x_px, float), distance_m)
+
+    def seen_in_base(
+        self,
+        x_px: Float[ndarray, "*points 2"],
+        distance_m: Float[ndarray, "*points"] | float,
+        base_from_gripper: Float[ndarray, "4 4"],
+    ) -> "SeenInBase":
+        """The same in the base frame for a reported gripper pose, with the errors of that pose beside it."""
+        from jcr.calibration.seen import seen_in_base
+
+        x_px = np.asarray(x_px, float)
+        return seen_in_base(self.hand_eye, self.lens, x_px, distance_m, np.asarray(base_from_gripper, float))
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""

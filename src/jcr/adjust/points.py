@@ -4,6 +4,8 @@ The mixed model of robots.py has eliminated the rigs and the points. What is lef
 the rigs given everything else, then of the points given rigs and cameras.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
@@ -11,33 +13,46 @@ from numpy import ndarray
 from jcr.adjust.elimination import point_blocks
 from jcr.adjust.images import derivatives
 from jcr.adjust.robots import Adjusted, of_poses, rigs_given_cameras
-from jcr.geometry import skew
+from jcr.geometry import by_similarity
 from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE
 
 SOME = 300
 """Points whose uncertainty stands for that of all."""
 
 
-def points_in_base(
-    adjusted: Adjusted, seed: int = 0
-) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p 3 3"]]:
-    """Some of the adjusted points in the frame that the first arm's poses are in, and the covariance (m²) of each."""
+@dataclass(frozen=True)
+class PointsPlaced:
+    """Some points in the frame that the first arm's poses are in, and how they err there (m²)."""
+
+    in_base: Float[ndarray, "p 3"]
+    together: Float[ndarray, "p 3 p 3"]
+    """Covariance that rigs, cameras and arms give them, which they share."""
+    own: Float[ndarray, "p 3 3"]
+    """Of the triangulation of each by itself."""
+
+
+def points_in_base(adjusted: Adjusted, seed: int = 0) -> PointsPlaced:
+    """Some of the adjusted points."""
     placed, images = adjusted.most_likely, adjusted.given.evidence
     count = len(images.scene.points_in_world)
     some = np.sort(np.random.default_rng(seed).permutation(count)[:SOME])
     base_from_world, scale = placed.z[0][:3, :3], placed.scale
     ahead = scale * images.scene.points_in_world[some] @ base_from_world.T
-    by_column, left = _of_points(adjusted, some)
+    by_column, own = _of_points(adjusted, some)
     by_column = scale * base_from_world @ by_column
     by_unknown, of_columns = _of_columns(adjusted)
     j = by_column @ by_unknown
-    j[:, :, SCALE] += ahead[..., None]
-    j[:, :, BASE_TRANSLATION] += np.eye(3)
-    j[:, :, BASE_ROTATION] -= skew(ahead)
-    covariance = j @ adjusted.covariance @ np.swapaxes(j, 1, 2)
-    covariance += by_column @ of_columns @ np.swapaxes(by_column, 1, 2)
-    covariance += scale**2 * base_from_world @ left @ base_from_world.T
-    return ahead + placed.z[0][:3, 3], covariance
+    of_frame = by_similarity(ahead)
+    j[:, :, BASE_TRANSLATION] += of_frame[:, :, :3]
+    j[:, :, BASE_ROTATION] += of_frame[:, :, 3:6]
+    j[:, :, SCALE] += of_frame[:, :, 6:]
+    j, by_column = j.reshape(3 * len(some), -1), by_column.reshape(3 * len(some), -1)
+    together = j @ adjusted.covariance @ j.T + by_column @ of_columns @ by_column.T
+    return PointsPlaced(
+        ahead + placed.z[0][:3, 3],
+        together.reshape(len(some), 3, len(some), 3),
+        scale**2 * base_from_world @ own @ base_from_world.T,
+    )
 
 
 def _of_points(

@@ -8,15 +8,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from jcr.arrays_json import Matrix, Numbers7, Part, Spread
+from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
 from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.calibration.requirement import not_exact_enough
-from jcr.calibration.uncertainty_json import Uncertainty, mm_and_deg
+from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
 from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError, NotTrustedError
 from jcr.files import write_text
-from jcr.intrinsics_json import IntrinsicsAndStd, Positive
+from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
     AngleRatio,
     Attempt,
@@ -36,6 +36,7 @@ from jcr.records import (
     RobotNoise,
     ScaleCheck,
     Verdict,
+    WithGivenIntrinsics,
     no_reconstruction,
     strongest_first,
 )
@@ -96,6 +97,31 @@ class RobotErrors(Part):
         )
 
 
+class GivenIntrinsicsKept(Part):
+    """The transform for who keeps the intrinsics that were given, and how exact that pair is."""
+
+    gripper_from_camera: Matrix
+    covariance: Covariance7
+    """In the order of `uncertainty`."""
+    intrinsics: IntrinsicsJson
+    seen: SeenJson
+    differs_mm: Spread
+    """From where the estimated intrinsics and their transform place a point at the centre of the image."""
+
+    @classmethod
+    def of(cls, found: WithGivenIntrinsics | None) -> "GivenIntrinsicsKept | None":
+        """That of a calibration."""
+        if found is None:
+            return None
+        return cls(
+            gripper_from_camera=found.gripper_from_camera.tolist(),
+            covariance=found.covariance.tolist(),
+            intrinsics=IntrinsicsJson.model_validate(vars(found.intrinsics)),
+            seen=SeenJson(**vars(found.seen)),
+            differs_mm=found.differs_mm,
+        )
+
+
 class Proposal(Part):
     """A gripper pose worth adding, and what would then be known."""
 
@@ -143,6 +169,8 @@ class CalibrationFile(Part):
     mount: Mount = "gripper"
     """base: the camera is fixed and watches what the gripper carries; gripper_from_camera and base_from_recon are then
     null, and uncertainty is that of base_from_camera, along axes of the base."""
+    with_given_intrinsics: GivenIntrinsicsKept | None = None
+    """`gripper_from_camera` belongs to `intrinsics`; this belongs to those that were given. Null where none were."""
     base_from_camera: Matrix | None = None
     gripper_from_object: Matrix | None = None
     """Of the frame of the reconstruction, scaled to metres: what the gripper carried."""
@@ -250,6 +278,7 @@ def calibration_file(
         depth_check=hand_eye.scale_evidence.depth,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
+        with_given_intrinsics=GivenIntrinsicsKept.of(hand_eye.with_given_intrinsics),
     )
 
 

@@ -12,7 +12,7 @@ from jcr.adjust.points import points_in_base
 from jcr.adjust.robots import Adjusted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
-from jcr.calibration.seen import Scene, within_95
+from jcr.calibration.seen import Scene, scene_uncertainty
 from jcr.handeye.fit import Cues
 from jcr.records import Capture, HandEye, Reconstruction, Tracks
 
@@ -89,9 +89,8 @@ class Case:
         """What the camera sees, and how well its points are known; None where the images were not adjusted."""
         if self.adjusted is None or self.hand_eye.before is None:
             return None
-        _, covariance = points_in_base(self.adjusted)
         distance = float(np.median(self.adjusted.given.evidence.view.depth)) * self.adjusted.placed.scale
-        return Scene(distance, float(np.median([within_95(one) for one in covariance])))
+        return Scene(distance, scene_uncertainty(points_in_base(self.adjusted)))
 
     @property
     def is_adjustable(self) -> bool:

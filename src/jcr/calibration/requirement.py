@@ -94,8 +94,9 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
     else:
         distance_mm, reached_mm, reached_deg = seen.distance_mm, seen.within_95_mm, seen.rotation_95_deg
     # Of camera poses that were given there is no scene but the point ahead.
-    if at == "scene" and found.scene_95_mm is not None:
-        reached_mm = found.scene_95_mm
+    if at == "scene" and found.scene is not None:
+        reached_mm = 1e3 * found.scene.within_95_m
+        reached_deg = float(np.degrees(within_95(found.scene.covariance[3:6, 3:6])))
     asked = options.require is not None
     return Requirement(*(options.require or GRASPING), asked, distance_mm, reached_mm, reached_deg, at=at)
 

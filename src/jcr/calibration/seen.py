@@ -1,10 +1,10 @@
 """How well a point that the camera sees is placed: what a calibration is used for.
 
-A pixel x at a distance d is the point p = d·u(K, x) in the camera, u being the unit ray, and X·p in the gripper. Its error
-comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale; the three were
-estimated together, and a principal point that is off by what a rotation of the camera makes good harms nobody who uses
-both. Each alone says too much, therefore; this is their joint covariance, carried to the point (projection uncertainty,
-as mrcal has it for a camera by itself: Kogan, "mrcal", documentation, "Projection uncertainty").
+A pixel x at a distance d is the point p = d·u(K, x) in the camera, u being the unit ray, and X·p in the gripper. Its
+error comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale; the
+three were estimated together, and a principal point that is off by what a rotation of the camera makes good harms
+nobody who uses both. Each alone says too much, therefore; this is their joint covariance, carried to the point
+(projection uncertainty, as mrcal has it for a camera by itself: Kogan, "mrcal", documentation, "Projection uncertainty").
 """
 
 from dataclasses import dataclass, replace
@@ -14,9 +14,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
+from jcr.adjust.points import PointsPlaced
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
-from jcr.geometry import retract, skew
-from jcr.records import Estimate, HandEye, InUse, Intrinsics, Seen, WithGivenIntrinsics
+from jcr.geometry import by_similarity, retract, skew
+from jcr.records import Estimate, HandEye, Intrinsics, InUse, SceneUncertainty, Seen, WithGivenIntrinsics
 
 Pixels = Float[ndarray, "*points 2"]
 Distances = Float[ndarray, "*#points"] | float
@@ -29,8 +30,7 @@ class Scene:
 
     distance_m: float
     """Median distance from the camera."""
-    within_95_m: float | None = None
-    """Distance that 95 % of the errors of its points in the base frame stay below, the median point; None: not known."""
+    uncertainty: SceneUncertainty | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +55,8 @@ def seen_uncertainty(
 ) -> Covariances:
     """Covariance (m²), in camera axes, of where on the gripper a point is that is seen at a pixel at a distance.
 
-    `intrinsics` are those that belong to the estimate, `x_px` (...,2) pixels of the distorted image, `distance_m` (...) is
-    along the ray, in the metres of the reconstruction. The robot's pose errors are not in it.
+    `intrinsics` are those that belong to the estimate, `x_px` (...,2) pixels of the distorted image, `distance_m` (...)
+    is along the ray, in the metres of the reconstruction. The robot's pose errors are not in it.
     """
     by = _derivatives(estimate, intrinsics, x_px, distance_m)
     return by @ joint_covariance(estimate) @ np.swapaxes(by, -1, -2)
@@ -69,7 +69,8 @@ def seen_in_base(
     distance_m: Distances,
     base_from_gripper: Float[ndarray, "4 4"],
 ) -> SeenInBase:
-    """The same in the base frame, seen from a reported gripper pose, whose errors stand beside those of the calibration."""
+    """The same in the base frame, seen from a reported gripper pose, whose errors stand beside those of the
+    calibration."""
     x = hand_eye.gripper_from_camera
     p_in_gripper = _in_camera(intrinsics, x_px, distance_m) @ x[:3, :3].T + x[:3, 3]
     base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
@@ -129,7 +130,7 @@ def in_use(estimate: Estimate, scene: Scene) -> InUse:
         corners=max(
             (seen(estimate, camera, corner, distance) for corner in corners), key=lambda one: one.within_95_mm
         ),
-        scene_95_mm=None if scene.within_95_m is None else 1e3 * scene.within_95_m,
+        scene=scene.uncertainty,
     )
 
 
@@ -163,8 +164,26 @@ def with_given_intrinsics(
     )
 
 
+def scene_uncertainty(points: PointsPlaced) -> SceneUncertainty:
+    """Of a scene by some of its points: how it moves as a whole, and what is left of their errors."""
+    middle, count = np.median(points.in_base, axis=0), len(points.in_base)
+    by = by_similarity(points.in_base - middle).reshape(3 * count, 7)
+    together = points.together.reshape(3 * count, 3 * count)
+    fit = np.linalg.pinv(by)
+    as_whole = fit @ together @ fit.T
+    left = np.trace(together) - 2 * np.sum((fit @ together) * by.T) + np.sum((as_whole @ by.T) * by.T)
+    each = points.together[np.arange(count), :, np.arange(count)] + points.own
+    return SceneUncertainty(
+        middle_in_base=middle,
+        covariance=as_whole,
+        shape_m=float(np.sqrt(max(left, 0.0) / (3 * count))),
+        within_95_m=float(np.median([within_95(one) for one in each])),
+    )
+
+
 def joint_covariance(estimate: Estimate) -> Float[ndarray, "j j"]:
-    """Of COVARIANCE_ORDER and the parameters of the intrinsics; of X and scale alone where no intrinsics were estimated."""
+    """Of COVARIANCE_ORDER and the parameters of the intrinsics; of X and scale alone where no intrinsics were
+    estimated."""
     if estimate.intrinsics_covariance is None or estimate.intrinsics_cross is None:
         return estimate.covariance
     cross = estimate.intrinsics_cross
@@ -192,14 +211,9 @@ def _derivatives(
     """Of the point on the gripper, in camera axes, by what `joint_covariance` is of."""
     camera_from_gripper_axes = estimate.gripper_from_camera[:3, :3].T
     p = _in_camera(intrinsics, x_px, distance_m)
-    by_x = np.concatenate(
-        [
-            np.broadcast_to(camera_from_gripper_axes, (*p.shape, 3)),
-            -skew(p) @ camera_from_gripper_axes,
-            p[..., None],
-        ],
-        axis=-1,
-    )
+    by_x = by_similarity(p)
+    by_x[..., :3] = camera_from_gripper_axes
+    by_x[..., 3:6] = by_x[..., 3:6] @ camera_from_gripper_axes
     if estimate.intrinsics_cross is None:
         return by_x
     ray = unproject(intrinsics, np.asarray(x_px, float))

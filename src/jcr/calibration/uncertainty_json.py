@@ -133,6 +133,6 @@ class Uncertainty(Part):
             worst=worst_direction(estimate),
             budget=UncertaintyBudget.of(estimate.budget),
             seen=None if in_use is None else SeenAndCorners.of(in_use),
-            scene_95_mm=None if in_use is None else in_use.scene_95_mm,
+            scene_95_mm=None if in_use is None or in_use.scene is None else 1e3 * in_use.scene.within_95_m,
             joint=Joint.of(estimate),
         )

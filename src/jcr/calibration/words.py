@@ -9,8 +9,8 @@ from jcr.records.words import network_scale, reached_in_words
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile
-    from jcr.calibration.uncertainty_json import UncertaintyBudget
+    from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
+    from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
 
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
@@ -58,6 +58,10 @@ def found(content: "CalibrationFile") -> list[str]:
         *([] if content.requirement is None else [f"  {reached_in_words(content.requirement)}"]),
         f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
+    if (seen := uncertainty.seen) is not None and uncertainty.joint is not None:
+        lines.insert(-2, f"  {seen_in_words(seen)}")
+    if content.with_given_intrinsics is not None:
+        lines.append(f"  {given_in_words(content.with_given_intrinsics)}")
     if uncertainty.budget is not None:
         parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
         lines.insert(-1, f"  from: {parts}")
@@ -68,6 +72,24 @@ def found(content: "CalibrationFile") -> list[str]:
     if (held_out := content.held_out) is not None:
         lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
     return lines
+
+
+def seen_in_words(seen: "SeenAndCorners") -> str:
+    """How exactly a point that the camera sees is placed, and what that is made of."""
+    return (
+        f"a point seen at {significant(1e-3 * seen.distance_mm)} m is placed within "
+        f"{significant(seen.within_95_mm)} mm in the robot's base frame (95 %; {significant(seen.lateral_95_mm)} mm "
+        f"across the ray, {significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a "
+        "corner of the image), with the intrinsics of this run and exact gripper poses"
+    )
+
+
+def given_in_words(given: "GivenIntrinsicsKept") -> str:
+    """How far the given intrinsics lead from the estimated ones where it matters."""
+    return (
+        f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
+        f"{significant(given.differs_mm)} mm from there, and within {significant(given.seen.within_95_mm)} mm"
+    )
 
 
 def worst_direction(estimate: Estimate) -> str:

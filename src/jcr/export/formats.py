@@ -18,7 +18,7 @@ from jcr.geometry import transform
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
     from jcr.cell.cameras_json import CameraPlaced
     from jcr.export.views import PosedImages
     from jcr.records import Capture, Intrinsics, PointCloud, Reconstruction
@@ -102,16 +102,14 @@ class Run:
         if options.camera is not None:
             mount = self._mount_of(self._camera(options.camera), options.child_frame)
         else:
-            uncertainty = self.calibration.uncertainty
-            assert uncertainty is not None  # wherever there is a transform
             fixed = self.calibration.mount == "base"
             mount = ros.camera_mount(
-                np.array(self.calibration.parent_from_camera),
-                np.array(uncertainty.covariance),
+                *self._transform,
                 options.base_frame if fixed else options.parent_frame,
                 options.child_frame,
                 options.base_frame,
                 self.doubt,
+                None if self.calibration.intrinsics is None else self.lens,
             )
         if options.to_root is None:
             return mount
@@ -125,6 +123,28 @@ class Run:
             )
         rotation = Rotation.from_quat(quat_xyzw).as_matrix()
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
+
+    @property
+    def _transform(self) -> tuple[np.ndarray, np.ndarray]:
+        """parent_from_camera and its covariance, of the intrinsics that were chosen."""
+        if (kept := self._kept) is not None:
+            return np.array(kept.gripper_from_camera), np.array(kept.covariance)
+        uncertainty = self.calibration.uncertainty
+        assert uncertainty is not None  # wherever there is a transform
+        return np.array(self.calibration.parent_from_camera), np.array(uncertainty.covariance)
+
+    @property
+    def _kept(self) -> "GivenIntrinsicsKept | None":
+        """The pair of the intrinsics that were given; None where the estimated ones are used."""
+        if self.options.intrinsics == "estimated" or self.options.camera is not None:
+            return None
+        kept = self.calibration.with_given_intrinsics
+        if kept is None:
+            raise InputError(
+                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave none, or "
+                "they were not estimated beside them; leave it out"
+            )
+        return kept
 
     @property
     def others(self) -> list[ros.CameraMount]:
@@ -171,12 +191,13 @@ class Run:
             child,
             options.base_frame,
             camera.doubt,
+            None if camera.intrinsics is None else camera.intrinsics.record(),
         )
 
     @property
     def lens(self) -> "Intrinsics":
-        """As calibrated."""
-        lens = self.calibration.intrinsics
+        """As estimated, or as given where these are asked for."""
+        lens = self.calibration.intrinsics if self._kept is None else self._kept.intrinsics
         if self.options.camera is not None:
             lens = self._camera(self.options.camera).intrinsics
         if lens is None:

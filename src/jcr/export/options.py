@@ -32,6 +32,9 @@ class ExportOptions:
     ] = None
     """Pose of the optical frame in that link: x y z (m) qx qy qz qw, as `ros2 run tf2_ros tf2_echo LINK OPTICAL`
     prints it; by default the same origin, with axes as in REP-103."""
+    intrinsics: Literal["estimated", "given"] = "estimated"
+    """Which intrinsics the camera is used with: those that the run estimated, or those that the capture gave; each has
+    a transform of its own, and files name the pair."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Voxel size (m) for octomap and esdf; by default the map's cell."""
     unknown: Literal["occupied", "free"] | None = None

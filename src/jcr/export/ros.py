@@ -5,7 +5,7 @@ Every text names its frames and units, and says so where the calibration is reje
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,8 @@ class CameraMount:
     """The robot's base, for the formats that ask for it."""
     doubt: str | None = None
     """Why the calibration is rejected; None when it is."""
+    intrinsics: Intrinsics | None = None
+    """Those that the transform belongs to: with others it places points elsewhere. None where they are not known."""
 
 
 def camera_mount(
@@ -51,6 +53,7 @@ def camera_mount(
     child: str = CHILD,
     base: str = BASE,
     doubt: str | None = None,
+    intrinsics: Intrinsics | None = None,
 ) -> CameraMount:
     """The optical frame on the gripper; `covariance` is in `jcr.records.COVARIANCE_ORDER`.
 
@@ -60,7 +63,7 @@ def camera_mount(
         require_frame_name(name)
     if parent == child:
         raise InputError(f"parent and child frame are both {parent!r}; name two different frames")
-    return CameraMount(parent, child, gripper_from_camera, covariance[:6, :6], base, doubt)
+    return CameraMount(parent, child, gripper_from_camera, covariance[:6, :6], base, doubt, intrinsics)
 
 
 def on_root(
@@ -78,13 +81,11 @@ def on_root(
     q = mount.parent_from_child[:3, :3] @ optical_from_root[:3, 3]
     jacobian = np.eye(6)
     jacobian[:3, 3:] = -skew(q)
-    return CameraMount(
-        mount.parent,
-        root,
-        mount.parent_from_child @ optical_from_root,
-        jacobian @ mount.covariance @ jacobian.T,
-        mount.base,
-        mount.doubt,
+    return replace(
+        mount,
+        child=root,
+        parent_from_child=mount.parent_from_child @ optical_from_root,
+        covariance=jacobian @ mount.covariance @ jacobian.T,
     )
 
 
@@ -263,8 +264,17 @@ def camera_info(mount: CameraMount, lens: Intrinsics) -> str:
 
 def notes(mount: CameraMount) -> list[str]:
     """What every file says of itself."""
-    about = f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"
-    return [about] if mount.doubt is None else [about, f"REJECTED: {mount.doubt}"]
+    lines = [f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"]
+    if (lens := mount.intrinsics) is not None:
+        bends = ", ".join(
+            f"{name} {value:.6g}"
+            for name, value in zip(COEFFICIENTS[lens.model], lens.distortion, strict=True)
+        )
+        lines.append(
+            f"belongs to these intrinsics ({lens.width} x {lens.height} px): fx {lens.fx:.6g}, fy {lens.fy:.6g}, cx "
+            f"{lens.cx:.6g}, cy {lens.cy:.6g}, {lens.model} {bends}"
+        )
+    return lines if mount.doubt is None else [*lines, f"REJECTED: {mount.doubt}"]
 
 
 def _publisher_arguments(parent: str, child: str, parent_from_child: Float[ndarray, "4 4"]) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, scale_translation, skew, step_between
+from jcr.geometry import by_similarity, inverse, scale_translation, skew, step_between
 
 Poses = Float[ndarray, "n 4 4"]
 TRANSLATION, ROTATION, SCALE, BASE_TRANSLATION, BASE_ROTATION = (
@@ -100,8 +100,7 @@ def expected_std(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*ba
 
 def point_ahead(x: Float[ndarray, "4 4"], distance_m: float) -> Float[ndarray, "3 7"]:
     """By how much a point on the optical axis moves on the gripper, in gripper axes, with X and scale."""
-    p = distance_m * x[:3, 2]
-    return np.hstack([np.eye(3), -skew(p), p[:, None]])
+    return by_similarity(distance_m * x[:3, 2])
 
 
 def most_informative(
@@ -112,8 +111,8 @@ def most_informative(
 ) -> tuple[Int[ndarray, " c"], Float[ndarray, "c 7"]]:
     """The `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
 
-    What counts is the position of a point (`point_ahead`; by default the camera), the rotation and the scale. Returns the
-    candidates' rows, and the standard deviations expected with each and those before it.
+    What counts is the position of a point (`point_ahead`; by default the camera), the rotation and the scale. Returns
+    the candidates' rows, and the standard deviations expected with each and those before it.
     """
     counted = np.eye(7)
     if point is not None:

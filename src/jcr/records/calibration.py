@@ -192,15 +192,37 @@ class Seen:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneUncertainty:
+    """How well the reconstructed scene is placed in the base frame, every point by all images that see it."""
+
+    middle_in_base: Float[ndarray, "3"]
+    covariance: Float[ndarray, "7 7"]
+    """Of steps of the scene as a whole (geometry.retract) about its middle, along axes of the base, and of the logarithm
+    of its size."""
+    shape_m: float
+    """One sigma per axis of what else moves a point: the scene is bent."""
+    within_95_m: float
+    """Distance that 95 % of a point's errors stay below, the median point; its own triangulation included."""
+
+    def covariance_at(self, x_in_base: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
+        """Of points (m²), without their own triangulation."""
+        from jcr.geometry import by_similarity  # SciPy, which help need not wait for
+
+        by = by_similarity(x_in_base - self.middle_in_base)
+        return by @ self.covariance @ np.swapaxes(by, 1, 2) + self.shape_m**2 * np.eye(3)
+
+
+@dataclass(frozen=True, kw_only=True)
 class InUse:
-    """How exact a calibration is in use, by its intrinsics, X and scale together; without the robot's own pose errors."""
+    """How exact a calibration is in use, by its intrinsics, X and scale together; without the robot's own pose
+    errors."""
 
     seen: Seen
     """At the centre of the image, at the median distance of the scene."""
     corners: Seen
     """The same at the worst corner of the image."""
-    scene_95_mm: float | None = None
-    """Of the points of the reconstruction in the base frame, the median; None where no image was adjusted."""
+    scene: SceneUncertainty | None = None
+    """None where no image was adjusted."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Integer, UInt8
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import apply, apply_similarity, inverse, scale_translation, skew
+from jcr.geometry import apply, apply_similarity, by_similarity, inverse, scale_translation
 from jcr.records import MATCHED, PRIOR, Capture, HandEye, PointCloud, Reconstruction
 from jcr.represent.options import CloudOptions
 
@@ -93,15 +93,17 @@ def position_std(
 ) -> Float[ndarray, " n"]:
     """One-sigma uncertainty (m), in the worst direction, that the calibration leaves at each point.
 
-    `recon_from_camera` and `x_in_recon` are metric. A point that image i sees at x in its camera lies in the
-    base frame at base_from_gripper[i] · gripper_from_camera · x. With q = R·x, the point seen from the camera
-    in gripper axes, the errors of `jcr.records.COVARIANCE_ORDER` move it by dt + dr x q + ds·q, whose
-    Jacobian is [I, -skew(q), q]; rotating the result to the base frame changes no length.
+    `recon_from_camera` and `x_in_recon` are metric. Where images were adjusted it is that of the scene in the base
+    frame. Of camera poses alone, a point that image i sees at x in its camera lies in the base frame at
+    base_from_gripper[i] · gripper_from_camera · x, and errs as X and the scale do.
     """
-    recon_to_camera = inverse(recon_from_camera)
-    x_in_camera = np.einsum("nij,nj->ni", recon_to_camera[image, :3, :3], x_in_recon)
-    x_in_camera += recon_to_camera[image, :3, 3]
-    q = x_in_camera @ hand_eye.gripper_from_camera[:3, :3].T
-    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(q), q[:, :, None]], axis=-1)
-    covariance = jacobian @ hand_eye.covariance @ np.swapaxes(jacobian, -1, -2)
+    placed = None if hand_eye.in_use is None else hand_eye.in_use.scene
+    if placed is not None:
+        covariance = placed.covariance_at(apply(hand_eye.base_from_recon, x_in_recon))
+    else:
+        recon_to_camera = inverse(recon_from_camera)
+        x_in_camera = np.einsum("nij,nj->ni", recon_to_camera[image, :3, :3], x_in_recon)
+        x_in_camera += recon_to_camera[image, :3, 3]
+        by = by_similarity(x_in_camera @ hand_eye.gripper_from_camera[:3, :3].T)
+        covariance = by @ hand_eye.covariance @ np.swapaxes(by, -1, -2)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))

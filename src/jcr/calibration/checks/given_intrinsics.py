@@ -1,8 +1,8 @@
 """Are the intrinsics that were given those of the images?
 
-Given intrinsics are measurements with a small error. The images and the robot's motion determine them all the same: freed in the bundle
-adjustment, focal length, principal point and two radial coefficients have an estimate and a covariance, in which what
-few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
+Given intrinsics are measurements with a small error. The images and the robot's motion determine them all the same:
+freed in the bundle adjustment, focal length, principal point and two radial coefficients have an estimate and a
+covariance, in which what few images, a flat scene or little rotation leave open is large, and nothing is then claimed.
 """
 
 from dataclasses import replace
@@ -37,8 +37,9 @@ def intrinsics_contradiction(case: Case) -> Checked:
     """What the used images show against the intrinsics that were given; nothing where they agree.
 
     Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
-    intrinsics adjusted until they settle. The calibration is then the one with the intrinsics that the images show, which
-    those that were given are no part of; one that was rejected stays, and the finding says by how much they move it.
+    intrinsics adjusted until they settle. The calibration is then the one with the intrinsics that the images show,
+    which those that were given are no part of; one that was rejected stays, and the finding says by how much they move
+    it.
     """
     held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
     assert case.adjusted is not None
