@@ -32,6 +32,8 @@ class Bench:
     """Asks for the folder of captures."""
     of_boards: bool = False
     """And takes --boards."""
+    keeps_runs: bool = False
+    """Takes --runs."""
     measures: tuple[str, ...] = ()
     """Files and folders whose change makes its page old, beside the bench's own."""
     long: str = ""
@@ -81,6 +83,22 @@ BENCHES = {
             "src/jcr/reconstruct/direct",
             "src/jcr/reconstruct/marker.py",
             "src/jcr/reconstruct/board.py",
+        ),
+    ),
+    "check_points": Bench(
+        "corners of boards that took no part in the calibration, where it puts them in the base: captures in DIR",
+        of_captures=True,
+        of_boards=True,
+        keeps_runs=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/reconstruct/board.py",
+            "src/jcr/reconstruct/board_in_view.py",
+            "benchmarks/corners.py",
+            "benchmarks/board_intrinsics.py",
         ),
     ),
     "matching": Bench(
@@ -234,7 +252,10 @@ class Arguments:
     captures: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
     """For real: the folder that holds capture folders, each with a reference.json."""
     boards: tuple[str, ...] = ()
-    """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references."""
+    """CAPTURE=BOARD, as jcr run --board has it. For real: of those that show one. For matching: to make references. For
+    check_points: of those that state a side; others are looked for."""
+    runs: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """For check_points: keep the run folders here, and use those that are."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write NAME.md in this folder (NAME_long.md with --long), and the images of those benches that draw some."""
     long: bool = False
@@ -263,11 +284,13 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"bench {name}: takes no folder of captures; leave it out")
     if not BENCHES[name].of_boards and arguments.boards:
         raise InputError(f"bench {name}: takes no --boards; leave them out")
+    if not BENCHES[name].keeps_runs and arguments.runs is not None:
+        raise InputError(f"bench {name}: keeps no run folders; leave out --runs")
     if arguments.long and not BENCHES[name].long:
         raise InputError(f"bench {name}: has no --long; leave it out")
     bench = import_module(f"benchmarks.{name}")
     asks = {"captures": BENCHES[name].of_captures, "boards": BENCHES[name].of_boards}
-    asks |= {"out": BENCHES[name].draws, "long": bool(BENCHES[name].long)}
+    asks |= {"runs": BENCHES[name].keeps_runs, "out": BENCHES[name].draws, "long": bool(BENCHES[name].long)}
     found = bench.run(**{option: getattr(arguments, option) for option, is_asked in asks.items() if is_asked})
     table = heading(arguments) + found
     arguments.output.result(table, {"bench": name, "markdown": table})

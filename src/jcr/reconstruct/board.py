@@ -5,6 +5,7 @@ The detectors are OpenCV's. A *body* is what is rigid and of known size: a board
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from jcr.camera import HALF_PIXEL
 from jcr.errors import InputError
 
 KINDS = (
@@ -112,16 +114,29 @@ def _charuco(
 
 def _charuco_detector(board: cv2.aruco.CharucoBoard) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
     detector = cv2.aruco.CharucoDetector(board)
-    corners = np.asarray(board.getChessboardCorners(), np.float64)
+    corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()
 
     def detect(grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
         x_px, ids, _, _ = detector.detectBoard(grey)
         if ids is None:
             return []
         index = ids.ravel().astype(int)
-        return [Sighting(0, tuple(index.tolist()), corners[index], x_px.reshape(-1, 2).astype(np.float64))]
+        in_image = x_px.reshape(-1, 2).astype(np.float64) - shift_px
+        return [Sighting(0, tuple(index.tolist()), corners[index], in_image)]
 
     return detect
+
+
+@cache
+def _charuco_shift_px() -> float:
+    """Half a pixel that OpenCV adds to the corners of ChArUco boards before its pull request 28380, else 0."""
+    square, margin = 40, 20
+    board = cv2.aruco.CharucoBoard((4, 3), 1.0, 0.7, _tags("DICT_4X4_50"))
+    drawn = board.generateImage((4 * square + 2 * margin, 3 * square + 2 * margin), marginSize=margin)
+    x_px, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(drawn)
+    corners = np.asarray(board.getChessboardCorners(), np.float64)[np.ravel(ids).astype(int), :2]
+    true = margin + square * corners - HALF_PIXEL
+    return HALF_PIXEL * round(float(np.mean(x_px.reshape(-1, 2) - true)) / HALF_PIXEL)
 
 
 def _chessboard(count: tuple[int, int], square: float) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
@@ -188,7 +203,8 @@ def _single_tags(
     side: float, tags: cv2.aruco.Dictionary
 ) -> Callable[[UInt8[ndarray, "h w"]], list[Sighting]]:
     parameters = cv2.aruco.DetectorParameters()
-    # Fits lines to the edges; with sub-pixel corners the offset of a simulated capture was off by 1.1, not 0.2 mm.
+    # Fits lines to the edges; sub-pixel corners are drawn inwards by blur, 0.1 to 0.4 px. AprilTag's corners are counted
+    # from the corner of the image.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(tags, parameters)
     half = side / 2
@@ -202,7 +218,7 @@ def _single_tags(
         # Two tags of one number are no landmark: which is which?
         twice = set(numbers[counts > 1].tolist())
         return [
-            Sighting(int(number), (0, 1, 2, 3), corners, x_px.reshape(4, 2).astype(np.float64))
+            Sighting(int(number), (0, 1, 2, 3), corners, x_px.reshape(4, 2).astype(np.float64) - HALF_PIXEL)
             for number, x_px in zip(ids.ravel(), found, strict=True)
             if int(number) not in twice
         ]
