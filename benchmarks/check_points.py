@@ -31,6 +31,8 @@ from benchmarks.corners import (
     pixels_of,
     triangulated,
 )
+from jcr.calibration.seen import joint_covariance
+from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
@@ -191,18 +193,17 @@ def predicted(camera: WristCamera, hand_eye: HandEye, corners: Corners, noise_px
 
 
 def _true_cameras(camera: WristCamera, hand_eye: HandEye, rng: np.random.Generator) -> Iterator[WristCamera]:
-    """Cameras that may be the true one, drawn from what the calibration states of its errors.
-
-    An estimate does not hold how errors of the intrinsics and of the transform go together. They compensate each other
-    at the distance of the scene, so that both are left out here.
-    """
-    budget = hand_eye.budget
-    covariance = hand_eye.covariance - (0 if budget is None else budget.intrinsics)
-    values, vectors = np.linalg.eigh(covariance[:6, :6])
+    """Cameras that may be the true one, drawn from what the calibration states of X and intrinsics together."""
+    estimate = hand_eye.estimate
+    values, vectors = np.linalg.eigh(joint_covariance(estimate))
     spread = vectors * np.sqrt(values.clip(0))
     for _ in range(DRAWS):
-        x = retract(camera.gripper_from_camera, spread @ rng.normal(size=6))
-        yield replace(camera, gripper_from_camera=x)
+        step = spread @ rng.normal(size=len(spread))
+        lens = camera.intrinsics
+        if estimate.intrinsics_cross is not None:
+            lens = with_parameters(lens, parameters(lens) + step[7:])
+        x = retract(camera.gripper_from_camera, step[:6])
+        yield replace(camera, gripper_from_camera=x, intrinsics=lens)
 
 
 def _claim(rows: Sequence[Row]) -> str:
@@ -227,8 +228,7 @@ def _corner_table(rows: Sequence[Row]) -> list[str]:
         "takes it to the base. The scatter is about the corner's mean over the images, across the ray (both axes) and "
         "along it. Halves: corners triangulated from every other image, rms distance from those of the others. "
         f"Predicted: the same measures of {DRAWS} draws of the errors that the calibration states, one draw for all "
-        "images, of the robot's random and systematic errors, one draw an image, and of pixels. Errors of the "
-        "intrinsics, and what of the transform compensates them, are not drawn. Side: mean distance of neighbouring "
+        "images, of the robot's random and systematic errors, one draw an image, and of pixels. Side: mean distance of neighbouring "
         "corners, ± predicted. Flat: rms distance of the triangulated corners from their plane, and from a surface of "
         "second order.",
         "",
