@@ -20,6 +20,16 @@ FEWEST_CORNERS = 12
 FLAGS = cv2.CALIB_FIX_K3
 """Both focal lengths, principal point, k1, k2, p1, p2, as a calibration frees them."""
 
+GIVEN = (
+    cv2.CALIB_USE_INTRINSIC_GUESS
+    | cv2.CALIB_FIX_FOCAL_LENGTH
+    | cv2.CALIB_FIX_PRINCIPAL_POINT
+    | cv2.CALIB_FIX_TANGENT_DIST
+    | cv2.CALIB_FIX_K1
+    | cv2.CALIB_FIX_K2
+    | cv2.CALIB_FIX_K3
+)
+"""Nothing is freed but poses."""
 FEATURES, FLAT, SHAPE_FREE = "features", "board, flat", "board, shape free"
 HALVES = "even images", "odd images"
 
@@ -119,10 +129,8 @@ def _fit(how: str, kind: str, corners: Corners, size: tuple[int, int], of_featur
         )
     by_features = None
     if of_features is not None and of_features.model == "pinhole":
-        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_INTRINSIC
-        by_features = cv2.calibrateCamera(
-            points, pixels, size, of_features.matrix, np.array(of_features.distortion), flags=flags
-        )[0]
+        given = of_features.matrix, np.array(of_features.distortion)
+        by_features = cv2.calibrateCamera(points, pixels, size, *given, flags=GIVEN)[0]
     (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
     values = np.array([fx, fy, cx, cy, *distortion.ravel()[:5]])
     per_axis = np.sqrt(0.5)

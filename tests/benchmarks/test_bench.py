@@ -165,6 +165,7 @@ def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]
     for given, said in {
         ("pairs", "captures"): "takes no folder of captures",
         ("cameras", "captures", "--boards", "a=charuco"): "takes no --boards",
+        ("bag", "--runs", "runs"): "keeps no run folders",
         ("bag", "--long"): "has no --long",
         ("all", "--long", "--out", "pages"): "of one bench at a time",
     }.items():
@@ -175,7 +176,8 @@ def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize("name", sorted(BENCHES))
 def test_a_bench_takes_what_its_row_of_the_table_says(name: str):
     row, run_one = BENCHES[name], import_module(f"benchmarks.{name}").run
-    asks = {"captures": row.of_captures, "boards": row.of_boards, "out": row.draws, "long": bool(row.long)}
+    asks = {"captures": row.of_captures, "boards": row.of_boards, "runs": row.keeps_runs}
+    asks |= {"out": row.draws, "long": bool(row.long)}
     assert set(signature(run_one).parameters) == {option for option, is_asked in asks.items() if is_asked}
 
 
