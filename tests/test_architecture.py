@@ -13,7 +13,7 @@ from places import ROOT
 SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"deflate", "errors"},
-    {"extras"},
+    {"compiled", "extras"},
     {"pages", "rounding", "geometry"},
     {"records", "files", "memory", "progress"},
     {"arrays_json", "camera", "least_squares"},

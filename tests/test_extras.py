@@ -25,7 +25,6 @@ def test_the_extras_that_are_named_exist():
                 for names in re.findall(rf"{DISTRIBUTION}\[([\w,]+)\]", text):
                     named |= {(name, file.name) for name in names.split(",")}
     assert {name for name, _ in named} >= {
-        "map",
         "networks",
         "view",
         "sam",

@@ -51,6 +51,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (
         ("errors.py", "bad input, a rejected answer", 1),
         ("extras.py", "optional packages", 1),
+        ("compiled.py", "loops over pixels", 1),
         ("deflate.py", "zlib before pycolmap", 1),
     ),
 )

@@ -89,6 +89,11 @@ def test_tracks_reproject_without_half_a_pixel(found: Reconstruction) -> None:
     assert len(found.tracks.points_in_recon) > 500
 
 
+def test_observations_agree_within_a_tenth_of_a_pixel(found: Reconstruction) -> None:
+    errors = np.linalg.norm(_reprojection_errors(found), axis=1)
+    assert np.median(errors) < 0.06  # keypoints: 0.15
+
+
 def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconstruction) -> None:
     assert np.isfinite(found.dense.points_in_recon).all()
     assert (found.dense.confidence > 0).mean() > 0.5

@@ -20,7 +20,7 @@ LOSS_SCALE = 2.0
 CELLS = 8
 """Across the width of an image: so near each other features share errors, of a texture, a shadow or what the distortion
 model leaves."""
-MIN_SIGMA_PX = 0.05
+MIN_SIGMA_PX = 0.02
 RATIOS = (0.25, 100.0)
 """Of the variances of other cameras' observations to that of the first's: of few points that only one other sees, a
 camera seems as good as its weight makes it."""

@@ -4,7 +4,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.depth.compiled import compiled
+from jcr.compiled import compiled
 
 SEEN_THROUGH = 0.01
 """A neighbour whose depth is farther by this share sees through the point. Beside an object's outline the plain

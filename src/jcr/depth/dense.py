@@ -10,7 +10,6 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD
-from jcr.extras import extra
 from jcr.memory import ALLOWANCE, GB, relieve, resident
 from jcr.progress import Progress
 from jcr.records import Intrinsics
@@ -46,7 +45,6 @@ def dense_pointmaps(
     `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times, one that sees
     through a point of another may show what was there before, and nothing is filled by `priors`.
     """
-    extra("numba", "map", "dense depth")
     from jcr.depth.fused import fused_depth
     from jcr.depth.matched import match_depth
 

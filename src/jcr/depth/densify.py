@@ -13,7 +13,6 @@ from jcr.capture.images import read_image
 from jcr.depth.dense import dense_pointmaps
 from jcr.depth.options import DepthOptions
 from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD, choose_neighbours, sweep_planes
-from jcr.extras import extra
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
@@ -35,7 +34,7 @@ def densify(
     """The reconstruction with pointmaps of its images; those that it has, predicted by a network, stay as they are.
 
     Only cameras, intrinsics and tracks are used, so that it may come before or after the calibration. A smaller budget
-    changes the time, and no bit. Raises InputError where an image cannot be read, or numba is not installed.
+    changes the time, and no bit. Raises InputError where an image cannot be read.
     """
     if reconstruction.pointmaps is not None:
         return reconstruction
@@ -72,9 +71,10 @@ def densify(
 def plan_depth(capture: Capture, options: DepthOptions, memory_gb: float) -> None:
     """Say what memory the dense depth of a capture, and its map, will take, before anything is made.
 
-    Raises InputError where the budget is too small, or numba is not installed.
+    Raises InputError where the budget is too small.
     """
-    extra("numba", "map", "dense depth")  # imported now, for it is a part of the program
+    import numba  # noqa: F401  (now, for it is a part of the program)
+
     width, height = capture.image_size
     pixels = int(width * height * min(1.0, options.pointmap_size_px / max(width, height)) ** 2)
     plan(

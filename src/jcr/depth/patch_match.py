@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.depth.compiled import compiled, random_state, uniform
+from jcr.compiled import compiled, random_state, uniform
 
 REACH, STRIDE = 2, 2
 """The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.depth.compiled import compiled, random_state, uniform
+from jcr.compiled import compiled, random_state, uniform
 
 SCALE = 0.35
 """k of Felzenszwalb and Huttenlocher 2004, eq. 4, for colours from 0 to 1: the larger, the larger the regions."""

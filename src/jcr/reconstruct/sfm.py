@@ -1,4 +1,5 @@
-"""Structure from motion with pycolmap: features, matches that the robot checks, incremental mapping, bundle adjustment.
+"""Structure from motion with pycolmap: features, matches that the robot checks, incremental mapping, bundle adjustment,
+and the observations aligned to a tenth of a pixel (least_squares_matching.py).
 
 COLMAP has the centre of the top-left pixel at (0.5, 0.5); this file is the border where that half pixel,
 the working size and COLMAP's camera models are converted.
@@ -33,6 +34,7 @@ from jcr.match.stage import Matched, Matcher, match_with_robot
 from jcr.match.verify import View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
+from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
     joined,
@@ -97,6 +99,8 @@ def structure_from_motion(
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
+        _adjust_robustly(model, hold_lens=known)
+        _align_observations(model, images, lenses[0] if known else _lens_of(model.camera(1), lenses[0]))
         _adjust_robustly(model, hold_lens=known)
         lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
@@ -176,17 +180,22 @@ def _enter(
         rig.add_ref_sensor(cameras[0].sensor_id)
         db.write_rig(rig, use_rig_id=True)
         for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
-            grey = np.asarray(Image.fromarray(pixels).convert("L"))
-            # Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
-            (database.parent / name).write_bytes(
-                encode_png(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
-            )
+            (database.parent / name).write_bytes(encode_png(_grey(pixels, size)))
             image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
             db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
     return cameras, names
+
+
+def _grey(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
+    """An image as features are found in it, of this width and height.
+
+    Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
+    """
+    grey = np.asarray(Image.fromarray(pixels).convert("L"))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def match(database: Path, seed: int) -> None:
@@ -421,6 +430,19 @@ def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
+def _align_observations(
+    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics
+) -> None:
+    """Least-squares matching of the model's observations, in the images that features were found in."""
+    camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
+    size = camera.width, camera.height
+    poses = poses_of(model, [image_id - 1 for image_id in image_ids])
+    greys = np.stack([_grey(images[image_id - 1], size) for image_id in image_ids])
+    aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
+    for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
+        model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
+
+
 def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> NotTrustedError:
     """How many registered, the likely reason, what to do instead."""
     with closing(pycolmap.Database.open(database)) as db:
@@ -443,27 +465,30 @@ def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstructio
 
 def tracks_of(model: pycolmap.Reconstruction, image_ids: Sequence[int], size: tuple[int, int]) -> Tracks:
     """Every observation of every triangulated point by images `image_ids`, in pixels of images of `size`."""
-    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     camera = model.camera(model.image(image_ids[0]).camera_id)
     original_from_working = np.array([size[0] / camera.width, size[1] / camera.height])
-    point_ids = sorted(model.point3D_ids())
-    seen = [
-        (
-            row_of[element.image_id],
-            model.image(element.image_id).point2D(element.point2D_idx).xy,
-            point,
-        )
-        for point, point_id in enumerate(point_ids)
-        for element in model.point3D(point_id).track.elements
-        if element.image_id in row_of
-    ]
-    image, x_px, point = zip(*seen, strict=True) if seen else ((), (), ())
+    seen = _observations(model, image_ids)
+    image, _, point = zip(*seen, strict=True) if seen else ((), (), ())
+    x_px = [model.image(image_ids[row]).point2D(index).xy for row, index, _ in seen]
     return Tracks(
         image=np.array(image, dtype=int),
         x_px=np.reshape(x_px, (-1, 2)) * original_from_working - HALF_PIXEL,
         point=np.array(point, dtype=int),
-        points_in_recon=np.reshape([model.point3D(point_id).xyz for point_id in point_ids], (-1, 3)),
+        points_in_recon=np.reshape(
+            [model.point3D(point_id).xyz for point_id in sorted(model.point3D_ids())], (-1, 3)
+        ),
     )
+
+
+def _observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Row of `image_ids`, row of the image's keypoints and row of the points in the order of their ids."""
+    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
+    return [
+        (row_of[element.image_id], element.point2D_idx, point)
+        for point, point_id in enumerate(sorted(model.point3D_ids()))
+        for element in model.point3D(point_id).track.elements
+        if element.image_id in row_of
+    ]
 
 
 def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:

@@ -1,0 +1,389 @@
+"""Least-squares matching: the observations of a track aligned to one of them, its reference, by their pixels.
+
+A keypoint is found in each image by itself, to 0.2 to 0.5 px; aligned to one patch, the observations of a track agree
+within a tenth. Where the reference's own keypoint is off, the point is another one of the surface: cameras are not
+concerned. A patch is seen under the warp of a plane that faces the track's cameras, whose affine part is free, and
+so are gain and offset (Gruen, "Adaptive least squares correlation", 1985). The reference's derivatives serve every step
+(inverse composition; Baker and Matthews, IJCV 2004). The variance is that of the residuals times the inverse normal
+equations (Förstner, "On the geometric precision of digital correlation", 1982): of three sizes of the patch the one with
+the smallest counts, and an observation where none is small keeps its keypoint.
+"""
+
+from dataclasses import replace
+from typing import no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from jcr.camera import by_point, project, unproject
+from jcr.compiled import compiled
+from jcr.geometry import inverse
+from jcr.records import Intrinsics, Tracks
+
+MOST_PX = 4.0
+"""An observation farther from its keypoint is another feature; COLMAP, too, keeps none that is farther off."""
+LEAST_CORRELATION = 0.9
+LARGEST_STD_PX = 0.3
+"""Of an aligned observation; keypoints are no worse."""
+_REDUCED = (4, 2, 1)
+"""Sizes of the patch: of the images reduced so much. Each starts where the one before it ended."""
+_RADIUS, _WINDOW = 7, 4.5
+"""Pixels: of the patch, and the standard deviation of its weights."""
+_STEPS, _SETTLED_PX = 15, 0.01
+_BEND_AT_PX = 6.0
+"""From the reference's keypoint, where derivatives of the warp are taken."""
+_FREE = 8
+"""Unknowns: shift x y, gain, offset, affine part by rows."""
+_STEEPEST = 5.0
+"""Scale from one image to another beyond which the warp is none."""
+_FLAT = 1e-3
+"""Standard deviation, in grey levels, of a patch without texture."""
+
+
+def align_tracks(
+    greys: UInt8[ndarray, "m h w"],
+    tracks: Tracks,
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    lens: Intrinsics,
+) -> Tracks:
+    """The tracks with the observations moved that could be aligned to their track's reference.
+
+    The images are of the size of `lens`, to which the tracks belong; rows of cameras and images are those of the tracks.
+    The reference is the observation that shows the surface at the median scale. It stays where it is.
+    """
+    order = np.lexsort((tracks.image, tracks.point))
+    image, x_px, point = tracks.image[order], tracks.x_px[order].astype(np.float64), tracks.point[order]
+    begins = np.flatnonzero(np.diff(point, prepend=-1))
+    ends = np.append(begins, len(point))
+    facing = _facing(tracks, recon_from_camera)[point]
+    scale = _scales(image, tracks.points_in_recon[point], facing, recon_from_camera, lens)
+    rank = np.lexsort((scale, point))
+    reference = rank[(ends[:-1] + ends[1:]) // 2]
+    of_reference = np.repeat(reference, np.diff(ends))
+    warp, bend = _warps(
+        x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, lens
+    )
+    start_px, start_affine = x_px.copy(), warp
+    found, variance = x_px.copy(), np.full(len(point), LARGEST_STD_PX**2)
+    for reduced in _REDUCED:
+        level = _reduced(greys, reduced)
+        level_from_image = np.array([level.shape[2] / lens.width, level.shape[1] / lens.height])
+        seen_px = _resized(start_px, level_from_image)
+        aligned_px, affine, variance_px = seen_px.copy(), start_affine.copy(), np.full(len(point), np.inf)
+        _align_all(
+            level,
+            image,
+            ends,
+            reference,
+            _resized(x_px, level_from_image),
+            (aligned_px, affine, bend * reduced),
+            variance_px,
+            MOST_PX / reduced,
+        )
+        aligned = variance_px * reduced**2 < LARGEST_STD_PX**2
+        start_px[aligned] = _resized(aligned_px[aligned], 1 / level_from_image)
+        start_affine[aligned] = affine[aligned]
+        better = variance_px * reduced**2 < variance
+        found[better], variance[better] = start_px[better], variance_px[better] * reduced**2
+    refined = np.empty_like(found)
+    refined[order] = found
+    return replace(tracks, x_px=refined)
+
+
+def _reduced(greys: UInt8[ndarray, "m h w"], by: int) -> UInt8[ndarray, "m h2 w2"]:
+    size = max(greys.shape[2] // by, 1), max(greys.shape[1] // by, 1)
+    if by == 1:
+        return np.ascontiguousarray(greys)
+    return np.stack([cv2.resize(grey, size, interpolation=cv2.INTER_AREA) for grey in greys])
+
+
+def _resized(x_px: Float[ndarray, "k 2"], factor: Float[ndarray, "2"]) -> Float[ndarray, "k 2"]:
+    """The same places in images resized by `factor`."""
+    return (x_px + 0.5) * factor - 0.5
+
+
+def _facing(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "p 3"]:
+    """For each point the mean direction of the cameras that see it: the normal of its plane, of any length.
+
+    Planes through neighbouring points gave the same: the affine part is free.
+    """
+    toward = recon_from_camera[tracks.image, :3, 3] - tracks.points_in_recon[tracks.point]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    return np.stack(
+        [np.bincount(tracks.point, along, len(tracks.points_in_recon)) for along in toward.T], axis=1
+    )
+
+
+def _scales(
+    image: Int[ndarray, " k"],
+    x_in_recon: Float[ndarray, "k 3"],
+    facing: Float[ndarray, "k 3"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    lens: Intrinsics,
+) -> Float[ndarray, " k"]:
+    """Pixels² of each observation that a unit of area of its plane covers, times the square of the normal's length."""
+    camera_from_recon = inverse(recon_from_camera)[image]
+    x_in_camera = _moved(camera_from_recon, x_in_recon)
+    by_recon = by_point(lens, x_in_camera) @ camera_from_recon[:, :3, :3]
+    # The area's factor along a normal n is det [J; nᵀ], and n is as long for all observations of a point.
+    return np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
+
+
+def _warps(
+    x_px: Float[ndarray, "k 2"],
+    image: Int[ndarray, " k"],
+    x_in_recon: Float[ndarray, "k 3"],
+    facing: Float[ndarray, "k 3"],
+    of_reference: Int[ndarray, " k"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    lens: Intrinsics,
+) -> tuple[Float[ndarray, "k 2 2"], Float[ndarray, "k 2 3"]]:
+    """Affine part and bend: (u, v) from the reference's keypoint is affine·(u, v) + bend·(u², uv, v²) from the other.
+
+    By central differences; the bend is of perspective and distortion. Where the plane is seen from the side or from
+    behind, both are 0, with which nothing is aligned.
+    """
+    recon_from_reference = recon_from_camera[image[of_reference]]
+    camera_from_recon = inverse(recon_from_camera)[image]
+    centre = recon_from_reference[:, :3, 3]
+    height = ((x_in_recon - centre) * facing).sum(1)
+
+    def at(u: int, v: int) -> Float[ndarray, "k 2"]:
+        offset = _BEND_AT_PX * np.array([u, v])
+        rays = unproject(lens, x_px[of_reference] + offset)
+        ray = np.einsum("kij,kj->ki", recon_from_reference[:, :3, :3], rays)
+        on_plane = centre + (height / (ray * facing).sum(1))[:, None] * ray
+        return project(lens, _moved(camera_from_recon, on_plane))
+
+    with np.errstate(all="ignore"):
+        middle, right, left, below, above = at(0, 0), at(1, 0), at(-1, 0), at(0, 1), at(0, -1)
+        cross = (at(1, 1) - at(1, -1) - at(-1, 1) + at(-1, -1)) / 4
+    affine = np.stack([right - left, below - above], axis=2) / (2 * _BEND_AT_PX)
+    bend = np.stack([(right + left) / 2 - middle, cross, (below + above) / 2 - middle], axis=2)
+    steepest = np.abs(affine).max((1, 2), initial=0.0)
+    tame = (np.isfinite(bend).all((1, 2)) & (steepest < _STEEPEST))[:, None, None]
+    return np.where(tame, affine, 0.0), np.where(tame, bend, 0.0) / _BEND_AT_PX**2
+
+
+def _moved(b_from_a: Float[ndarray, "k 4 4"], x_in_a: Float[ndarray, "k 3"]) -> Float[ndarray, "k 3"]:
+    return np.einsum("kij,kj->ki", b_from_a[:, :3, :3], x_in_a) + b_from_a[:, :3, 3]
+
+
+@compiled
+@no_type_check
+def _align_all(greys, image, ends, reference, keypoint_px, warp, variance_px, most_px):
+    """Move `warp` (centres, affine parts, bends) of all observations but the references to where they are aligned.
+
+    What is aligned has a variance (px²) afterwards; the rest keeps infinity.
+    """
+    offsets, window = _window(_RADIUS)
+    wide, _ = _window(_RADIUS + 1)
+    around = np.empty(len(wide))
+    template = np.empty(len(offsets))
+    patch = np.empty(len(offsets))
+    pull = np.empty((len(offsets), _FREE))
+    straight = np.zeros((2, 2))
+    straight[0, 0] = straight[1, 1] = 1.0
+    flat = np.zeros((2, 3))
+    for p in range(len(reference)):
+        r = reference[p]
+        if not _patch(greys[image[r]], keypoint_px[r], straight, flat, wide, around):
+            continue
+        deviation = _template(around, offsets, window, template, pull)
+        if deviation < _FLAT:
+            continue
+        xx = xy = yy = 0.0
+        for k in range(len(offsets)):
+            xx += pull[k, 0] * pull[k, 0]
+            xy += pull[k, 0] * pull[k, 1]
+            yy += pull[k, 1] * pull[k, 1]
+        for o in range(ends[p], ends[p + 1]):
+            if o != r:
+                x_px, affine = warp[0][o], warp[1][o]
+                correlation = _align(
+                    greys[image[o]], keypoint_px[o], x_px, affine, warp[2][o], offsets, window, template, pull, patch,
+                    deviation, most_px
+                )  # fmt: skip
+                if correlation > LEAST_CORRELATION:
+                    # Both patches have noise: the difference of two of unit variance has 2 (1 − correlation).
+                    noise = 2 * max(1 - correlation, 1e-6) * deviation * deviation
+                    along_x = affine[0, 0] * affine[0, 0] + affine[1, 0] * affine[1, 0]
+                    across = affine[0, 0] * affine[0, 1] + affine[1, 0] * affine[1, 1]
+                    along_y = affine[0, 1] * affine[0, 1] + affine[1, 1] * affine[1, 1]
+                    variance_px[o] = noise * (along_x * xx + 2 * across * xy + along_y * yy) / 2
+
+
+@compiled
+@no_type_check
+def _window(radius):
+    """Offsets (n,2) of the pixels of a patch, row by row, and their weights, whose sum is 1."""
+    side = 2 * radius + 1
+    offsets = np.empty((side * side, 2))
+    weight = np.empty(side * side)
+    for k in range(side * side):
+        offsets[k, 0] = k % side - radius
+        offsets[k, 1] = k // side - radius
+        weight[k] = np.exp(-0.5 * (offsets[k, 0] ** 2 + offsets[k, 1] ** 2) / _WINDOW**2)
+    total = weight.sum()
+    for k in range(side * side):
+        weight[k] /= total
+    return offsets, weight
+
+
+@compiled
+@no_type_check
+def _patch(grey, x_px, affine, bend, offsets, patch):
+    """Write the greys at the warped offsets; whether the image holds all of them."""
+    for k in range(len(offsets)):
+        u = offsets[k, 0]
+        v = offsets[k, 1]
+        x = x_px[0] + affine[0, 0] * u + affine[0, 1] * v
+        y = x_px[1] + affine[1, 0] * u + affine[1, 1] * v
+        x += bend[0, 0] * u * u + bend[0, 1] * u * v + bend[0, 2] * v * v
+        y += bend[1, 0] * u * u + bend[1, 1] * u * v + bend[1, 2] * v * v
+        if not (x >= 1 and y >= 1 and x < grey.shape[1] - 2 and y < grey.shape[0] - 2):
+            return False
+        patch[k] = _smooth(grey, x, y)
+    return True
+
+
+@compiled
+@no_type_check
+def _smooth(grey, x, y):
+    """The image between its pixels: a cubic B-spline with the pixels as its coefficients, which blurs by 0.58 px.
+
+    Without the blur the interpolation would be rougher between pixels than on them and pull towards one of the two.
+    """
+    column = int(x)
+    row = int(y)
+    f = x - column
+    g = y - row
+    a0 = (1 - f) ** 3 / 6
+    a1 = 2 / 3 - f * f * (1 - f / 2)
+    a3 = f * f * f / 6
+    a2 = 1 - a0 - a1 - a3
+    b0 = (1 - g) ** 3 / 6
+    b1 = 2 / 3 - g * g * (1 - g / 2)
+    b3 = g * g * g / 6
+    b2 = 1 - b0 - b1 - b3
+    above = grey[row - 1]
+    upper = grey[row]
+    lower = grey[row + 1]
+    below = grey[row + 2]
+    value = a0 * (
+        b0 * above[column - 1] + b1 * upper[column - 1] + b2 * lower[column - 1] + b3 * below[column - 1]
+    )
+    value += a1 * (b0 * above[column] + b1 * upper[column] + b2 * lower[column] + b3 * below[column])
+    value += a2 * (
+        b0 * above[column + 1] + b1 * upper[column + 1] + b2 * lower[column + 1] + b3 * below[column + 1]
+    )
+    value += a3 * (
+        b0 * above[column + 2] + b1 * upper[column + 2] + b2 * lower[column + 2] + b3 * below[column + 2]
+    )
+    return value
+
+
+@compiled
+@no_type_check
+def _template(around, offsets, window, template, pull):
+    """Write the reference patch less its mean, and `pull` (n,8), what a grey too high does to each unknown.
+
+    Its standard deviation is returned. A patch whose texture does not fix the unknowns pulls without bound: its
+    variance rejects it.
+    """
+    side = 2 * _RADIUS + 3
+    mean = 0.0
+    square = 0.0
+    jacobian = np.empty((len(offsets), _FREE))
+    for k in range(len(offsets)):
+        middle = int((offsets[k, 1] + _RADIUS + 1) * side + offsets[k, 0] + _RADIUS + 1)
+        template[k] = around[middle]
+        jacobian[k, 0] = (around[middle + 1] - around[middle - 1]) / 2
+        jacobian[k, 1] = (around[middle + side] - around[middle - side]) / 2
+        mean += window[k] * template[k]
+        square += window[k] * template[k] * template[k]
+    deviation = np.sqrt(max(square - mean * mean, 0.0))
+    for k in range(len(offsets)):
+        template[k] -= mean
+        jacobian[k, 2] = template[k]
+        jacobian[k, 3] = deviation
+        for i in range(2):
+            for j in range(2):
+                jacobian[k, 4 + 2 * i + j] = jacobian[k, i] * offsets[k, j] / _WINDOW
+    inverse_normal = _inverse_normal(jacobian, window)
+    for k in range(len(offsets)):
+        for i in range(_FREE):
+            pull[k, i] = 0.0
+            for j in range(_FREE):
+                pull[k, i] += inverse_normal[i, j] * jacobian[k, j] * window[k]
+    return deviation
+
+
+@compiled
+@no_type_check
+def _inverse_normal(jacobian, window):
+    """Inverse (8,8) of the weighted normal equations, by elimination; what is singular is held by next to nothing."""
+    n = _FREE
+    wide = np.zeros((n, 2 * n))
+    for i in range(n):
+        for j in range(n):
+            for k in range(len(window)):
+                wide[i, j] += window[k] * jacobian[k, i] * jacobian[k, j]
+        wide[i, n + i] = 1.0
+    for i in range(n):
+        wide[i, i] += 1e-9 * wide[i, i] + 1e-12
+    for i in range(n):
+        pivot = wide[i, i]
+        for j in range(2 * n):
+            wide[i, j] /= pivot
+        for row in range(n):
+            factor = wide[row, i]
+            if row != i:
+                for j in range(2 * n):
+                    wide[row, j] -= factor * wide[i, j]
+    return wide[:, n:]
+
+
+@compiled
+@no_type_check
+def _align(grey, keypoint_px, x_px, affine, bend, offsets, window, template, pull, patch, deviation, most_px):
+    """Gauss-Newton steps of `x_px` and `affine`; the correlation where they settle, -1 where they do not."""
+    step = np.empty(_FREE)
+    for _ in range(_STEPS):
+        if not _patch(grey, x_px, affine, bend, offsets, patch):
+            return -1.0
+        mean = 0.0
+        square = 0.0
+        for k in range(len(offsets)):
+            mean += window[k] * patch[k]
+            square += window[k] * patch[k] * patch[k]
+        gain = deviation / np.sqrt(max(square - mean * mean, 1e-12))
+        for i in range(_FREE):
+            step[i] = 0.0
+        correlation = 0.0
+        for k in range(len(offsets)):
+            here = gain * (patch[k] - mean)
+            correlation += window[k] * here * template[k]
+            for i in range(_FREE):
+                step[i] += (here - template[k]) * pull[k, i]
+        a, b, c, d = step[4] / _WINDOW + 1, step[5] / _WINDOW, step[6] / _WINDOW, step[7] / _WINDOW + 1
+        determinant = a * d - b * c
+        if determinant < 0.3:
+            return -1.0
+        moved = 0.0
+        away = 0.0
+        for i in range(2):
+            first, second = affine[i, 0], affine[i, 1]
+            affine[i, 0] = (first * d - second * c) / determinant
+            affine[i, 1] = (second * a - first * b) / determinant
+            shift = affine[i, 0] * step[0] + affine[i, 1] * step[1]
+            x_px[i] -= shift
+            moved += shift * shift
+            away += (x_px[i] - keypoint_px[i]) ** 2
+        if away > most_px * most_px:
+            return -1.0
+        if moved < _SETTLED_PX * _SETTLED_PX:
+            return correlation / (deviation * deviation)
+    return -1.0
