@@ -228,7 +228,8 @@ def _corner_table(rows: Sequence[Row]) -> list[str]:
         "takes it to the base. The scatter is about the corner's mean over the images, across the ray (both axes) and "
         "along it. Halves: corners triangulated from every other image, rms distance from those of the others. "
         f"Predicted: the same measures of {DRAWS} draws of the errors that the calibration states, one draw for all "
-        "images, of the robot's random and systematic errors, one draw an image, and of pixels. Side: mean distance of neighbouring "
+        "images, of the robot's random and systematic errors, one draw an image, and of pixels. "
+        "Side: mean distance of neighbouring "
         "corners, ± predicted. Flat: rms distance of the triangulated corners from their plane, and from a surface of "
         "second order.",
         "",

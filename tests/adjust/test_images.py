@@ -34,6 +34,7 @@ def two_cameras() -> tuple[CellProblem, Scene, Freedom]:
 def test_derivatives_are_those_of_the_residuals():
     problem, scene, freedom = two_cameras()
     images = ImageProblem.of(scene, problem.observations, freedom)
+    freedom = images.freedom
     scene = at_start(replace(scene, points_in_world=scene.points_in_world[images.points]), freedom)
     rng = np.random.default_rng(0)
     # Off the start, where images differ from their cameras and the cameras from their priors.

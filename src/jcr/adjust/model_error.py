@@ -1,10 +1,10 @@
 """What a camera's model leaves of its distortion: a displacement that is smooth over the image, the same in all images.
 
-A few coefficients do not bend every ray as a cheap lens does. What they leave is common to all images: it does not
+A few coefficients do not bend every ray as a cheap camera does. What they leave is common to all images: it does not
 average out, it hardly shows in the pixels' noise, and it moves the intrinsics that are fitted with it. It is a random
-effect here as the systematic errors of the robot are: polynomials over the image, of one size that is estimated with the
-rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9). What the intrinsics can express is taken out
-of them, so that the intrinsics are those that fit the image best.
+effect here as the systematic errors of the robot are: polynomials over the image, of one size that is estimated with
+the rest (MacKay, "Bayesian interpolation", Neural Computation 4, 1992, eq. 4.9). What the intrinsics can express is
+taken out of them, so that the intrinsics are those that fit the image best.
 """
 
 import numpy as np

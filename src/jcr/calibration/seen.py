@@ -3,8 +3,8 @@
 A pixel x at a distance d is the point p = d·u(K, x) in the camera, u being the unit ray, and X·p in the gripper. Its
 error comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale; the
 three were estimated together, and a principal point that is off by what a rotation of the camera makes good harms
-nobody who uses both. Each alone says too much, therefore; this is their joint covariance, carried to the point
-(projection uncertainty, as mrcal has it for a camera by itself: Kogan, "mrcal", documentation, "Projection uncertainty").
+nobody who uses both. Each alone exaggerates, therefore; this is their joint covariance, carried to the point
+(projection uncertainty, as mrcal has it for a camera by itself: Kogan, "mrcal", "Projection uncertainty").
 """
 
 from dataclasses import dataclass, replace
@@ -147,6 +147,8 @@ def with_given_intrinsics(
         return None
     off = parameters(given) - parameters(camera)
     step = cross @ np.linalg.pinv(estimate.intrinsics_covariance, rcond=1e-12, hermitian=True) @ off
+    # Who keeps the pair has distances of their own, and no scale.
+    step[6] = 0.0
     pair = replace(
         estimate,
         covariance=estimate.covariance + np.outer(step, step),

@@ -141,8 +141,8 @@ class Run:
         kept = self.calibration.with_given_intrinsics
         if kept is None:
             raise InputError(
-                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave none, or "
-                "they were not estimated beside them; leave it out"
+                f"--intrinsics given: {self.folder.path} has no transform for given intrinsics: the capture gave "
+                "none, or no others were estimated beside them; leave it out"
             )
         return kept
 

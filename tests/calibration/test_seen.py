@@ -1,0 +1,170 @@
+"""What a calibration is used for: where it places a point that the camera sees."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.seen import BENT, WAYS, measure
+from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
+from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
+from jcr.adjust.points import points_in_base
+from jcr.adjust.robots import Adjusted
+from jcr.adjust.wrist import adjust_wrist
+from jcr.calibration.seen import (
+    Scene,
+    in_use,
+    joint_covariance,
+    scene_uncertainty,
+    seen_in_base,
+    seen_uncertainty,
+    with_given_intrinsics,
+    within_95,
+)
+from jcr.camera import parameters, unproject, with_parameters
+from jcr.geometry import apply, inverse, retract
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import Estimate, HandEye, Intrinsics
+
+X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
+DISTANCE_M = 0.45
+
+
+def adjusted(problem: HandEyeProblem, camera: Intrinsics = LENS, seed: int = 0) -> tuple[Adjusted, HandEye]:
+    tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3, camera)
+    start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    found = adjust_wrist(
+        problem.base_from_gripper,
+        (start.gripper_from_camera, start.scale, start.base_from_recon),
+        problem.recon_from_camera,
+        LENS,
+        tracks,
+        prior=prior_of(LENS, ESTIMATED),
+    )
+    return found, start
+
+
+@cache
+def estimated(seed: int = 0) -> tuple[Estimate, HandEye]:
+    rng = np.random.default_rng(seed)
+    problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
+    found, start = adjusted(problem, seed=seed)
+    return Estimate(
+        gripper_from_camera=found.placed.x[0],
+        scale=1.0,
+        base_from_recon=np.eye(4),
+        covariance=found.covariance[:7, :7],
+        intrinsics=found.placed.scene.cameras[0],
+        intrinsics_covariance=found.intrinsics_covariance(0),
+        intrinsics_cross=found.intrinsics_cross(0),
+    ), start
+
+
+def placed(x: np.ndarray, camera: Intrinsics, log_scale: float = 0.0) -> np.ndarray:
+    ray = unproject(camera, X_PX)
+    return apply(x, np.exp(log_scale) * DISTANCE_M * ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
+    estimate, _ = estimated()
+    assert estimate.intrinsics is not None
+    steps = np.random.default_rng(0).multivariate_normal(
+        np.zeros(16), joint_covariance(estimate), 4000, method="eigh"
+    )
+    drawn = np.array(
+        [
+            placed(
+                retract(estimate.gripper_from_camera, step[:6]),
+                with_parameters(estimate.intrinsics, parameters(estimate.intrinsics) + step[7:]),
+                step[6],
+            )
+            for step in steps
+        ]
+    )
+    in_camera = drawn @ estimate.gripper_from_camera[:3, :3]
+    for k, covariance in enumerate(seen_uncertainty(estimate, estimate.intrinsics, X_PX, DISTANCE_M)):
+        assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
+
+
+def test_intrinsics_and_transform_together_place_a_point_better_than_each_is_known():
+    estimate, _ = estimated()
+    assert estimate.intrinsics is not None
+    together = seen_uncertainty(estimate, estimate.intrinsics, X_PX[0], DISTANCE_M)
+    apart = replace(estimate, intrinsics_cross=np.zeros_like(estimate.intrinsics_cross))
+    assert np.trace(together) < 0.7 * np.trace(
+        seen_uncertainty(apart, estimate.intrinsics, X_PX[0], DISTANCE_M)
+    )
+    found = in_use(estimate, Scene(DISTANCE_M))
+    assert found.seen.within_95_mm == pytest.approx(1e3 * within_95(together))
+    assert found.seen.lateral_95_mm < found.seen.within_95_mm < found.corners.within_95_mm
+
+
+def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
+    estimate, start = estimated()
+    assert estimate.intrinsics is not None
+    hand_eye = replace(start, estimate=estimate)
+    pose = inverse(np.linalg.inv(hand_eye.gripper_from_camera))
+    found = seen_in_base(hand_eye, estimate.intrinsics, X_PX, DISTANCE_M, pose)
+    here = seen_uncertainty(estimate, estimate.intrinsics, X_PX, DISTANCE_M)
+    assert np.trace(found.calibration, axis1=1, axis2=2) == pytest.approx(np.trace(here, axis1=1, axis2=2))
+    noise, rng = hand_eye.robot_noise, np.random.default_rng(0)
+    steps = rng.normal(size=(4000, 6)) * np.repeat((noise.translation, noise.rotation), 3)
+    drawn = np.array(
+        [
+            apply(retract(pose, step), placed(estimate.gripper_from_camera, estimate.intrinsics))[1]
+            for step in steps
+        ]
+    )
+    assert np.cov(drawn.T) == pytest.approx(found.robot_random[1], abs=0.06 * np.trace(found.robot_random[1]))
+    assert found.together == pytest.approx(found.calibration + found.robot_random + found.robot_systematic)
+
+
+def test_each_intrinsics_have_a_transform_of_their_own():
+    estimate, _ = estimated()
+    assert estimate.intrinsics is not None
+    off = parameters(estimate.intrinsics)
+    off[:4] += [3.0, 3.0, 3.0, -3.0]
+    given = with_parameters(estimate.intrinsics, off)
+    pair = with_given_intrinsics(estimate, given, DISTANCE_M)
+    assert pair is not None and pair.intrinsics == given
+    here = placed(estimate.gripper_from_camera, estimate.intrinsics)[0]
+    with_its_own, mixed = (
+        1e3 * np.linalg.norm(placed(x, given)[0] - here)
+        for x in (pair.gripper_from_camera, estimate.gripper_from_camera)
+    )
+    assert with_its_own < 0.5 * mixed and mixed > 2
+    assert pair.differs_mm == pytest.approx(with_its_own, abs=0.1)
+    assert pair.seen.within_95_mm > pair.differs_mm
+    assert with_given_intrinsics(replace(estimate, intrinsics_cross=None), given, DISTANCE_M) is None
+
+
+def test_points_of_the_scene_are_where_they_are_said_to_be():
+    inside, sizes = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
+        found, _ = adjusted(problem, seed=seed)
+        points = points_in_base(found)
+        # The tracks are of points that the problem drew first, in the base.
+        true = np.random.default_rng([seed, 1]).uniform([0.25, -0.25, 0.0], [0.75, 0.25, 0.12], (300, 3))
+        nearest = np.linalg.norm(points.in_base[:, None] - true, axis=2).min(1)
+        n = np.arange(len(nearest))
+        covariance = points.together[n, :, n] + points.own
+        inside.append(nearest < np.array([within_95(one) for one in covariance]))
+        scene = scene_uncertainty(points)
+        sizes.append(np.trace(scene.covariance_at(points.in_base), axis1=1, axis2=2).mean())
+        assert sizes[-1] == pytest.approx(
+            np.trace(points.together[n, :, n], axis1=1, axis2=2).mean(), rel=0.1
+        )
+    assert np.concatenate(inside).mean() > 0.8
+
+
+@pytest.mark.slow
+def test_seen_points_err_as_is_said_whatever_is_known_of_the_camera():
+    rows = measure(("white",), (12,), WAYS, draws=8)
+    assert {row.known for row in rows} == {way.name for way in WAYS} and BENT in {way.camera for way in WAYS}
+    for row in rows:
+        assert row.within_95 > 0.85 and row.within_3 > 0.95, row
+        assert row.seen_mm < row.said_mm < 5 * row.seen_mm, row
