@@ -101,6 +101,11 @@ BENCHES = {
             "benchmarks/board_intrinsics.py",
         ),
     ),
+    "seen": Bench(
+        "points that the camera sees, in simulation: are they placed as exactly as is said?",
+        measures=(*SOLVER, "benchmarks/simulated"),
+        long="40 draws of every row instead of 10",
+    ),
     "matching": Bench(
         "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
         of_captures=True,

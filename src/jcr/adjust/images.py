@@ -165,8 +165,8 @@ def adjust_images(scene: Scene, observations: Observations, freedom: Freedom) ->
         before = noise
         scene, view, damping = minimised(scene, problem, noise, world, damping)
         noise = noise_of(scene, view, problem, before)
-        resized, change = with_model_error_of(evidence(scene, problem, noise))
-        problem = resized
+        images, change = with_model_error_of(evidence(scene, problem, noise))
+        problem = images.problem
         if max(noise.change(before), change) < SIZES_SETTLED:
             break
     unit = float(np.median(np.abs(depth / view.depth)))
@@ -283,15 +283,25 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
     )
 
 
-def with_model_error_of(images: ImageEvidence) -> tuple[ImageProblem, float]:
-    """The problem with displacements as large as the images show them, and the relative change of that."""
+def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
+    """The evidence with displacements as large as it shows them, and the relative change of that."""
     freedom = images.problem.freedom
     columns, std = freedom.model_error_columns, freedom.model_error_std
     if len(std) == 0:
-        return images.problem, 0.0
-    variance = np.diag(np.linalg.inv(images.information))[columns]
-    size = size_of(images.scene.camera_steps[columns], variance, std)
-    return images.problem.with_model_error(size), abs(float(np.log(size[0] / std[0])))
+        return images, 0.0
+    covariance = np.linalg.inv(images.information)
+    steps = images.scene.camera_steps[columns]
+    likeliest = steps - covariance[columns] @ images.gradient
+    size = size_of(likeliest, covariance[columns, columns], std)
+    information, gradient = images.information.copy(), images.gradient.copy()
+    change = size**-2.0 - std**-2.0
+    information[columns, columns] += np.diag(change)
+    gradient[columns] += change * steps
+    resized = images.problem.with_model_error(size)
+    return (
+        replace(images, problem=resized, information=information, gradient=gradient),
+        abs(float(np.log(size[0] / std[0]))),
+    )
 
 
 def median_reprojection_px(view: View, problem: ImageProblem) -> Float[ndarray, " n"]:

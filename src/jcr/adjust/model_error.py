@@ -20,6 +20,8 @@ DEGREE = 5
 """Of the polynomials: what a seventh power of the radius leaves beside k1, k2 and k3 has this."""
 TYPICAL = 1e-4
 """Of the width, per polynomial: the middle of the prior of their size, a weak one."""
+UPDATES, SETTLED = 100, 1e-3
+"""At most so many of the size, to this relative change of its square."""
 WORTH = 2.0
 """Polynomials that the typical size counts for, beside those that the images determine."""
 
@@ -44,12 +46,26 @@ def displacements(
 
 
 def size_of(
-    steps: Float[ndarray, " e"], variance: Float[ndarray, " e"], std: Float[ndarray, " e"]
+    likeliest: Float[ndarray, " e"], covariance: Float[ndarray, "e e"], std: Float[ndarray, " e"]
 ) -> Float[ndarray, " e"]:
-    """The size of displacements from where they are and how well that is known, given the size that was assumed."""
-    determined = float((1 - np.minimum(variance / std**2, 1.0)).sum())
-    size = np.sqrt((steps @ steps + WORTH * TYPICAL**2) / (determined + WORTH))
-    return np.full(len(steps), size)
+    """The size of displacements, from where they are likeliest with a prior of size `std` and how well that is known.
+
+    At the fixed point of MacKay's update, beside a weak prior.
+    """
+    posterior = np.linalg.inv(covariance)
+    right = posterior @ likeliest
+    # Of the images alone, along directions of which they know independently.
+    known, directions = np.linalg.eigh(posterior - np.diag(std**-2.0))
+    known, right = np.maximum(known, 0.0), directions.T @ right
+    variance = float(std[0] ** 2)
+    for _ in range(UPDATES):
+        information = known + 1 / variance
+        determined = float((known / information).sum())
+        squares = float(((right / information) ** 2).sum())
+        before, variance = variance, (squares + WORTH * TYPICAL**2) / (determined + WORTH)
+        if abs(np.log(variance / before)) < SETTLED:
+            break
+    return np.full(len(std), np.sqrt(variance))
 
 
 def _polynomials_count() -> int:

@@ -218,8 +218,8 @@ def adjust(
         before = pixels, log_sizes
         scene, view, damping = minimised(placed.scene, problem, pixels, robots, damping)
         pixels = noise_of(scene, view, problem, pixels)
-        problem, resized = with_model_error_of(evidence(scene, problem, pixels))
-        given = replace(given, evidence=evidence(scene, problem, pixels))
+        images, resized = with_model_error_of(evidence(scene, problem, pixels))
+        problem, given = images.problem, replace(given, evidence=images)
         placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
         equations, _ = equations_of(placed, given)
         robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
