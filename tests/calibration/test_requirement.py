@@ -149,7 +149,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
         if asked is None:
             assert show(result, Output()) == 0
             said = capsys.readouterr()
-            assert "95 % of errors are below" in said.out and not said.err
+            assert "(95 % of errors)" in said.out and not said.err
             continue
         with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
             show(result, Output())

@@ -21,7 +21,7 @@ DEGREE = 5
 TYPICAL = 1e-4
 """Of the width, per polynomial: the middle of the prior of their size, a weak one."""
 UPDATES, SETTLED = 100, 1e-3
-"""At most so many of the size, to this relative change of its square."""
+"""Most updates of the size, and the relative change of its square that ends them."""
 WORTH = 2.0
 """Polynomials that the typical size counts for, beside those that the images determine."""
 

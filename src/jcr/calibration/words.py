@@ -55,16 +55,17 @@ def found(content: "CalibrationFile") -> list[str]:
         f"back end {content.backend})",
         *(f"  {row}" for row in matrix),
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
-        *([] if content.requirement is None else [f"  {reached_in_words(content.requirement)}"]),
-        f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %",
     ]
-    if (seen := uncertainty.seen) is not None and uncertainty.joint is not None:
-        lines.insert(-2, f"  {seen_in_words(seen)}")
-    if content.with_given_intrinsics is not None:
-        lines.append(f"  {given_in_words(content.with_given_intrinsics)}")
     if uncertainty.budget is not None:
         parts = "; ".join(f"{name} {size}" for name, size in budget_in_words(uncertainty.budget).items())
-        lines.insert(-1, f"  from: {parts}")
+        lines.append(f"  from: {parts}")
+    if content.requirement is not None:
+        lines.append(f"  {reached_in_words(content.requirement)}")
+    if (seen := uncertainty.seen) is not None and uncertainty.joint is not None:
+        lines.append(f"  {seen_in_words(seen)}")
+    if content.with_given_intrinsics is not None:
+        lines.append(f"  {given_in_words(content.with_given_intrinsics)}")
+    lines.append(f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %")
     if content.scale_check is not None:
         lines.append(f"  {scale_in_words(content.scale_check)}")
     if content.depth_check is not None:
@@ -75,12 +76,11 @@ def found(content: "CalibrationFile") -> list[str]:
 
 
 def seen_in_words(seen: "SeenAndCorners") -> str:
-    """How exactly a point that the camera sees is placed, and what that is made of."""
+    """What the uncertainty of a point that the camera sees is made of, and where it is largest."""
     return (
-        f"a point seen at {significant(1e-3 * seen.distance_mm)} m is placed within "
-        f"{significant(seen.within_95_mm)} mm in the robot's base frame (95 %; {significant(seen.lateral_95_mm)} mm "
-        f"across the ray, {significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a "
-        "corner of the image), with the intrinsics of this run and exact gripper poses"
+        f"of a seen point: {significant(seen.lateral_95_mm)} mm across the ray and {significant(seen.along_95_mm)} mm "
+        f"along it, {significant(seen.corners.within_95_mm)} mm in a corner of the image, with the intrinsics of this "
+        "run and exact gripper poses"
     )
 
 

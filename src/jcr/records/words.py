@@ -70,16 +70,14 @@ def _reached(required: Mapping[str, Any]) -> str:
     far = required["distance_mm"]
     at = required.get("at", "seen" if far else "camera")
     asked = "asked for" if required["asked"] else "needed to grasp"
-    of = {
-        "seen": f"a point seen at {significant(1e-3 * far)} m",
-        "camera": "the camera on the gripper",
-        "scene": "mapped points in the base frame",
+    mm, degrees = significant(required["reached_mm"]), significant(required["reached_deg"])
+    reached = {
+        "seen": f"a point seen at {significant(1e-3 * far)} m is placed within {mm} mm and {degrees}° in the robot's base "
+        "frame (95 % of errors)",
+        "camera": f"95 % of errors of the camera on the gripper are below {mm} mm and {degrees}°",
+        "scene": f"95 % of errors of mapped points are below {mm} mm and {degrees}°",
     }
-    return (
-        f"{of[at]}: 95 % of errors are below {significant(required['reached_mm'])} mm and "
-        f"{significant(required['reached_deg'])}°; {required['translation_mm']:g} mm and "
-        f"{required['rotation_deg']:g}° are {asked}"
-    )
+    return f"{reached[at]}; {required['translation_mm']:g} mm and {required['rotation_deg']:g}° are {asked}"
 
 
 def network_scale(off_percent: float, std_percent: float) -> str:

@@ -34,6 +34,7 @@ from jcr.report.object_table import objects_section
 from jcr.report.pictures import images_section, thumbnails
 from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
+from jcr.report.seen import seen_section
 from jcr.report.transform import transform_section
 from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
@@ -41,7 +42,7 @@ from jcr.rounding import significant
 SURFACE_POINTS = 80_000
 """Sampled from the map, at most."""
 
-MAIN = ("Translation, 1 σ", "Rotation, 1 σ")
+MAIN = ("A seen point", "Translation, 1 σ", "Rotation, 1 σ")
 """The tiles with the largest numbers."""
 
 ANY_LENS = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
@@ -50,6 +51,7 @@ LINKS = {
     "warnings": "Warnings",
     "notes": "Notes",
     "transform": "Transform",
+    "seen": "Seen points",
     "view": "3D",
     "images": "Images",
     "features": "Features",
@@ -95,6 +97,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         _remarks("warnings", "Warnings", calibration.remarks),
         _remarks("notes", "Notes", calibration.notes),
         transform_section(hand_eye),
+        seen_section(result),
         "" if result.cameras is None else cameras_section(result.cameras),
         scene_section(result, base_from_camera, surface),
         images_section(result),
@@ -201,7 +204,7 @@ def _verdict(calibration: CalibrationFile) -> str:
         kind, headline = "fair", f"<b>{SHORT.capitalize()}:</b> {escape(say)}."
     else:
         within = "nothing speaks against it" if required is None else escape(reached_in_words(required))
-        kind, headline = "good", f"<b>Trusted:</b> {within}."
+        kind, headline = "good", f"<b>Accepted:</b> {within}."
     if held_out is None:
         believe = "There were too few images to leave one out and see how well the others predict it."
     elif not calibration.observability.observable:
@@ -224,15 +227,15 @@ def _verdict(calibration: CalibrationFile) -> str:
 
 def _tiles(calibration: CalibrationFile) -> str:
     tiles = []
-    required = calibration.requirement
     if (uncertainty := calibration.uncertainty) is not None:
         direction, _, size = uncertainty.worst.partition(": ")
         worst_deg = significant(max(uncertainty.rotation_std_deg))
-        at = " ahead" if required is not None and required.distance_mm else ""
-        below_mm = "" if required is None else f"95 %{at} below {significant(required.reached_mm)} mm; "
-        below_deg = "" if required is None else f"95 % below {significant(required.reached_deg)}°; "
-        tiles.append(("Translation, 1 σ", size, f"{below_mm}worst {direction}"))
-        tiles.append(("Rotation, 1 σ", f"±{worst_deg}°", f"{below_deg}worst about an axis of the gripper"))
+        if (seen := uncertainty.seen) is not None:
+            far = significant(1e-3 * seen.distance_mm)
+            where = f"at {far} m, 95 % of errors; {significant(seen.ray_95_deg)}° of its ray"
+            tiles.append(("A seen point", f"{significant(seen.within_95_mm)} mm", where))
+        tiles.append(("Translation, 1 σ", size, f"of the camera; worst {direction}"))
+        tiles.append(("Rotation, 1 σ", f"±{worst_deg}°", "of the camera; worst about an axis of the gripper"))
     if (held_out := calibration.held_out) is not None:
         degrees = f"{significant(held_out.rotation_deg)}°{pixels(held_out).replace(', ', ' · ')}"
         tiles.append(("Leave-one-out error", f"{significant(held_out.translation_mm)} mm", degrees))

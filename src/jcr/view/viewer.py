@@ -86,7 +86,7 @@ class Viewer:
         elif (short := calibration.short) is not None:
             lines.append(f"**{sentence(short)}**")
         elif calibration.requirement is not None:
-            lines.append(f"**Trusted:** {reached_in_words(calibration.requirement)}")
+            lines.append(f"**Accepted:** {reached_in_words(calibration.requirement)}")
         if calibration.converged and held_out is not None:
             lines.append(
                 f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "
