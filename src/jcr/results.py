@@ -17,7 +17,7 @@ from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
-from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
+from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction, Verdict
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith
 from jcr.segment.measure import Measured
@@ -98,8 +98,13 @@ class RunResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
+        """Whether the calibration is accepted, with warnings or without."""
         return self.hand_eye.converged
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of calibration.json."""
+        return self.hand_eye.verdict
 
     def timed(self, stage: str, start: float, notes: Sequence[str] = ()) -> "RunResult":
         """With the seconds since `start` (time.perf_counter) and the notes of one more stage."""
@@ -142,7 +147,7 @@ def hand_eye_table(hand_eye: HandEye, report: str) -> str:
         f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
         for k, axis in enumerate("xyz")
     )
-    verdict = "accepted" if hand_eye.converged else f"rejected: {escape('; '.join(hand_eye.warnings))}"
+    verdict = ": ".join(filter(None, (hand_eye.verdict, escape("; ".join(hand_eye.warnings)))))
     return (
         f"<p><b>gripper_from_camera</b>, {verdict}; {int(hand_eye.inliers.sum())} of {len(hand_eye.inliers)} poses "
         f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
@@ -159,11 +164,11 @@ class PosesResult:
     calibration: CalibrationFile
     hand_eye: HandEye
     scale_is_one: bool
-    """Whether it may be trusted and the scale is that of a marker whose size is right."""
+    """Whether it is accepted and the scale is that of a marker whose size is right."""
 
     @property
     def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
+        """Whether the calibration is accepted, with warnings or without."""
         return self.hand_eye.converged
 
     @property

@@ -1,4 +1,4 @@
-"""Is yesterday's calibration still valid of today's images? What `jcr verify` answers."""
+"""Has the camera moved since it was calibrated? What `jcr verify` answers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from jcr.handeye.fit import PoseFit, fit_poses
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.relocate import Located, relocate
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
@@ -73,12 +73,19 @@ class Verification:
         return float(np.linalg.norm(self.offset[3:]))
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
+        """Of the calibration, for the new images."""
+        if self.moved:
+            return "rejected"
+        return "accepted with warnings" if self.notes else "accepted"
+
+    @property
+    def finding(self) -> str:
         """What has moved, in words."""
         if self.fixed is not None:
-            return f"{self.fixed} has moved" if self.moved else "still valid"
+            return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
-        return f"{moved[self.cause]} has moved" if self.moved else "still valid"
+        return f"{moved[self.cause]} has moved" if self.moved else "nothing has moved"
 
     @property
     def advice(self) -> str:
@@ -104,7 +111,7 @@ def verify(
 ) -> Verification:
     """Hold the calibration in the run folder `out` against the few images of `new`.
 
-    Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
+    Raises InputError for a run that holds no accepted calibration, or images of another camera; NotTrustedError
     when the images share too few features with the old scene, or too few of another, to tell.
     """
     report = progress or silent

@@ -54,14 +54,17 @@ def advised(
 
 
 def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
-    """That a calibration is not as exact as is required; `systematic`: mostly by systematic errors of the robot."""
+    """That a calibration is not as exact as is required, which rejects it where a user asked for it.
+
+    `systematic`: mostly by systematic errors of the robot.
+    """
     if required.is_met:
         return None
     mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
     numbers = {name: float(value) for name, value in vars(required).items() if value is not None}
     return Finding(
         kind=Kind.NOT_EXACT_ENOUGH,
-        severity="warns",
+        severity="rejects" if required.asked else "warns",
         mend=mend,
         value=1e-3 * required.reached_mm,
         details=numbers,

@@ -378,6 +378,11 @@ class HandEye:
         return self.verdict != "rejected"
 
     @property
+    def is_sound(self) -> bool:
+        """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
+        return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
+
+    @property
     def doubt(self) -> str | None:
         """Why it is rejected, in words; None when it is not."""
         return doubt_of(self.findings)
