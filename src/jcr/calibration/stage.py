@@ -1,5 +1,7 @@
 """The calibration of a capture: fit, adjust, checks, verdict, requirement."""
 
+import numpy as np
+
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.fit import fitted
@@ -27,5 +29,10 @@ def calibrate(
     case = adjusted(fitted(capture, reconstruction, options, robot))
     for check in CHECKS:
         if check.needs(case):
-            case = with_checked(case, check.run(case))
+            try:
+                case = with_checked(case, check.run(case))
+            except np.linalg.LinAlgError:
+                # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
+                if case.hand_eye.converged:
+                    raise
     return advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std)

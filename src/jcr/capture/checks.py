@@ -15,12 +15,14 @@ from jcr.capture.images import TURNED, how_stored, read_image
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.errors import InputError
-from jcr.geometry import require_rigid
+from jcr.geometry import require_rigid, step_between
 from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
 
 NAMED = 10
 """Images that a message names; of more it says how many."""
 MIRRORED = (2, 4, 5, 7)
+SAME_POSE = (0.5e-3, np.radians(0.05))
+"""m, rad: within this, poses are one at which the arm rests."""
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
@@ -75,6 +77,18 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
         raise InputError(f"{where}: {count} frames; choose {MAX_FRAMES} at most, 8 to 15 are good")
     if count < at_least:
         raise InputError(f"{where}: {count} frames; at least {at_least} are needed, 8 to 12 are good")
+
+
+def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
+    """Raises InputError where three gripper poses or more are one and the same."""
+    metres, radians = np.abs(step_between(base_from_gripper[:1], base_from_gripper).reshape(-1, 2, 3)).max(
+        axis=(0, 2), initial=0.0
+    )
+    if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:
+        raise InputError(
+            f"{where}: all {len(base_from_gripper)} gripper poses are the same (within {1e3 * metres:.2g} mm and "
+            f"{np.degrees(radians):.2g}°); read the pose again for each image"
+        )
 
 
 def checked_lens(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import how_scaled, how_turned, require_frames
+from jcr.capture.checks import how_scaled, how_turned, require_frames, require_motion
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
@@ -96,8 +96,10 @@ def read_source(
             found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
         if not isinstance(found, Capture):
             require_frames(len(found.base_from_gripper), str(path), 0)
+            require_motion(found.base_from_gripper, str(path))
             return found
         require_frames(len(found), str(path), at_least)
+        require_motion(found.base_from_gripper, str(path))
         turned = how_turned(found)
         remarks = (None if turned is None else sentence(turned), how_scaled(found))
         return replace(found, notes=(*found.notes, *filter(None, remarks)))

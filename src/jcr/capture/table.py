@@ -1,6 +1,5 @@
 """Images and a table of gripper poses: which image belongs to which row."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from numpy import ndarray
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture
 from jcr.capture.depth_images import depth_beside
+from jcr.capture.names import natural
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.capture.pose_table import PoseTable, read_pose_table, stamp_ns
@@ -156,8 +156,4 @@ def _pictures(folder: Path) -> list[str]:
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in PICTURES]
     names = [str(file.relative_to(folder)) for file in files]
-    return sorted(names, key=_natural)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return sorted(names, key=natural)
