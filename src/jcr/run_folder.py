@@ -310,7 +310,11 @@ def _with_depth_apart(content: bytes) -> bytes:
 
 
 def state_of(capture: Capture, options: MadeWith) -> State:
-    """The state of a run with these options, before anything was tried."""
+    """The state of a run with these options, before anything was tried; InputError where no file can hold it."""
+    try:
+        str(capture.folder.resolve()).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
     return State(
         capture=str(capture.folder.resolve()),
         reconstruct=fingerprint(capture, _deciding(options.reconstruct)),

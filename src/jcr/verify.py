@@ -1,11 +1,11 @@
 """Has the camera moved since it was calibrated? What `jcr verify` answers."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from scipy.stats import chi2
 
@@ -131,11 +131,13 @@ def verify(
             f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
             f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
         )
+    taken_then, taken_now = _images(capture.folder, capture.images), _images(new.folder, new.images)
+    _require_new(taken_now, taken_then)
     report("find the old scene", 0.0)
     located = relocate(
         reconstruction,
-        [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index],
-        [read_image(new.folder / name) for name in new.images],
+        [taken_then[capture.images[row]] for row in reconstruction.image_index],
+        [*taken_now.values()],
     )
     report("find the old scene", 1.0)
     shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
@@ -158,7 +160,7 @@ def verify(
             systematic,
             options.alpha,
         )
-        notes = (*lost, *([] if unused is None else [sentence(unused)]))
+        notes = (*lost, *([] if unused is None else [sentence(unused)]), *_same_poses(new, capture))
         return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
     if len(new) < MIN_TO_RECALIBRATE:
         raise NotTrustedError(
@@ -196,6 +198,11 @@ def verify_camera(
     if name not in placed:
         there = ", ".join(placed) or "none"
         raise InputError(f"--camera {name}: {out} has placed no fixed camera of that name; there are {there}")
+    own = others[name]
+    _require_new(
+        {str(picture): read_image(picture) for picture in pictures},
+        _images(own.folder or capture.folder, own.images),
+    )
     # One lens took both: what is wrong with it moves both places alike.
     lens = placed[name]
     exact = np.zeros(4 + len(lens.distortion))
@@ -220,6 +227,37 @@ def verify_camera(
     notes = tuple(text for camera in found.cameras for text in camera.warnings)
     images = tuple(str(picture) for picture in pictures)
     return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
+
+
+def _images(folder: Path, names: Sequence[str]) -> dict[str, UInt8[ndarray, "h w 3"]]:
+    return {name: read_image(folder / name) for name in names}
+
+
+def _require_new(
+    now: Mapping[str, UInt8[ndarray, "_ _ 3"]], then: Mapping[str, UInt8[ndarray, "_ _ 3"]]
+) -> None:
+    """InputError where an image is one of the calibration, whatever it is called: that would confirm itself."""
+    for name, image in now.items():
+        for old, other in then.items():
+            if np.array_equal(image, other):
+                raise InputError(
+                    f"{name}: is {old}, which the calibration was made from, and cannot test it; take a new image"
+                )
+
+
+def _same_poses(new: Capture, then: Capture) -> tuple[str, ...]:
+    """A note where gripper poses are to the last digit those of the calibration: commanded ones, or copied."""
+    same = [
+        name
+        for name, pose in zip(new.images, new.base_from_gripper, strict=True)
+        if (pose == then.base_from_gripper).all(axis=(1, 2)).any()
+    ]
+    if not same:
+        return ()
+    return (
+        f"{', '.join(same)}: the gripper pose is to the last digit one of the calibration; give the pose that the robot "
+        "measures there now, not a copy or the commanded one",
+    )
 
 
 def fitted(

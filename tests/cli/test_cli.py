@@ -201,7 +201,11 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["fly"], "not a jcr command"),
+        (["fly"], "not a jcr command; choose from"),
+        (["rum"], "not a jcr command; did you mean run?"),
+        (["run", "a", "b", "--requre", "1", "1"], "did you mean --require? (jcr run --help)"),
+        (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
+        (["export", "a", "octomapp"], "did you mean octomap?"),
         (["run"], "required"),
         (
             ["run", "a", "b", "--require", "2"],

@@ -14,6 +14,7 @@ from numpy import ndarray
 from jcr.capture.images import TURNED, how_stored, read_image
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
+from jcr.capture.robot_poses import likely_unit
 from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
 from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
@@ -140,9 +141,10 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
     """InputError when positions are too far from the base to be metres."""
     farthest = float(np.abs(base_from_gripper[:, :3, 3]).max())
     if farthest > MAX_REACH:
+        name, short, a_metre = likely_unit(farthest)
         raise InputError(
-            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like millimetres: "
-            "divide the translations by 1000 (a pose table: --pose-units mm-rad or mm-deg)"
+            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
+            f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
         )
 
 

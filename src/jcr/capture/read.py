@@ -11,7 +11,7 @@ from jcr.capture.checks import how_scaled, how_turned, require_frames, require_m
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
-from jcr.capture.table import find_table
+from jcr.capture.table import find_table, pictures
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
 from jcr.geometry import inverse
@@ -87,7 +87,7 @@ def read_source(
         )
     if options.frames < 3:
         raise InputError(f"--frames {options.frames}: at least 3 frames are needed, 8 to 15 are good")
-    row = FORMATS[format_of(path) if options.format == "auto" else options.format]
+    row = FORMATS[format_of(path, options) if options.format == "auto" else options.format]
     module, function = row.reader.split(":")
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
@@ -130,12 +130,12 @@ def _content(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def format_of(path: Path) -> str:
+def format_of(path: Path, options: ReadOptions | None = None) -> str:
     """The name of the format that the files at a path show; InputError when they show none."""
-    return _of_folder(path) if path.is_dir() else _of_file(path)
+    return _of_folder(path, options or ReadOptions()) if path.is_dir() else _of_file(path)
 
 
-def _of_folder(folder: Path) -> str:
+def _of_folder(folder: Path, options: ReadOptions) -> str:
     for name, sign in (
         ("capture", "capture.json"),
         ("bag", "metadata.yaml"),
@@ -147,10 +147,15 @@ def _of_folder(folder: Path) -> str:
             return name
     if find_model(folder) is not None:
         return "colmap"
-    if find_table(folder) is not None:
+    if options.poses is not None or find_table(folder) is not None:
         return "table"
     if any(file.suffix in BAGS for file in folder.iterdir()):
         raise InputError(f"{folder}: holds bags; name one of them")
+    if taken := pictures(folder):
+        raise InputError(
+            f"{folder}: no capture.json and no poses.csv beside its {len(taken)} images ({taken[0]} … {taken[-1]}); "
+            "add a table of gripper poses with the columns image,x,y,z,qx,qy,qz,qw (m), or name one with --poses"
+        )
     raise InputError(
         f"{folder}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); "
         "see jcr docs captures"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, NotTrustedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportOptions, FormatName
 from jcr.export.provenance import Provenance
@@ -59,7 +59,10 @@ def written(
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
-        raise InputError(f"{format}: no such format; choose one of {', '.join(get_args(FormatName))}")
+        names = get_args(FormatName)
+        raise InputError(
+            f"{format}: no such format{did_you_mean(format, names)}; choose one of {', '.join(names)}"
+        )
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     run = Run(out, options)
