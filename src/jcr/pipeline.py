@@ -4,7 +4,7 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import NotTrustedError
-from jcr.mapping import measured, require_map
+from jcr.mapping import measured, require_dense, require_map, why_no_map
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
@@ -33,23 +33,32 @@ def run(
     *,
     backend: str | None = None,
     progress: Progress | None = None,
+    calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
     """Calibrate a capture and write calibration, cloud, map and report to the folder `out`.
 
-    Finished stages are reused from `out` if capture and options are unchanged. Raises InputError if the input cannot be
-    used, or if a map is requested and torch is not installed, and NotTrustedError if no camera poses are found
-    (calibration.json then says why).
+    Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
+    says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
+    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
     """
     options = (options or RunOptions()).for_capture(capture, backend)
     check_options(options.calibrate)
+    missing = None
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         options = replace(options, map=None)
     if options.map is not None:
-        require_map(options.depth)
+        require_dense(options.depth)
+        if (missing := why_no_map()) is not None:
+            options = replace(options, map=None)
     with held(Path(out)) as folder:
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
-        return _all_stages(capture, added, folder, options, progress or silent)
+        result = stages.calibrated(capture, folder, options, progress or silent)
+        if missing is not None:
+            result = result.noted(missing)
+        if calibrated is not None:
+            calibrated(result)
+        return _after_calibration(result, added, folder, options, progress or silent)
 
 
 def calibrate(
@@ -107,7 +116,8 @@ def build_map(
     capture = before.capture()
     with held(Path(out)) as folder:
         added = with_images(read_added(folder.path, capture), add)
-        return _all_stages(capture, added, folder, options, progress or silent)
+        result = stages.calibrated(capture, folder, options, progress or silent)
+        return _after_calibration(result, added, folder, options, progress or silent)
 
 
 def add_camera(
@@ -157,12 +167,11 @@ def measure(out: str | Path) -> Measured:
     return measured(folder.cloud(), folder.calibration())
 
 
-def _all_stages(
-    capture: Capture, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
+def _after_calibration(
+    result: RunResult, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     """`added` are the images of the map alone; None: there is no map."""
-    result = stages.calibrated(capture, folder, options, progress)
-    if capture.mount != "base":
+    if result.capture.mount != "base":
         result = stages.located(result, folder, options, progress)
     if added is not None:
         result = stages.densified(result, folder, options, progress)

@@ -106,11 +106,16 @@ class RunResult:
         """That of calibration.json."""
         return self.hand_eye.verdict
 
+    def noted(self, *notes: str) -> "RunResult":
+        """With more notes."""
+        update = {"notes": [*self.calibration.notes, *notes]}
+        return replace(self, calibration=self.calibration.model_copy(update=update))
+
     def timed(self, stage: str, start: float, notes: Sequence[str] = ()) -> "RunResult":
         """With the seconds since `start` (time.perf_counter) and the notes of one more stage."""
         timings = self.calibration.timings_s | {stage: round(time.perf_counter() - start, 3)}
-        update = {"timings_s": timings, "notes": [*self.calibration.notes, *notes]}
-        return replace(self, calibration=self.calibration.model_copy(update=update))
+        calibration = self.calibration.model_copy(update={"timings_s": timings})
+        return replace(self, calibration=calibration).noted(*notes)
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:

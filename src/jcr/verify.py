@@ -27,6 +27,8 @@ from jcr.records import Capture, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
+ROUNDING = 1e-9
+"""Of a pose that is written and read."""
 MIN_TO_RECALIBRATE = 5
 """Images of another scene; with fewer a wrong one cannot be outvoted."""
 
@@ -250,7 +252,7 @@ def _same_poses(new: Capture, then: Capture) -> tuple[str, ...]:
     same = [
         name
         for name, pose in zip(new.images, new.base_from_gripper, strict=True)
-        if (pose == then.base_from_gripper).all(axis=(1, 2)).any()
+        if (np.abs(pose - then.base_from_gripper) < ROUNDING).all(axis=(1, 2)).any()
     ]
     if not same:
         return ()

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr import pipeline, stages
@@ -14,7 +15,7 @@ from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.cli.output import Output
-from jcr.cli.result import show
+from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between, transform
 from jcr.records import Finding, HandEye, Kind, PosePairs
@@ -125,9 +126,14 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
         result = PosesResult(Path("out"), given, page(given, hand_eye)[0], hand_eye, False)
         if asked is None:
+            show_calibration(result, Output())
+            said = capsys.readouterr().out
+            quaternion = Rotation.from_matrix(hand_eye.gripper_from_camera[:3, :3]).as_quat(canonical=True)
+            assert "95 % of errors are below" in said
+            assert "qx qy qz qw: " in said and " ".join(f"{part:.6f}" for part in quaternion) in said
             assert show(result, Output()) == 0
             said = capsys.readouterr()
-            assert "95 % of errors are below" in said.out and not said.err
+            assert said.out.startswith("accepted\nnext: jcr export out ros2\n") and not said.err
             continue
         with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
             show(result, Output())

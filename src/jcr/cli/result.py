@@ -1,5 +1,6 @@
 """How a calibration is printed on the terminal, the same for every command that ends with one."""
 
+import shlex
 import sys
 from typing import TYPE_CHECKING
 
@@ -10,22 +11,32 @@ if TYPE_CHECKING:
     from jcr.results import PosesResult, RunResult
 
 
+def show_calibration(result: "RunResult | PosesResult", output: Output) -> None:
+    """Print the calibration for people as soon as it stands; with --json all comes at the end."""
+    from jcr.calibration.words import summary
+
+    if not output.json:
+        sys.stdout.write(summary(result.calibration))
+        sys.stdout.flush()
+
+
 def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> int:
-    """Print the calibration, its doubts and notes on stderr, and for people what comes after it.
+    """Print what follows the calibration: further cameras, the verdict and `after` it; doubts and notes on stderr.
 
     Returns exit status 0, or raises NotTrustedError where it is rejected.
     """
-    from jcr.calibration.words import summary
+    from jcr.calibration.words import verdict_in_words
     from jcr.cell.cameras_json import in_words
     from jcr.records.words import sentence
     from jcr.results import RunResult
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
-    facts, text = content.model_dump(), summary(content)
+    facts, text = content.model_dump(), ""
     if cameras is not None:
         facts |= {name: cameras.as_json()[name] for name in ("cameras", "arms")}
         text += "\n".join(in_words(cameras)) + "\n"
-    output.result(text + after, facts)
+    text += f"{verdict_in_words(content)}\n"
+    output.result(text + after + _next_commands(result), facts)
     for remark in content.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     # Notes on poses that were given are the reader's, which has printed them.
@@ -39,3 +50,22 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     if content.short is not None:
         sys.stderr.write(f"warning: {sentence(content.short)}\n")
     return 0
+
+
+def _next_commands(result: "RunResult | PosesResult") -> str:
+    """Three commands that make sense now, a line each."""
+    from jcr.results import RunResult
+
+    out = shlex.quote(str(result.out))
+    source = result.capture.source or result.capture.folder if isinstance(result, RunResult) else None
+    if not result.converged:
+        again = f"jcr check {'CAPTURE' if source is None else shlex.quote(str(source))}"
+        commands = (again, "jcr docs findings", "jcr docs captures")
+    elif isinstance(result, RunResult) and result.scene is not None:
+        commands = (f"jcr view {out}", f"jcr export {out} ros2", f"jcr verify {out} NEW_IMAGES")
+    else:
+        verify = (
+            f"jcr verify {out} NEW_IMAGES" if isinstance(result, RunResult) else f"jcr compare {out} OTHER"
+        )
+        commands = (f"jcr export {out} ros2", f"jcr export {out} urdf", verify)
+    return "next: " + "\n      ".join(commands) + "\n"
