@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +15,7 @@ from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image, show_one_view
 from jcr.capture.names import paired_by_name
+from jcr.capture.read import read_source
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.conventions import better_reading, convention_finding
@@ -75,7 +77,7 @@ class Examination:
 
 
 def check(
-    capture: Capture | PosePairs,
+    capture: Capture | PosePairs | str | Path,
     suggest: int = 0,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
@@ -84,7 +86,9 @@ def check(
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
-    """Examine a capture; with `look` its images are registered sparsely to hold the poses against them.
+    """Examine a capture, or what lies at its path.
+
+    With `look` its images are registered sparsely to hold the poses against them.
 
     A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
     `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
@@ -93,6 +97,8 @@ def check(
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
     poses and joint angles contradict each other.
     """
+    if isinstance(capture, str | Path):
+        capture = read_source(capture)
     gripper = capture.base_from_gripper
     motion = inverse(gripper)[:, None] @ gripper[None]
     move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())

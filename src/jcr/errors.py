@@ -33,3 +33,7 @@ class NotTrustedError(RuntimeError):
     def with_more(self, *also: str) -> "NotTrustedError":
         """The same with more to say."""
         return NotTrustedError(self.what, *self.remedies, also=(*self.also, *also))
+
+
+RejectedError = NotTrustedError
+"""The name that says what it is; the other one stays for programs that catch it."""

@@ -4,9 +4,10 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from jcr import __version__, stages
 from jcr.calibration.calibration_json import calibration_file
@@ -14,35 +15,39 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images
+from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
-from jcr.errors import NotTrustedError
+from jcr.errors import InputError, NotTrustedError
 from jcr.mapping import measured, require_dense, require_map, why_no_map
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult
-from jcr.run_folder import RunFolder, held
+from jcr.run_folder import CAPTURE, RunFolder, held
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
 
 def run(
-    capture: Capture,
+    capture: Capture | str | Path,
     out: str | Path,
-    options: RunOptions | None = None,
+    options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: str | None = None,
     progress: Progress | None = None,
     calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
-    """Calibrate a capture and write calibration, cloud, map and report to the folder `out`.
+    """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
 
     Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
     says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
     if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
     """
-    options = (options or RunOptions()).for_capture(capture, backend)
+    options = checked_options(options, RunOptions)
     check_options(options.calibrate)
+    capture = _capture_of(capture, Path(out))
+    options = options.for_capture(capture, backend)
     missing = None
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         options = replace(options, map=None)
@@ -62,9 +67,9 @@ def run(
 
 
 def calibrate(
-    capture: Capture,
+    capture: Capture | str | Path,
     out: str | Path,
-    options: RunOptions | None = None,
+    options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: str | None = None,
     progress: Progress | None = None,
@@ -73,7 +78,7 @@ def calibrate(
 
     No dense depth is estimated: only a map and a known length need it, and `build_map` adds it if it is missing.
     """
-    options = replace(options or RunOptions(), map=None)
+    options = replace(checked_options(options, RunOptions), map=None)
     return run(capture, out, options, backend=backend, progress=progress)
 
 
@@ -98,11 +103,11 @@ def calibrate_poses(
 
 def build_map(
     out: str | Path,
-    cloud: CloudOptions | None = None,
-    map: MapOptions | None = None,
-    segment: SegmentOptions | None = None,
+    cloud: CloudOptions | Mapping[str, Any] | None = None,
+    map: MapOptions | Mapping[str, Any] | None = None,
+    segment: SegmentOptions | Mapping[str, Any] | None = None,
     *,
-    add: Sequence[tuple[Path, Path]] = (),
+    add: Sequence[tuple[str | Path, str | Path]] = (),
     progress: Progress | None = None,
 ) -> RunResult:
     """Build cloud, map and report again, from the capture and the calibration of the run folder `out`.
@@ -111,11 +116,18 @@ def build_map(
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
     before = RunFolder(Path(out))
-    options = RunOptions.of(before.options(), cloud=cloud, map=map or MapOptions(), segment=segment)
+    options = RunOptions.of(
+        before.options(),
+        cloud=checked_options(cloud, CloudOptions),
+        map=checked_options(map, MapOptions),
+        segment=checked_options(segment, SegmentOptions),
+    )
     require_map(options.depth)
     capture = before.capture()
     with held(Path(out)) as folder:
-        added = with_images(read_added(folder.path, capture), add)
+        added = with_images(
+            read_added(folder.path, capture), [(Path(image), Path(pose)) for image, pose in add]
+        )
         result = stages.calibrated(capture, folder, options, progress or silent)
         return _after_calibration(result, added, folder, options, progress or silent)
 
@@ -123,7 +135,7 @@ def build_map(
 def add_camera(
     out: str | Path,
     name: str,
-    pictures: Sequence[str | Path],
+    pictures: Sequence[str | Path] | str | Path,
     intrinsics: str | Path | None = None,
     *,
     progress: Progress | None = None,
@@ -134,6 +146,7 @@ def add_camera(
     run, of cameras.json and of the report. Raises InputError if the images are not from one camera or do not fit the
     intrinsics, and NotTrustedError, writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
+    pictures = [pictures] if isinstance(pictures, str | Path) else pictures
     before, report = RunFolder(Path(out)), progress or silent
     options, capture = RunOptions.of(before.options(), map=None), before.capture()
     if (doubt := before.calibration().doubt) is not None:
@@ -165,6 +178,16 @@ def measure(out: str | Path) -> Measured:
     """
     folder = RunFolder(Path(out))
     return measured(folder.cloud(), folder.calibration())
+
+
+def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
+    """A capture as it is, or read from a path; images of a recording are put into the run folder."""
+    if isinstance(capture, Capture):
+        return capture
+    if not isinstance(capture, str | Path):
+        raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
+    with held(out):
+        return read_capture(capture, into=out / CAPTURE)
 
 
 def _after_calibration(

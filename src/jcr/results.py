@@ -17,9 +17,18 @@ from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
-from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction, Verdict
+from jcr.records import (
+    Capture,
+    HandEye,
+    Intrinsics,
+    PointCloud,
+    PosePairs,
+    Reconstruction,
+    Verdict,
+    verdict_of,
+)
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.run_folder import MadeWith
+from jcr.run_folder import MadeWith, RunFolder
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -158,6 +167,54 @@ def hand_eye_table(hand_eye: HandEye, report: str) -> str:
         f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
         f"<p>1σ, gripper axes. {escape(report)}</p>"
     )
+
+
+@dataclass(frozen=True)
+class SavedRun:
+    """What a run folder holds, read back without computing anything."""
+
+    out: Path
+    calibration: CalibrationFile
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of calibration.json."""
+        return verdict_of(self.calibration.findings)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration is accepted, with warnings or without."""
+        return self.calibration.converged
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each finding that rejects or warns."""
+        return tuple(self.calibration.warnings)
+
+    @property
+    def gripper_from_camera(self) -> Float[ndarray, "4 4"] | None:
+        """The hand-eye transform; None where none was found, or the camera is fixed."""
+        found = self.calibration.gripper_from_camera
+        return None if found is None else np.array(found)
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"] | None:
+        """In records.COVARIANCE_ORDER; None where nothing was found."""
+        known = self.calibration.uncertainty
+        return None if known is None else np.array(known.covariance)
+
+    def capture(self) -> Capture:
+        """The images and poses that the run was made from; InputError where they are gone."""
+        return RunFolder(self.out).capture()
+
+    def scene(self) -> "SceneMap":
+        """The map; InputError where there is none."""
+        return RunFolder(self.out).scene()
+
+
+def load_run(out: str | Path) -> SavedRun:
+    """The run in the folder `out`; InputError where there is none, or its calibration.json was damaged."""
+    return SavedRun(Path(out), RunFolder(Path(out)).calibration())
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -15,15 +16,17 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
+from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import PoseFit, fit_poses
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.relocate import Located, relocate
-from jcr.records import Capture, Reconstruction, Verdict
+from jcr.records import Capture, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
@@ -109,14 +112,23 @@ class Verification:
 
 
 def verify(
-    out: Path, new: Capture, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
+    out: str | Path,
+    new: Capture | str | Path,
+    options: VerifyOptions | Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
 ) -> Verification:
-    """Hold the calibration in the run folder `out` against the few images of `new`.
+    """Hold the calibration in the run folder `out` against the few images of `new`, a capture or its path.
 
     Raises InputError for a run that holds no accepted calibration, or images of another camera; NotTrustedError
     when the images share too few features with the old scene, or too few of another, to tell.
     """
-    report = progress or silent
+    report, options = progress or silent, checked_options(options, VerifyOptions)
+    out = Path(out)
+    if not isinstance(new, Capture):
+        found = read_source(new, at_least=1)
+        if isinstance(found, PosePairs):
+            raise InputError(f"{new}: gives poses and no images, which verify needs")
+        new = found
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
     folder = RunFolder(out)

@@ -1,6 +1,7 @@
 """Reading a capture, whatever it was written as: the format is known by its files, and each has its own reader."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +16,7 @@ from jcr.capture.table import find_table, pictures
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
 from jcr.geometry import inverse
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.records.words import sentence
@@ -52,7 +54,7 @@ FORMATS = {
 
 def read_capture(
     path: str | Path,
-    options: ReadOptions | None = None,
+    options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
@@ -73,14 +75,14 @@ def read_capture(
 
 def read_source(
     path: str | Path,
-    options: ReadOptions | None = None,
+    options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
     at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
     """As `read_capture`, and poses of cameras without images where that is what the file holds."""
-    path, options = Path(path), options or ReadOptions()
+    path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
         raise InputError(
             f"{path}: no such capture; name a folder that holds a capture.json, or another format"

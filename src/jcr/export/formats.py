@@ -15,6 +15,7 @@ from jcr.export.options import ExportOptions, FormatName
 from jcr.export.provenance import Provenance
 from jcr.files import write_text
 from jcr.geometry import transform
+from jcr.options import checked_options
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def export_run(
     NotTrustedError if the calibration is rejected; with force=True it is exported, and the file says why it is rejected.
     """
     named = None if path is None else Path(path)
-    made = ExportOptions(**options)  # pyright: ignore[reportArgumentType]
+    made = checked_options(options, ExportOptions)
     return written(Path(out), format, named, made)[2]
 
 
