@@ -23,8 +23,8 @@ from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.results import PosesResult, RunOptions, RunResult
-from jcr.run_folder import CAPTURE, RunFolder, held
+from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
+from jcr.run_folder import CAPTURE, REPORT, RunFolder, held
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -63,7 +63,22 @@ def run(
             result = result.noted(missing)
         if calibrated is not None:
             calibrated(result)
-        return _after_calibration(result, added, folder, options, progress or silent)
+        result = _after_calibration(result, added, folder, options, progress or silent)
+        folder.keep_complete(result.capture, options)
+        return result
+
+
+def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
+    """The run in the folder `out`, if it was made from this capture with these options and nothing has changed."""
+    if not (Path(out) / REPORT).is_file():
+        return None
+    options = options.for_capture(capture)
+    if capture.mount == "base" or why_no_map() is not None:
+        options = replace(options, map=None)
+    with held(Path(out)) as folder:
+        if not folder.is_complete(folder.keep_capture(capture), options):
+            return None
+    return load_run(out)
 
 
 def calibrate(

@@ -175,6 +175,8 @@ class SavedRun:
 
     out: Path
     calibration: CalibrationFile
+    cameras: CamerasFile | None
+    """The other cameras of the cell; None where there are none."""
 
     @property
     def verdict(self) -> Verdict:
@@ -214,7 +216,8 @@ class SavedRun:
 
 def load_run(out: str | Path) -> SavedRun:
     """The run in the folder `out`; InputError where there is none, or its calibration.json was damaged."""
-    return SavedRun(Path(out), RunFolder(Path(out)).calibration())
+    folder = RunFolder(Path(out))
+    return SavedRun(folder.path, folder.calibration(), folder.cameras())
 
 
 @dataclass(frozen=True)

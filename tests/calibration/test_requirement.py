@@ -71,11 +71,11 @@ def test_what_is_reached_is_said_of_the_camera_or_of_what_it_looks_at():
 def test_the_images_that_are_missing_are_counted_and_proposed():
     given, _ = pairs(12, 12)
     reached = calibrate_poses(given).requirement
-    assert reached is not None and reached.is_met and reached.more_images == 0
+    assert reached is not None and reached.met and reached.more_images == 0
     asked = CalibrateOptions(require=(0.75 * reached.reached_mm, 10.0))
     hand_eye = calibrate_poses(given, asked)
     required = hand_eye.requirement
-    assert required is not None and not required.is_met and required.more_images
+    assert required is not None and not required.met and required.more_images
     assert len(hand_eye.next_poses) == max(2, required.more_images)
     content, html = page(given, hand_eye)
     assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
@@ -116,7 +116,7 @@ def test_an_answer_that_is_rejected_is_red_whatever_was_asked():
     given, _ = pairs(12, 12)
     met = calibrate_poses(given, CalibrateOptions(require=(1000.0, 100.0)))
     content, html = page(given, met.with_findings(DISAGREE))
-    assert content.requirement is not None and content.requirement.is_met
+    assert content.requirement is not None and content.requirement.met
     assert 'class="verdict bad"' in html and "the images disagree" in html
 
 
@@ -133,7 +133,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
             assert "qx qy qz qw: " in said and " ".join(f"{part:.6f}" for part in quaternion) in said
             assert show(result, Output()) == 0
             said = capsys.readouterr()
-            assert said.out.startswith("accepted\nnext: jcr export out ros2\n") and not said.err
+            assert said.out.startswith("accepted\nnext: jcr export out urdf\n") and not said.err
             continue
         with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
             show(result, Output())

@@ -58,7 +58,7 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
 
     `systematic`: mostly by systematic errors of the robot.
     """
-    if required.is_met:
+    if required.met:
         return None
     mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
     numbers = {name: float(value) for name, value in vars(required).items() if value is not None}
@@ -123,7 +123,7 @@ def _worthwhile(
     systematic = None if hand_eye.budget is None else hand_eye.budget.robot_systematic
     if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
         stays = stays + systematic
-    _, proposed = next_poses(used, PROPOSED if required.is_met else MOST, x, noise)
+    _, proposed = next_poses(used, PROPOSED if required.met else MOST, x, noise)
     added = np.stack([pose.base_from_gripper for pose in proposed])
     information = np.cumsum(
         np.concatenate([pose_information(used, x, noise).sum(0)[None], pose_information(added, x, noise)]), 0
@@ -138,11 +138,11 @@ def _worthwhile(
     proposed = [
         replace(pose, expected_std=np.sqrt(np.diag(then))) for pose, then in zip(proposed, left, strict=True)
     ]
-    if required.is_met:
+    if required.met:
         return 0, proposed
     for count, then in enumerate(left, start=1):
         millimetres, degrees = _reached(then, x, 1e-3 * required.distance_mm)
-        if replace(required, reached_mm=millimetres, reached_deg=degrees).is_met:
+        if replace(required, reached_mm=millimetres, reached_deg=degrees).met:
             return count, proposed[: max(PROPOSED, count)]
     return None, proposed[:PROPOSED]
 

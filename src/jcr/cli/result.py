@@ -8,10 +8,10 @@ from jcr.cli.output import Output
 from jcr.errors import NotTrustedError
 
 if TYPE_CHECKING:
-    from jcr.results import PosesResult, RunResult
+    from jcr.results import PosesResult, RunResult, SavedRun
 
 
-def show_calibration(result: "RunResult | PosesResult", output: Output) -> None:
+def show_calibration(result: "RunResult | SavedRun | PosesResult", output: Output) -> None:
     """Print the calibration for people as soon as it stands; with --json all comes at the end."""
     from jcr.calibration.words import summary
 
@@ -20,7 +20,7 @@ def show_calibration(result: "RunResult | PosesResult", output: Output) -> None:
         sys.stdout.flush()
 
 
-def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> int:
+def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: str = "") -> int:
     """Print what follows the calibration: further cameras, the verdict and `after` it; doubts and notes on stderr.
 
     Returns exit status 0, or raises NotTrustedError where it is rejected.
@@ -28,7 +28,7 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     from jcr.calibration.words import verdict_in_words
     from jcr.cell.cameras_json import in_words
     from jcr.records.words import sentence
-    from jcr.results import RunResult
+    from jcr.results import PosesResult
 
     content, cameras = result.calibration, getattr(result, "cameras", None)
     facts, text = content.model_dump(), ""
@@ -40,7 +40,7 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     for remark in content.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     # Notes on poses that were given are the reader's, which has printed them.
-    for note in content.notes if isinstance(result, RunResult) else ():
+    for note in () if isinstance(result, PosesResult) else content.notes:
         sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
         raise NotTrustedError(f"rejected: {content.doubt}")
@@ -52,20 +52,17 @@ def show(result: "RunResult | PosesResult", output: Output, after: str = "") -> 
     return 0
 
 
-def _next_commands(result: "RunResult | PosesResult") -> str:
+def _next_commands(result: "RunResult | SavedRun | PosesResult") -> str:
     """Three commands that make sense now, a line each."""
-    from jcr.results import RunResult
+    from jcr.results import PosesResult
+    from jcr.run_folder import RunFolder
 
-    out = shlex.quote(str(result.out))
-    source = result.capture.source or result.capture.folder if isinstance(result, RunResult) else None
+    out, has_images = shlex.quote(str(result.out)), not isinstance(result, PosesResult)
     if not result.converged:
-        again = f"jcr check {'CAPTURE' if source is None else shlex.quote(str(source))}"
-        commands = (again, "jcr docs findings", "jcr docs captures")
-    elif isinstance(result, RunResult) and result.scene is not None:
-        commands = (f"jcr view {out}", f"jcr export {out} ros2", f"jcr verify {out} NEW_IMAGES")
+        source = RunFolder(result.out).state().capture if has_images else "CAPTURE"
+        commands = (f"jcr check {shlex.quote(source)}", "jcr docs findings", "jcr docs captures")
     else:
-        verify = (
-            f"jcr verify {out} NEW_IMAGES" if isinstance(result, RunResult) else f"jcr compare {out} OTHER"
-        )
-        commands = (f"jcr export {out} ros2", f"jcr export {out} urdf", verify)
+        shown = f"jcr view {out}" if RunFolder(result.out).has_map() else f"jcr export {out} urdf"
+        test = f"jcr verify {out} NEW_IMAGES" if has_images else f"jcr compare {out} OTHER"
+        commands = (shown, f"jcr export {out} ros2", test)
     return "next: " + "\n      ".join(commands) + "\n"

@@ -1,5 +1,6 @@
 """`jcr run`: everything, from a capture to a calibrated camera and a map."""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -53,7 +54,7 @@ def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
     from jcr.errors import InputError
     from jcr.mapping import require_dense
-    from jcr.pipeline import RunOptions, run
+    from jcr.pipeline import RunOptions, finished, run
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
@@ -74,6 +75,10 @@ def main(arguments: Arguments) -> int:
             raise InputError(
                 f"{arguments.capture}: gives poses and no images, nothing to map; use `jcr calibrate`"
             )
+        if (before := finished(capture, arguments.out, options)) is not None:
+            sys.stderr.write(f"unchanged: {arguments.out} is the run of this capture with these options\n")
+            show_calibration(before, arguments.output)
+            return show(before, arguments.output, f"report: {before.out / 'report.html'}\n")
         result = run(
             capture,
             arguments.out,

@@ -188,8 +188,8 @@ class Requirement:
     """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
 
     @property
-    def is_met(self) -> bool:
-        """Whether the errors are within what is required."""
+    def met(self) -> bool:
+        """Whether 95 % of the errors are within what is required."""
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
 
 
