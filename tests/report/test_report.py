@@ -207,7 +207,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     required = run.calibration.requirement
     assert required is not None
     within = f"95 % of errors are below {significant(required.reached_mm)} mm and {significant(required.reached_deg)}°"
-    assert f"Accepted: {within}" in elements.text
+    assert f"{written['verdict'].capitalize()}: {within}" in elements.text
     for std in written["uncertainty"]["translation_std_mm"]:
         assert f"±{significant(std)} mm" in elements.text
     for image in written["images"]:

@@ -156,7 +156,7 @@ def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]
     return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
 
 
-def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
     """Details of some pixels' size, of unit contrast: noise is smaller, shading larger."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
