@@ -11,7 +11,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,14 @@ from jcr.run_folder import State
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
+EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
 RESULTS_OF_CALLS = (
     "jcr.results:RunResult",
+    "jcr.results:SavedRun",
+    "jcr.calibration.difference:Difference",
+    "jcr.verify:Verification",
+    "jcr.touch_test:Touched",
+    "jcr.records:Requirement",
     "jcr.records:Capture",
     "jcr.records:HandEye",
     "jcr.records:Reconstruction",
@@ -137,7 +143,9 @@ def api_page() -> str:
     parts = [
         "# Python\n",
         "Every public name of `jcr`. Transforms are `a_from_b` (4×4), points `x_in_a`; metres and radians, or the unit "
-        "in the name. Cameras are OpenCV's: x right, y down, z forward.\n",
+        "in the name. Cameras are OpenCV's: x right, y down, z forward. A path may be text, an array a list, options a "
+        "dict; what is wrong with them is an `InputError`.\n",
+        f"A complete example, `examples/{EXAMPLE.name}`:\n\n```python\n{EXAMPLE.read_text('utf-8')}```\n",
     ]
     for name in jcr.__all__:
         parts += _entry(f"jcr.{name}", getattr(jcr, name))
@@ -162,14 +170,25 @@ def _entry(name: str, value: Any, level: str = "##") -> list[str]:
     if is_dataclass(value):
         said, kinds = described(value), annotations(value)
         rows = [
-            f"| `{field.name}` | `{_cell(kinds.get(field.name, ''))}` | {_cell(_escaped(said.get(field.name, '')))} |"
+            f"| `{field.name}` | `{_cell(kinds.get(field.name, ''))}` | {_default(field)} | "
+            f"{_cell(_escaped(said.get(field.name, '')))} |"
             for field in fields(value)
         ]
-        lines += ["", "| field | type | |", "|---|---|---|", *rows]
+        lines += ["", "| field | type | default | |", "|---|---|---|---|", *rows]
+    for name, prop in inspect.getmembers(value, lambda member: isinstance(member, property)):
+        if name in vars(value) and prop.__doc__:
+            lines.append(f"\n`.{name}`: {_text(prop.__doc__)}")
     for method, function in inspect.getmembers(value, inspect.isfunction):
         if not method.startswith("_") and function.__doc__ and method in vars(value):
             lines += ["", f"```python\n{_signature(method, function)}\n```", "", _text(function.__doc__)]
     return lines
+
+
+def _default(field: Field[Any]) -> str:
+    """Of a field of a record; empty where it must be given."""
+    if field.default is not MISSING:
+        return f"`{_cell(repr(field.default))}`"
+    return "" if field.default_factory is MISSING else "those of its fields"
 
 
 def _signature(name: str, function: Any) -> str:

@@ -35,6 +35,6 @@ print(f"used: {solve.inliers.sum()} of {len(solve.inliers)} poses")
 # An arm that only slides and never turns its wrist: the answer names what it cannot know, and the cure.
 sliding = hand_eye_problem(np.random.default_rng(1), count=10, pattern="translation", robot_noise=noise)
 solve = jcr.solve_hand_eye(sliding.base_from_gripper, sliding.recon_from_camera)
-print(f"without rotating: observable {solve.observability.observable}, trusted {solve.converged}")
+print(f"without rotating: observable {solve.observability.observable}, {solve.verdict}")
 for unseen, cure in zip(solve.observability.unobservable, solve.observability.advice, strict=True):
     print(f"- {unseen}; {cure}")

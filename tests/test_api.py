@@ -1,8 +1,10 @@
 """The names of the package, and that pycolmap may be imported before or after it."""
 
+import re
 import subprocess
 import sys
 from io import BytesIO
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,8 +12,12 @@ import pytest
 from PIL import Image
 
 import jcr
+from fuzz_targets import sound_run
 from jcr import deflate
 from jcr.capture.images import encode_png
+from jcr.capture.options import ReadOptions
+from jcr.options import checked_options
+from jcr.results import RunOptions
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:
@@ -72,3 +78,43 @@ def test_a_png_holds_the_same_pixels(
     read = np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
     np.testing.assert_array_equal(read[..., ::-1] if pixels.ndim == 3 else read, pixels[::-1])
     np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(file))), pixels[::-1])
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"mapp": None}, "RunOptions: no option 'mapp'; did you mean map?"),
+        ({"calibrate": {"reqire": (1, 1)}}, "CalibrateOptions: no option 'reqire'; did you mean require?"),
+        ({"calibrate": {"require": (1, "far")}}, "CalibrateOptions: require.1: 'far'"),
+        ({"reconstruct": {"backend": "colmp"}}, "did you mean colmap?"),
+    ],
+)
+def test_wrong_options_are_input_errors_before_any_work(options, says: str, tmp_path: Path):
+    with pytest.raises(jcr.InputError, match=re.escape(says)):
+        jcr.run("nowhere", tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_conventions_and_formats_are_checked_and_named(tabletop: Path):
+    with pytest.raises(jcr.InputError, match="pose_convention: 'kukka'.*did you mean kuka"):
+        jcr.read_capture(tabletop, {"pose_convention": "kukka"})
+    assert jcr.read_capture(str(tabletop), {"frames": 12}).images
+    with pytest.raises(jcr.InputError, match="give jcr.RunOptions"):
+        checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]
+
+
+def test_options_take_text_for_paths_and_lists_for_tuples():
+    found = checked_options({"poses": "poses.csv", "episode": [0, 2]}, ReadOptions)
+    assert found == ReadOptions(poses=Path("poses.csv"), episode=(0, 2))
+    assert checked_options(None, RunOptions) == RunOptions()
+
+
+def test_a_run_is_loaded_and_compared_by_text_and_by_path(tmp_path: Path):
+    out = sound_run(tmp_path)
+    loaded = jcr.load_run(str(out))
+    assert loaded.verdict == loaded.calibration.verdict and loaded.converged == loaded.calibration.converged
+    assert loaded.covariance is not None and loaded.covariance.shape == (7, 7)
+    assert np.allclose(loaded.gripper_from_camera, jcr.load_run(out).calibration.gripper_from_camera)
+    assert jcr.compare(str(out), out).chi2 == 0
+    with pytest.raises(jcr.InputError, match=r"reconstruction.npz: no such file"):
+        jcr.touch(str(out), "touched.csv")

@@ -13,7 +13,7 @@ from places import ROOT
 SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"deflate", "errors"},
-    {"compiled", "extras"},
+    {"compiled", "extras", "options"},
     {"pages", "rounding", "geometry"},
     {"records", "files", "memory", "progress"},
     {"arrays_json", "camera", "least_squares"},
@@ -35,7 +35,7 @@ LAYERS = [
     {"mapping", "report"},
     {"stages"},
     {"live", "pipeline"},
-    {"batch", "touch", "verify"},
+    {"batch", "touch_test", "verify"},
     {"view"},
     {"cli"},
     {"__main__"},

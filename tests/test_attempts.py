@@ -36,7 +36,7 @@ GARBAGE = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere."""
-    monkeypatch.setattr(convention, "better_reading", lambda gripper, camera: None)
+    monkeypatch.setattr(convention, "better_reading", lambda *_: None)
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(told.out)["captures"]}
     assert "of 4 captures failed or are rejected" in told.err and told.err.count("\n") == 1
     assert rows["broken"].status == "failed" and "01.jpg: not a readable image" in rows["broken"].reason
-    assert rows["plain"].status == "not trusted" and "registered" in rows["plain"].reason
+    assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None
 
     with (out / "summary.csv").open() as file:
@@ -78,14 +78,14 @@ def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.
     monkeypatch.setattr(module, "run_one", dies_on_bad)
     paths = [tmp_path / name for name in ("one", "bad", "two", "three")]
     rows = batch(paths, tmp_path / "out", RunOptions(), COMPLETE)
-    assert [row.status for row in rows] == ["done", "done", "done", "failed"]
+    assert [row.status for row in rows] == ["accepted", "accepted", "accepted", "failed"]
     assert "process died" in rows[-1].reason
 
 
-def test_a_capture_that_falls_short_of_what_is_required_is_not_done(tmp_path: Path, captures: list[Path]):
+def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Path, captures: list[Path]):
     options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)))
     row = run_one(Task(captures[1], tmp_path / "b", options, True, ReadOptions()))
-    assert row.status == "not trusted" and row.reason, row
+    assert row.status == "rejected" and row.reason, row
 
 
 def test_folders_of_one_name_are_kept_apart(tmp_path: Path):
@@ -125,7 +125,7 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
         deadline = time.monotonic() + 60
         while task.capture != first and not removed.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
-        return Row(str(task.capture), str(task.out), "done", offset_std_mm=1.0)
+        return Row(str(task.capture), str(task.out), "accepted", offset_std_mm=1.0)
 
     monkeypatch.setattr(module, "run_one", unfinished)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})
@@ -145,4 +145,4 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
     finally:
         cluster.shutdown()
     assert not nodes
-    assert sorted(Path(row.capture).name for row in rows if row.status == "done") == list("012345")
+    assert sorted(Path(row.capture).name for row in rows if row.status == "accepted") == list("012345")

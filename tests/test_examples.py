@@ -102,7 +102,7 @@ def test_quick_start_prints_the_true_camera_and_the_things_on_the_table(done: Pa
     shutil.copytree(done, tmp_path / "out" / "quick_start")  # its finished stages are taken from there
     text = told("01_quick_start", tmp_path)
     rows = re.search(r"\(m\):\n(.*?)\none sigma", text, re.DOTALL)
-    assert rows is not None and "trusted: True" in text
+    assert rows is not None and "verdict: accepted" in text
     found = np.array(re.findall(r"-?\d+\.\d*", rows[1]), float).reshape(4, 4)
     truth = true_hand_eye()
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 5e-4
@@ -122,7 +122,7 @@ def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: P
     off_mm, off_deg = numbers(r"off the truth: (.+) mm, (.+)°", text)
     assert off_mm < 3 * np.sqrt(3) * sigma_mm < 10 and off_deg < 3 * np.sqrt(3) * sigma_deg < 1
     assert "used: 10 of 10" in text
-    assert "without rotating: observable False, trusted False" in text
+    assert "without rotating: observable False, rejected" in text
     assert re.search(r"^- translation of the camera.*; tilt the wrist", text, re.MULTILINE)
 
 

@@ -4,14 +4,19 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
 from fuzz_targets import RUN_IMAGES, sound_run
-from jcr.cli import dispatch
-from jcr.run_folder import RunFolder
+from jcr.calibration.options import CalibrateOptions
+from jcr.cli import call, dispatch
+from jcr.errors import InputError
+from jcr.reconstruct.backends import ReconstructOptions
+from jcr.records import Capture
+from jcr.run_folder import MadeWith, RunFolder, state_of
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +134,19 @@ def test_a_cut_file_is_refused(sound: Path, tmp_path: Path, name: str, length: i
     (out / name).write_text((out / name).read_text()[:length])
     command = ["map", str(out)] if name == "run.json" else ["compare", str(out), str(out)]
     assert name in refused([*command, "--quiet"] if name == "run.json" else command, capsys)
+
+
+def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work():
+    capture = Capture(Path("caf\udce9"), ("a.png",), np.eye(4)[None], (640, 480))
+    made_with = MadeWith(reconstruct=ReconstructOptions(), calibrate=CalibrateOptions())
+    with pytest.raises(InputError, match="not UTF-8; rename it"):
+        state_of(capture, made_with)
+
+
+def test_memory_that_ends_is_one_line(capsys):
+    def load() -> ModuleType:
+        raise MemoryError("Unable to allocate 5.62 MiB")
+
+    assert call(load, "jcr run", []) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: out of memory (Unable to allocate 5.62 MiB); ") and said.count("\n") == 1

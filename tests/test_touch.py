@@ -9,7 +9,7 @@ import pytest
 from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.run_folder import RunFolder
-from jcr.touch import touch
+from jcr.touch_test import touch
 
 pytestmark = pytest.mark.slow
 

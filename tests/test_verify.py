@@ -25,6 +25,7 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
+from jcr.run_folder import RunFolder
 from jcr.simulate.capture import with_robot_noise
 
 pytestmark = pytest.mark.slow
@@ -230,7 +231,29 @@ def test_the_command_is_content_with_what_has_not_moved(
     poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, np.random.default_rng(seed))
     write_capture(tmp_path / "today", capture, poses, [10, 11])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet"]) == 0
-    assert "still valid" in capsys.readouterr().out
+    assert capsys.readouterr().out.startswith("accepted: nothing has moved")
+
+
+def test_images_of_the_calibration_are_refused_by_their_content(
+    out: Path, capture: Capture, tmp_path: Path, capsys
+):
+    today = write_capture(tmp_path / "today", capture, capture.base_from_gripper, [10, 3])
+    old = today.folder / capture.images[3]
+    old.rename(old.with_name("fresh.jpg"))
+    file = today.folder / "capture.json"
+    file.write_text(file.read_text().replace(Path(capture.images[3]).name, "fresh.jpg"))
+    assert dispatch(["verify", str(out), str(today.folder)]) == 2
+    assert (
+        f"fresh.jpg: is {capture.images[3]}, which the calibration was made from" in capsys.readouterr().err
+    )
+
+
+def test_poses_copied_from_the_calibration_are_a_warning(out: Path, capture: Capture, tmp_path: Path, capsys):
+    poses = capture.base_from_gripper.copy()
+    poses[10] = RunFolder(out).capture().base_from_gripper[3]
+    write_capture(tmp_path / "today", capture, poses, [10])
+    dispatch(["verify", str(out), str(tmp_path / "today")])
+    assert "to the last digit one of the calibration" in capsys.readouterr().err
 
 
 def test_the_new_images_may_come_with_a_table_of_poses(out: Path, capture: Capture, tmp_path: Path, capsys):

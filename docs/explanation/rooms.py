@@ -12,7 +12,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     (
         ("batch.py", "many captures", 1),
         ("verify.py", "has the camera moved?", 1),
-        ("touch.py", "does the tip agree?", 1),
+        ("touch_test.py", "does the tip agree?", 1),
     ),
     (("live/", "take a capture", 1), ("pipeline.py", "the stages in order", 2)),
     (("stages.py", "each stage on a run folder, from the files of those before it, timed", 1),),
@@ -52,6 +52,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
         ("errors.py", "bad input, a rejected answer", 1),
         ("extras.py", "optional packages", 1),
         ("compiled.py", "loops over pixels", 1),
+        ("options.py", "checked options", 1),
         ("deflate.py", "zlib before pycolmap", 1),
     ),
 )

@@ -9,17 +9,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from jcr import deflate  # noqa: F401
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, NotTrustedError, RejectedError
 
 if TYPE_CHECKING:
+    from jcr.calibration.difference import compare
+    from jcr.calibration.options import CalibrateOptions
     from jcr.capture.options import ReadOptions
     from jcr.capture.read import read_capture
     from jcr.check import check as check_capture
     from jcr.export.formats import export_run
     from jcr.handeye.solve import solve_hand_eye
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
+    from jcr.reconstruct.backends import ReconstructOptions
     from jcr.represent.map_file import load_map
-    from jcr.results import RunOptions
+    from jcr.results import RunOptions, load_run
+    from jcr.touch_test import touch
     from jcr.verify import verify as verify_run
 
     __version__: str
@@ -27,6 +31,11 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "ReadOptions": "jcr.capture.options",
     "RunOptions": "jcr.results",
+    "CalibrateOptions": "jcr.calibration.options",
+    "ReconstructOptions": "jcr.reconstruct.backends",
+    "compare": "jcr.calibration.difference",
+    "load_run": "jcr.results",
+    "touch": "jcr.touch_test",
     "check_capture": "jcr.check:check",
     "verify_run": "jcr.verify:verify",
     "export_run": "jcr.export.formats",
@@ -41,20 +50,26 @@ _MODULE_OF = {
 }
 
 __all__ = [
+    "CalibrateOptions",
     "InputError",
     "NotTrustedError",
     "ReadOptions",
+    "ReconstructOptions",
+    "RejectedError",
     "RunOptions",
     "add_camera",
     "build_map",
     "calibrate",
     "check_capture",
+    "compare",
     "export_run",
     "load_map",
+    "load_run",
     "measure",
     "read_capture",
     "run",
     "solve_hand_eye",
+    "touch",
     "verify_run",
 ]
 

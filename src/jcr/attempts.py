@@ -122,9 +122,10 @@ HELPS: tuple[Mend, ...] = ("reconstruction", "images")
 
 
 def rejection(tried: Tried) -> Finding | None:
-    """The strongest finding that rejects a calibration; None of one that is accepted, or was not made."""
-    found = () if tried.calibrated is None else tried.calibrated.findings
-    return next((finding for finding in found if finding.severity == "rejects"), None)
+    """The strongest finding that rejects a calibration; None of one that is sound, or was not made."""
+    if tried.calibrated is None or tried.calibrated.is_sound:
+        return None
+    return next(finding for finding in tried.calibrated.findings if finding.severity == "rejects")
 
 
 def needs_another(tried: Tried) -> bool:
@@ -298,8 +299,8 @@ def _better(one: Tried, other: Tried) -> Tried:
     doubt = f"{about} is rejected ({one.hand_eye.doubt})"
     if other.calibrated is None:
         return one.noted(f"{doubt}, and {other.name} failed ({other.failure})").kept_before(other)
-    if other.hand_eye.converged:
-        note = f"{doubt}; {other.with_error} is accepted, and was used instead of {one.with_error}"
+    if other.hand_eye.is_sound:
+        note = f"{doubt}; {other.with_error} is {other.hand_eye.verdict}, and was used instead of {one.with_error}"
         return other.noted(note).kept_after(one, untrusted)
     farther = "rejected, and its leave-one-out error is the larger one: "
     note = f"{doubt}, and so is {other.name}; "

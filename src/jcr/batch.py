@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from html import escape
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.capture.options import ReadOptions
@@ -26,6 +26,7 @@ from jcr.extras import extra
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, run
 from jcr.progress import Progress, silent
+from jcr.records import Verdict, verdict_of
 from jcr.records.words import sentence
 from jcr.run_folder import CAPTURE, RunFolder, fingerprint
 
@@ -58,7 +59,7 @@ class Row:
 
     capture: str
     out: str
-    status: Literal["done", "not trusted", "failed"]
+    status: Verdict | Literal["failed"]
     backend: str = ""
     images: int = 0
     used: int = 0
@@ -70,7 +71,7 @@ class Row:
     held_out_deg: float | None = None
     seconds: float = 0.0
     reason: str = ""
-    """Why it failed or is rejected."""
+    """Why it failed or is rejected, or its first warning."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +135,8 @@ def run_one(task: Task) -> Row:
         except NotTrustedError as error:
             content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
-        if row.status != "done":
-            row = replace(
-                row, reason=reason or content.doubt or (sentence(content.short) if content.short else "")
-            )
+        named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")
+        row = replace(row, reason=reason or named)
         write_text(
             task.out / STATE, json.dumps({"made_from": made_from, "row": asdict(row)}, indent=1) + "\n"
         )
@@ -146,12 +145,6 @@ def run_one(task: Task) -> Row:
         return replace(failed, reason=str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
         return replace(failed, reason=f"{type(error).__name__}: {error}")
-
-
-def _falls_short(content: CalibrationFile) -> bool:
-    """Of what the user requires; the default is a wish."""
-    required = content.requirement
-    return required is not None and required.asked and not required.is_met
 
 
 def _finished(task: Task, made_from: str) -> Row | None:
@@ -167,7 +160,7 @@ def _row(task: Task, content: CalibrationFile) -> Row:
     row = Row(
         str(task.capture),
         str(task.out),
-        "not trusted" if content.doubt is not None or _falls_short(content) else "done",
+        verdict_of(content.findings),
         content.backend,
         len(content.images),
         content.images_used,
@@ -187,8 +180,13 @@ def _row(task: Task, content: CalibrationFile) -> Row:
     return row
 
 
+def is_accepted(row: Row) -> bool:
+    """Whether its calibration is, with warnings or without."""
+    return row.status in ("accepted", "accepted with warnings")
+
+
 def _rank(row: Row) -> tuple[int, float, str]:
-    order = ("done", "not trusted", "failed").index(row.status)
+    order = (*get_args(Verdict), "failed").index(row.status)
     return order, float("inf") if row.offset_std_mm is None else row.offset_std_mm, row.capture
 
 
@@ -308,7 +306,7 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>jcr batch
 <style>:root{{color-scheme:light dark}}body{{font:15px system-ui,sans-serif;margin:1.5em}}
 table{{border-collapse:collapse}}th,td{{padding:.3em .8em;text-align:left;border-bottom:1px solid #8885}}
 td.n,th.n{{text-align:right;font-variant-numeric:tabular-nums}}.bad{{color:#c33}}</style>
-<h1>{done} of {n} captures calibrated</h1><table><thead><tr><th class="n">#</th><th>capture</th><th>status</th>
+<h1>{accepted} of {n} captures accepted</h1><table><thead><tr><th class="n">#</th><th>capture</th><th>status</th>
 <th class="n">images used</th>
 <th class="n">translation ± mm</th><th class="n">rotation ± °</th><th class="n">scale ± %</th>
 <th class="n">leave-one-out mm</th><th class="n">leave-one-out °</th><th class="n">s</th><th>reason</th></tr></thead>
@@ -330,10 +328,9 @@ def _page(rows: list[Row]) -> str:
         cells = "".join(
             f'<td class="n">{"" if number is None else f"{number:.3g}"}</td>' for number in numbers
         )
-        bad = "" if row.status == "done" else ' class="bad"'
+        bad = "" if is_accepted(row) else ' class="bad"'
         lines.append(
             f'<tr><td class="n">{rank}</td><td>{link}</td><td{bad}>{row.status}</td>'
             f'<td class="n">{row.used} of {row.images}</td>{cells}<td>{escape(row.reason)}</td></tr>'
         )
-    done = sum(row.status == "done" for row in rows)
-    return _PAGE.format(done=done, n=len(rows), rows="\n".join(lines))
+    return _PAGE.format(accepted=sum(map(is_accepted, rows)), n=len(rows), rows="\n".join(lines))

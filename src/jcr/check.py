@@ -1,16 +1,21 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import fold_distance_px
-from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image
+from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image, show_one_view
+from jcr.capture.names import paired_by_name
+from jcr.capture.read import read_source
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.conventions import better_reading, convention_finding
@@ -22,9 +27,21 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
-from jcr.records import Capture, HandEye, NextPose, Observability, PosePairs, Reconstruction
+from jcr.records import (
+    Capture,
+    Finding,
+    HandEye,
+    Kind,
+    NextPose,
+    Observability,
+    PosePairs,
+    Reconstruction,
+    Verdict,
+)
 from jcr.records.words import remedy, sentence, unobservable
 
+STILL = (20e-3, np.radians(5.0))
+"""m, rad: a gripper that moves farther is seen to, in images of a camera that it carries."""
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
@@ -51,9 +68,16 @@ class Examination:
     """Why a calibration of this capture would be rejected."""
     remarks: tuple[str, ...]
 
+    @property
+    def verdict(self) -> Verdict:
+        """What its calibration would be."""
+        if self.faults:
+            return "rejected"
+        return "accepted" if self.hand_eye is None else self.hand_eye.verdict
+
 
 def check(
-    capture: Capture | PosePairs,
+    capture: Capture | PosePairs | str | Path,
     suggest: int = 0,
     look: bool = True,
     robot_noise: tuple[float, float] | None = None,
@@ -62,7 +86,9 @@ def check(
     progress: Progress | None = None,
     thorough: bool = False,
 ) -> Examination:
-    """Examine a capture; with `look` its images are registered sparsely to hold the poses against them.
+    """Examine a capture, or what lies at its path.
+
+    With `look` its images are registered sparsely to hold the poses against them.
 
     A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
     `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
@@ -71,13 +97,15 @@ def check(
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
     poses and joint angles contradict each other.
     """
+    if isinstance(capture, str | Path):
+        capture = read_source(capture)
     gripper = capture.base_from_gripper
     motion = inverse(gripper)[:, None] @ gripper[None]
     move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
     turn = float(rotation_angle(motion[..., :3, :3]).max())
-    sharp, remarks = np.zeros(0), [*capture.notes]
+    sharp, remarks, is_still = np.zeros(0), [*capture.notes], False
     if isinstance(capture, Capture):
-        brightness, sharp = _looks(capture)
+        brightness, sharp, is_still = _looks(capture)
         remarks += _picture_remarks(capture, brightness, sharp)
         if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
             remarks.append(
@@ -91,20 +119,21 @@ def check(
     if isinstance(capture, Capture):
         unused = robot_errors(capture, CalibrateOptions()).unused
         remarks += [] if unused is None else [sentence(unused)]
+    faults: list[str] = []
+    if is_still and (move > STILL[0] or turn > STILL[1]):
+        still = Finding(
+            kind=Kind.STATIC_IMAGES, severity="rejects", mend="images", value=move, details={"rotation": turn}
+        )
+        faults.append(sentence(still))
     held, quick = None, False
     if isinstance(capture, PosePairs):
         held = _held_against(gripper, capture, robot_noise)
-    elif look and not thorough and len(capture) > QUICK:
-        rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
-        held, _ = _registered(_of_rows(capture, rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        if held is not None and (held.faults or not held.hand_eye.inliers.all()):
-            held = None
-        quick = held is not None
-    if held is None and look and isinstance(capture, Capture):
-        held, notes = _registered(capture, robot_noise, seed, progress)
-        remarks += notes
+    elif look and not faults:
+        held, quick = _looked_at(capture, robot_noise, seed, progress, thorough)
     hand_eye, ratio = (None, None) if held is None else (held.hand_eye, held.ratio)
-    faults = [] if held is None else [*held.faults]
+    if held is not None:
+        faults += held.faults
+        remarks += held.remarks
     if ratio is not None:
         angles = angle_finding(*ratio)
         remarks += [] if angles is None else [sentence(angles)]
@@ -126,9 +155,27 @@ def check(
 class _Held:
     """Gripper poses held against cameras."""
 
-    hand_eye: HandEye
+    hand_eye: HandEye | None
+    """None where no cameras were found."""
     ratio: tuple[float, float] | None
     faults: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+
+
+def _looked_at(
+    capture: Capture,
+    robot_noise: tuple[float, float] | None,
+    seed: int,
+    progress: Progress | None,
+    thorough: bool,
+) -> "tuple[_Held, bool]":
+    """The gripper poses held against the images, and whether few small ones were enough."""
+    if not thorough and len(capture) > QUICK:
+        rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
+        held = _registered(_of_rows(capture, rows), robot_noise, seed, progress, QUICK_SIZE_PX)
+        if not held.faults and held.hand_eye is not None and held.hand_eye.inliers.sum() == QUICK:
+            return held, True
+    return _registered(capture, robot_noise, seed, progress), False
 
 
 def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
@@ -145,44 +192,66 @@ def _registered(
     seed: int,
     progress: Progress | None,
     size_px: int | None = None,
-) -> tuple[_Held | None, list[str]]:
-    """The gripper poses held against cameras that features find, and what else that shows; None where none are found."""
+) -> _Held:
+    """The gripper poses held against cameras that features find, and what else that shows."""
     options = ColmapOptions(seed=seed)
     if size_px is not None:
         options = replace(options, working_size_px=size_px)
     try:
         found = reconstruct(capture, options, progress)
     except NotTrustedError as error:
-        if size_px is not None:
-            return None, []
-        board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return None, [str(error)] if board is None else [str(error), sentence(board)]
-    return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise), [
-        *found.warnings,
-        *found.notes,
-    ]
+        board = None
+        if size_px is None:
+            board = proposed([read_image(capture.folder / name) for name in capture.images])
+        return _Held(None, None, (str(error),), () if board is None else (sentence(board),))
+    by_name = paired_by_name(capture.images, capture.base_from_gripper)
+    held = _held_against(
+        capture.base_from_gripper[found.image_index],
+        found,
+        robot_noise,
+        {by_number: poses[found.image_index] for by_number, poses in by_name.items()},
+    )
+    wrong: tuple[Finding, ...] = ()
+    if size_px is None and held.hand_eye is not None and held.hand_eye.converged:
+        wrong = left_out_poses(capture, found, held.hand_eye)
+    named = {
+        severity: [sentence(one) for one in wrong if one.severity == severity]
+        for severity in ("rejects", "warns")
+    }
+    return replace(
+        held,
+        faults=(*held.faults, *named["rejects"]),
+        remarks=(*held.remarks, *named["warns"], *found.warnings, *found.notes),
+    )
 
 
 def _held_against(
     used: Float[ndarray, "m 4 4"],
     found: Reconstruction | PosePairs,
     robot_noise: tuple[float, float] | None,
+    by_name: Mapping[bool, Float[ndarray, "m 4 4"]] | None = None,
 ) -> _Held:
     camera = found.recon_from_camera
     hand_eye, ratio = solve_hand_eye(used, camera, robot_noise=robot_noise), None
-    reading = better_reading(used, camera)
+    reading = better_reading(used, camera, by_name)
     faults = [] if reading is None else [sentence(convention_finding(reading))]
     faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
+    remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
     if hand_eye.converged and hand_eye.inliers.sum() >= 3:
         ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])
-    return _Held(hand_eye, ratio, tuple(faults))
+    return _Held(hand_eye, ratio, tuple(faults), tuple(remarks))
 
 
-def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
-    """Mean grey level and relative sharpness of every image."""
-    looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
+def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"], bool]:
+    """Mean grey level and relative sharpness of every image, and whether all show one view."""
+    first = read_image(capture.folder / capture.images[0])
+    looks, is_still = [], len(capture) > 1
+    for name in capture.images:
+        image = read_image(capture.folder / name)
+        looks.append(brightness_and_sharpness(image))
+        is_still = is_still and show_one_view(first, image)
     brightness, sharpness = np.array(looks).T
-    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9)
+    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still
 
 
 def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):

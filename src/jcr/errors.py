@@ -1,11 +1,18 @@
 """The two things that can be wrong and are no bug: the user's input, and a rejected answer."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 
 
 def printable(text: str) -> str:
     """The text without what a terminal would obey: names in files may hold any character."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """ "; did you mean …?" where one of the known words is like it; else nothing."""
+    like = get_close_matches(word.lower(), known, n=1)
+    return f"; did you mean {like[0]}?" if like else ""
 
 
 class InputError(ValueError):
@@ -26,3 +33,7 @@ class NotTrustedError(RuntimeError):
     def with_more(self, *also: str) -> "NotTrustedError":
         """The same with more to say."""
         return NotTrustedError(self.what, *self.remedies, also=(*self.also, *also))
+
+
+RejectedError = NotTrustedError
+"""The name that says what it is; the other one stays for programs that catch it."""

@@ -35,9 +35,23 @@ class Mapped:
 
 def require_map(options: DepthOptions) -> None:
     """InputError, before any work, where no map can be made: no torch, or no dense depth wanted."""
+    require_dense(options)
+    require_packages("the map", "; `jcr run` and `jcr calibrate` calibrate without it")
+
+
+def require_dense(options: DepthOptions) -> None:
+    """InputError where a map is wanted, and the dense depth that it needs is not."""
     if not options.dense:
         raise InputError("--no-dense: the map needs dense depth; leave it out, or add --no-map")
-    require_packages("the map", "; `jcr run --no-map` and `jcr calibrate` do not need it")
+
+
+def why_no_map() -> str | None:
+    """What to install before a map can be made; None where nothing is missing."""
+    try:
+        require_packages("the map", ", then `jcr map`")
+    except InputError as error:
+        return f"no map was made: {error}"
+    return None
 
 
 def make_map(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> Mapped:

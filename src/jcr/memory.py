@@ -17,10 +17,27 @@ GB = 1e9
 ALLOWANCE = 150_000_000
 """Bytes beside what is estimated: what libraries take when they are first used, and freed blocks among others."""
 
+ADDRESS_SPACE = 2_000_000_000
+"""Bytes: of it a small calibration without torch uses 1.6 GB, most of it never touched."""
+MORE_MEMORY = "use fewer or smaller images, end other programs, or raise its limit (ulimit -v)"
+"""The remedy where memory ends."""
 MAP = 300_000_000
 """Bytes of calibration, map and report beside the reconstruction."""
 FOUND = 5_000_000
 """Bytes per image: features, matches and tracks in structure from motion and bundle adjustment."""
+
+
+def require_address_space() -> None:
+    """Raise InputError where a limit (ulimit -v) leaves less address space than the libraries take that we call.
+
+    With less OpenBLAS ends the process, and libraries cannot be loaded; neither says why.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
+        raise InputError(
+            f"out of memory: this process may have {limit / GB:.1f} GB of address space (ulimit -v), and its libraries "
+            f"need {ADDRESS_SPACE / GB:.0f} GB; raise the limit"
+        )
 
 
 def resident() -> int:

@@ -4,9 +4,10 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from jcr import __version__, stages
 from jcr.calibration.calibration_json import calibration_file
@@ -14,48 +15,76 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.poses import calibrate_poses as calibrate_poses_stage
 from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images
+from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
-from jcr.errors import NotTrustedError
-from jcr.mapping import measured, require_map
+from jcr.errors import InputError, NotTrustedError
+from jcr.mapping import measured, require_dense, require_map, why_no_map
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.results import PosesResult, RunOptions, RunResult
-from jcr.run_folder import RunFolder, held
+from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
+from jcr.run_folder import CAPTURE, REPORT, RunFolder, held
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
 
 def run(
-    capture: Capture,
+    capture: Capture | str | Path,
     out: str | Path,
-    options: RunOptions | None = None,
+    options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: str | None = None,
     progress: Progress | None = None,
+    calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
-    """Calibrate a capture and write calibration, cloud, map and report to the folder `out`.
+    """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
 
-    Finished stages are reused from `out` if capture and options are unchanged. Raises InputError if the input cannot be
-    used, or if a map is requested and torch is not installed, and NotTrustedError if no camera poses are found
-    (calibration.json then says why).
+    Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
+    says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
+    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
     """
-    options = (options or RunOptions()).for_capture(capture, backend)
+    options = checked_options(options, RunOptions)
     check_options(options.calibrate)
+    capture = _capture_of(capture, Path(out))
+    options = options.for_capture(capture, backend)
+    missing = None
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         options = replace(options, map=None)
     if options.map is not None:
-        require_map(options.depth)
+        require_dense(options.depth)
+        if (missing := why_no_map()) is not None:
+            options = replace(options, map=None)
     with held(Path(out)) as folder:
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
-        return _all_stages(capture, added, folder, options, progress or silent)
+        result = stages.calibrated(capture, folder, options, progress or silent)
+        if missing is not None:
+            result = result.noted(missing)
+        if calibrated is not None:
+            calibrated(result)
+        result = _after_calibration(result, added, folder, options, progress or silent)
+        folder.keep_complete(result.capture, options)
+        return result
+
+
+def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
+    """The run in the folder `out`, if it was made from this capture with these options and nothing has changed."""
+    if not (Path(out) / REPORT).is_file():
+        return None
+    options = options.for_capture(capture)
+    if capture.mount == "base" or why_no_map() is not None:
+        options = replace(options, map=None)
+    with held(Path(out)) as folder:
+        if not folder.is_complete(folder.keep_capture(capture), options):
+            return None
+    return load_run(out)
 
 
 def calibrate(
-    capture: Capture,
+    capture: Capture | str | Path,
     out: str | Path,
-    options: RunOptions | None = None,
+    options: RunOptions | Mapping[str, Any] | None = None,
     *,
     backend: str | None = None,
     progress: Progress | None = None,
@@ -64,7 +93,7 @@ def calibrate(
 
     No dense depth is estimated: only a map and a known length need it, and `build_map` adds it if it is missing.
     """
-    options = replace(options or RunOptions(), map=None)
+    options = replace(checked_options(options, RunOptions), map=None)
     return run(capture, out, options, backend=backend, progress=progress)
 
 
@@ -89,11 +118,11 @@ def calibrate_poses(
 
 def build_map(
     out: str | Path,
-    cloud: CloudOptions | None = None,
-    map: MapOptions | None = None,
-    segment: SegmentOptions | None = None,
+    cloud: CloudOptions | Mapping[str, Any] | None = None,
+    map: MapOptions | Mapping[str, Any] | None = None,
+    segment: SegmentOptions | Mapping[str, Any] | None = None,
     *,
-    add: Sequence[tuple[Path, Path]] = (),
+    add: Sequence[tuple[str | Path, str | Path]] = (),
     progress: Progress | None = None,
 ) -> RunResult:
     """Build cloud, map and report again, from the capture and the calibration of the run folder `out`.
@@ -102,18 +131,26 @@ def build_map(
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
     before = RunFolder(Path(out))
-    options = RunOptions.of(before.options(), cloud=cloud, map=map or MapOptions(), segment=segment)
+    options = RunOptions.of(
+        before.options(),
+        cloud=checked_options(cloud, CloudOptions),
+        map=checked_options(map, MapOptions),
+        segment=checked_options(segment, SegmentOptions),
+    )
     require_map(options.depth)
     capture = before.capture()
     with held(Path(out)) as folder:
-        added = with_images(read_added(folder.path, capture), add)
-        return _all_stages(capture, added, folder, options, progress or silent)
+        added = with_images(
+            read_added(folder.path, capture), [(Path(image), Path(pose)) for image, pose in add]
+        )
+        result = stages.calibrated(capture, folder, options, progress or silent)
+        return _after_calibration(result, added, folder, options, progress or silent)
 
 
 def add_camera(
     out: str | Path,
     name: str,
-    pictures: Sequence[str | Path],
+    pictures: Sequence[str | Path] | str | Path,
     intrinsics: str | Path | None = None,
     *,
     progress: Progress | None = None,
@@ -124,6 +161,7 @@ def add_camera(
     run, of cameras.json and of the report. Raises InputError if the images are not from one camera or do not fit the
     intrinsics, and NotTrustedError, writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
+    pictures = [pictures] if isinstance(pictures, str | Path) else pictures
     before, report = RunFolder(Path(out)), progress or silent
     options, capture = RunOptions.of(before.options(), map=None), before.capture()
     if (doubt := before.calibration().doubt) is not None:
@@ -157,12 +195,21 @@ def measure(out: str | Path) -> Measured:
     return measured(folder.cloud(), folder.calibration())
 
 
-def _all_stages(
-    capture: Capture, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
+def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
+    """A capture as it is, or read from a path; images of a recording are put into the run folder."""
+    if isinstance(capture, Capture):
+        return capture
+    if not isinstance(capture, str | Path):
+        raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
+    with held(out):
+        return read_capture(capture, into=out / CAPTURE)
+
+
+def _after_calibration(
+    result: RunResult, added: Capture | None, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     """`added` are the images of the map alone; None: there is no map."""
-    result = stages.calibrated(capture, folder, options, progress)
-    if capture.mount != "base":
+    if result.capture.mount != "base":
         result = stages.located(result, folder, options, progress)
     if added is not None:
         result = stages.densified(result, folder, options, progress)

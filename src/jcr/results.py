@@ -17,9 +17,18 @@ from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
-from jcr.records import Capture, HandEye, Intrinsics, PointCloud, PosePairs, Reconstruction
+from jcr.records import (
+    Capture,
+    HandEye,
+    Intrinsics,
+    PointCloud,
+    PosePairs,
+    Reconstruction,
+    Verdict,
+    verdict_of,
+)
 from jcr.represent.options import CloudOptions, MapOptions
-from jcr.run_folder import MadeWith
+from jcr.run_folder import MadeWith, RunFolder
 from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
@@ -99,14 +108,24 @@ class RunResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
+        """Whether the calibration is accepted, with warnings or without."""
         return self.hand_eye.converged
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of calibration.json."""
+        return self.hand_eye.verdict
+
+    def noted(self, *notes: str) -> "RunResult":
+        """With more notes."""
+        update = {"notes": [*self.calibration.notes, *notes]}
+        return replace(self, calibration=self.calibration.model_copy(update=update))
 
     def timed(self, stage: str, start: float, notes: Sequence[str] = ()) -> "RunResult":
         """With the seconds since `start` (time.perf_counter) and the notes of one more stage."""
         timings = self.calibration.timings_s | {stage: round(time.perf_counter() - start, 3)}
-        update = {"timings_s": timings, "notes": [*self.calibration.notes, *notes]}
-        return replace(self, calibration=self.calibration.model_copy(update=update))
+        calibration = self.calibration.model_copy(update={"timings_s": timings})
+        return replace(self, calibration=calibration).noted(*notes)
 
     @property
     def image_index(self) -> Int[ndarray, " m"]:
@@ -167,12 +186,63 @@ def hand_eye_table(hand_eye: HandEye, report: str) -> str:
         f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
         for k, axis in enumerate("xyz")
     )
-    verdict = "accepted" if hand_eye.converged else f"rejected: {escape('; '.join(hand_eye.warnings))}"
+    verdict = ": ".join(filter(None, (hand_eye.verdict, escape("; ".join(hand_eye.warnings)))))
     return (
         f"<p><b>gripper_from_camera</b>, {verdict}; {int(hand_eye.inliers.sum())} of {len(hand_eye.inliers)} poses "
         f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
         f"<p>1σ, gripper axes. {escape(report)}</p>"
     )
+
+
+@dataclass(frozen=True)
+class SavedRun:
+    """What a run folder holds, read back without computing anything."""
+
+    out: Path
+    calibration: CalibrationFile
+    cameras: CamerasFile | None
+    """The other cameras of the cell; None where there are none."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of calibration.json."""
+        return verdict_of(self.calibration.findings)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration is accepted, with warnings or without."""
+        return self.calibration.converged
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each finding that rejects or warns."""
+        return tuple(self.calibration.warnings)
+
+    @property
+    def gripper_from_camera(self) -> Float[ndarray, "4 4"] | None:
+        """The hand-eye transform; None where none was found, or the camera is fixed."""
+        found = self.calibration.gripper_from_camera
+        return None if found is None else np.array(found)
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"] | None:
+        """In records.COVARIANCE_ORDER; None where nothing was found."""
+        known = self.calibration.uncertainty
+        return None if known is None else np.array(known.covariance)
+
+    def capture(self) -> Capture:
+        """The images and poses that the run was made from; InputError where they are gone."""
+        return RunFolder(self.out).capture()
+
+    def scene(self) -> "SceneMap":
+        """The map; InputError where there is none."""
+        return RunFolder(self.out).scene()
+
+
+def load_run(out: str | Path) -> SavedRun:
+    """The run in the folder `out`; InputError where there is none, or its calibration.json was damaged."""
+    folder = RunFolder(Path(out))
+    return SavedRun(folder.path, folder.calibration(), folder.cameras())
 
 
 @dataclass(frozen=True)
@@ -184,11 +254,11 @@ class PosesResult:
     calibration: CalibrationFile
     hand_eye: HandEye
     scale_is_one: bool
-    """Whether it may be trusted and the scale is that of a marker whose size is right."""
+    """Whether it is accepted and the scale is that of a marker whose size is right."""
 
     @property
     def converged(self) -> bool:
-        """Whether the calibration may be trusted."""
+        """Whether the calibration is accepted, with warnings or without."""
         return self.hand_eye.converged
 
     @property

@@ -9,12 +9,14 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr import __version__
@@ -81,6 +83,9 @@ class State(BaseModel):
     options: MadeWith
     attempts: tuple[Attempt, ...] = ()
     """How that reconstruction was chosen."""
+    complete: str | None = None
+    """The fingerprint of all that a finished run was made from and of its calibration.json; None of one that was not
+    finished."""
 
     @property
     def depth(self) -> str:
@@ -264,6 +269,35 @@ class RunFolder:
         else:
             write_cameras(self.path, content)
 
+    def keep_complete(self, capture: Capture, options: Any) -> None:
+        """Note in run.json that all files of a run of this capture with these options are there."""
+        self.keep_state(self.state().model_copy(update={"complete": self._completion(capture, options)}))
+
+    def is_complete(self, capture: Capture, options: Any) -> bool:
+        """Whether a run of the same is finished, and nobody has changed or removed its files since."""
+        files = [RECONSTRUCTION, CALIBRATION, REPORT] + ([] if options.map is None else [CLOUD, MAP])
+        if not all((self.path / name).is_file() for name in files):
+            return False
+        try:
+            return self.state().complete == self._completion(capture, options)
+        except InputError:
+            return False
+
+    def _completion(self, capture: Capture, options: Any) -> str:
+        made = fingerprint(capture, _deciding(options.reconstruct))
+        files = [*filter(None, (capture.urdf, *(capture.depths or ())))]
+        files += [
+            (camera.folder or capture.folder) / name for camera in capture.others for name in camera.images
+        ]
+        files += sorted((self.path / ADDED).rglob("*"))
+        paths = [capture.folder / file for file in files]
+        states = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
+        digest = hashlib.sha256(json.dumps([made, asdict(options), states], default=str).encode())
+        with np.printoptions(threshold=sys.maxsize):
+            digest.update(repr(capture).encode())
+        digest.update(read_bytes(self.path / CALIBRATION))
+        return digest.hexdigest()
+
     def keep_report(self, page: str) -> None:
         """Write report.html."""
         write_text(self.path / REPORT, page)
@@ -310,7 +344,11 @@ def _with_depth_apart(content: bytes) -> bytes:
 
 
 def state_of(capture: Capture, options: MadeWith) -> State:
-    """The state of a run with these options, before anything was tried."""
+    """The state of a run with these options, before anything was tried; InputError where no file can hold it."""
+    try:
+        str(capture.folder.resolve()).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{capture.folder}: a folder whose name is not UTF-8; rename it") from None
     return State(
         capture=str(capture.folder.resolve()),
         reconstruct=fingerprint(capture, _deciding(options.reconstruct)),

@@ -48,7 +48,7 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     content = calibration_file(
         capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts
     )
-    if not content.converged or content.short is not None:
+    if content.verdict == "rejected" or content.short is not None:
         board = proposed_for(capture, options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
     folder.keep_calibration(content)

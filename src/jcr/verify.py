@@ -1,11 +1,12 @@
-"""Is yesterday's calibration still valid of today's images? What `jcr verify` answers."""
+"""Has the camera moved since it was calibrated? What `jcr verify` answers."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from scipy.stats import chi2
 
@@ -15,18 +16,22 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
+from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import PoseFit, fit_poses
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.reconstruct.relocate import Located, relocate
-from jcr.records import Capture, Reconstruction
+from jcr.records import Capture, PosePairs, Reconstruction, Verdict
 from jcr.records.words import sentence
 from jcr.run_folder import RunFolder
 
+ROUNDING = 1e-9
+"""Of a pose that is written and read."""
 MIN_TO_RECALIBRATE = 5
 """Images of another scene; with fewer a wrong one cannot be outvoted."""
 
@@ -73,12 +78,19 @@ class Verification:
         return float(np.linalg.norm(self.offset[3:]))
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
+        """Of the calibration, for the new images."""
+        if self.moved:
+            return "rejected"
+        return "accepted with warnings" if self.notes else "accepted"
+
+    @property
+    def finding(self) -> str:
         """What has moved, in words."""
         if self.fixed is not None:
-            return f"{self.fixed} has moved" if self.moved else "still valid"
+            return f"{self.fixed} has {'moved' if self.moved else 'not moved'}"
         moved = {"camera": "the camera", "scene": "the scene", "either": "the camera or the scene"}
-        return f"{moved[self.cause]} has moved" if self.moved else "still valid"
+        return f"{moved[self.cause]} has moved" if self.moved else "nothing has moved"
 
     @property
     def advice(self) -> str:
@@ -100,14 +112,23 @@ class Verification:
 
 
 def verify(
-    out: Path, new: Capture, options: VerifyOptions = VerifyOptions(), progress: Progress | None = None
+    out: str | Path,
+    new: Capture | str | Path,
+    options: VerifyOptions | Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
 ) -> Verification:
-    """Hold the calibration in the run folder `out` against the few images of `new`.
+    """Hold the calibration in the run folder `out` against the few images of `new`, a capture or its path.
 
-    Raises InputError for a run that holds no trusted calibration, or images of another camera; NotTrustedError
+    Raises InputError for a run that holds no accepted calibration, or images of another camera; NotTrustedError
     when the images share too few features with the old scene, or too few of another, to tell.
     """
-    report = progress or silent
+    report, options = progress or silent, checked_options(options, VerifyOptions)
+    out = Path(out)
+    if not isinstance(new, Capture):
+        found = read_source(new, at_least=1)
+        if isinstance(found, PosePairs):
+            raise InputError(f"{new}: gives poses and no images, which verify needs")
+        new = found
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
     folder = RunFolder(out)
@@ -124,11 +145,13 @@ def verify(
             f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
             f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
         )
+    taken_then, taken_now = _images(capture.folder, capture.images), _images(new.folder, new.images)
+    _require_new(taken_now, taken_then)
     report("find the old scene", 0.0)
     located = relocate(
         reconstruction,
-        [read_image(capture.folder / capture.images[row]) for row in reconstruction.image_index],
-        [read_image(new.folder / name) for name in new.images],
+        [taken_then[capture.images[row]] for row in reconstruction.image_index],
+        [*taken_now.values()],
     )
     report("find the old scene", 1.0)
     shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
@@ -151,7 +174,7 @@ def verify(
             systematic,
             options.alpha,
         )
-        notes = (*lost, *([] if unused is None else [sentence(unused)]))
+        notes = (*lost, *([] if unused is None else [sentence(unused)]), *_same_poses(new, capture))
         return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
     if len(new) < MIN_TO_RECALIBRATE:
         raise NotTrustedError(
@@ -189,6 +212,11 @@ def verify_camera(
     if name not in placed:
         there = ", ".join(placed) or "none"
         raise InputError(f"--camera {name}: {out} has placed no fixed camera of that name; there are {there}")
+    own = others[name]
+    _require_new(
+        {str(picture): read_image(picture) for picture in pictures},
+        _images(own.folder or capture.folder, own.images),
+    )
     # One lens took both: what is wrong with it moves both places alike.
     lens = placed[name]
     exact = np.zeros(4 + len(lens.distortion))
@@ -213,6 +241,37 @@ def verify_camera(
     notes = tuple(text for camera in found.cameras for text in camera.warnings)
     images = tuple(str(picture) for picture in pictures)
     return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
+
+
+def _images(folder: Path, names: Sequence[str]) -> dict[str, UInt8[ndarray, "h w 3"]]:
+    return {name: read_image(folder / name) for name in names}
+
+
+def _require_new(
+    now: Mapping[str, UInt8[ndarray, "_ _ 3"]], then: Mapping[str, UInt8[ndarray, "_ _ 3"]]
+) -> None:
+    """InputError where an image is one of the calibration, whatever it is called: that would confirm itself."""
+    for name, image in now.items():
+        for old, other in then.items():
+            if np.array_equal(image, other):
+                raise InputError(
+                    f"{name}: is {old}, which the calibration was made from, and cannot test it; take a new image"
+                )
+
+
+def _same_poses(new: Capture, then: Capture) -> tuple[str, ...]:
+    """A note where gripper poses are to the last digit those of the calibration: commanded ones, or copied."""
+    same = [
+        name
+        for name, pose in zip(new.images, new.base_from_gripper, strict=True)
+        if (np.abs(pose - then.base_from_gripper) < ROUNDING).all(axis=(1, 2)).any()
+    ]
+    if not same:
+        return ()
+    return (
+        f"{', '.join(same)}: the gripper pose is to the last digit one of the calibration; give the pose that the robot "
+        "measures there now, not a copy or the commanded one",
+    )
 
 
 def fitted(

@@ -75,6 +75,9 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.PLACE_UNCERTAIN: {"value": 0.1, "details": SIZE | {"focal_std": 0.1}, "mend": "intrinsics"},
     Kind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
     Kind.ANOTHER_SCENE: {"value": 9.0, "details": {"camera": "wrist"}},
+    Kind.STATIC_IMAGES: {"value": 0.2, "details": SIZE},
+    Kind.POSES_SWAPPED: {"images": ("a.png", "b.png")},
+    Kind.POSE_CONTRADICTS_IMAGE: {"value": 0.1, "images": ("a.png",), "details": SIZE},
 }
 """What a kind needs to be said; the others a value with its sigma and chance, or words of their own."""
 

@@ -3,24 +3,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated.problem import HandEyeProblem, disturbed, hand_eye_problem
 from jcr import pipeline, stages
-from jcr.calibration.calibration_json import CalibrationFile, calibration_file
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file, write_calibration
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.requirement import GRASPING, advised
 from jcr.calibration.seen import within_95
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
+from jcr.cli import dispatch
 from jcr.cli.output import Output
-from jcr.cli.result import show
+from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.records import Finding, HandEye, Kind, PosePairs
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
-from jcr.results import PosesResult, RunOptions
+from jcr.results import PosesResult, RunOptions, hand_eye_table
 
 DISAGREE = Finding(
     kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
@@ -96,18 +98,18 @@ def test_the_poses_that_are_proposed_reach_what_they_promise():
 def test_the_images_that_are_missing_are_counted_and_proposed():
     given, _ = pairs(12, 12)
     reached = calibrate_poses(given).requirement
-    assert reached is not None and reached.is_met and reached.more_images == 0
+    assert reached is not None and reached.met and reached.more_images == 0
     asked = CalibrateOptions(require=(0.75 * reached.reached_mm, 10.0))
     hand_eye = calibrate_poses(given, asked)
     required = hand_eye.requirement
-    assert required is not None and not required.is_met and required.more_images
+    assert required is not None and not required.met and required.more_images
     assert len(hand_eye.next_poses) == max(2, required.more_images)
     content, html = page(given, hand_eye)
-    assert content.short is not None and content.verdict == "accepted with warnings"
+    assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
     say = sentence(content.short)
     assert f"add {required.more_images} image" in say
     assert "within what is needed" in summary(content)
-    assert 'class="verdict fair"' in html and 'class="verdict good"' not in html
+    assert 'class="verdict bad"' in html and "Rejected:" in html
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
 
 
@@ -137,7 +139,7 @@ def test_an_answer_that_is_rejected_is_red_whatever_was_asked():
     given, _ = pairs(12, 12)
     met = calibrate_poses(given, CalibrateOptions(require=(1000.0, 100.0)))
     content, html = page(given, met.with_findings(DISAGREE))
-    assert content.requirement is not None and content.requirement.is_met
+    assert content.requirement is not None and content.requirement.met
     assert 'class="verdict bad"' in html and "the images disagree" in html
 
 
@@ -147,12 +149,44 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
         result = PosesResult(Path("out"), given, page(given, hand_eye)[0], hand_eye, False)
         if asked is None:
+            show_calibration(result, Output())
+            said = capsys.readouterr().out
+            quaternion = Rotation.from_matrix(hand_eye.gripper_from_camera[:3, :3]).as_quat(canonical=True)
+            assert "(95 % of errors)" in said
+            assert "qx qy qz qw: " in said and " ".join(f"{part:.6f}" for part in quaternion) in said
             assert show(result, Output()) == 0
             said = capsys.readouterr()
-            assert "(95 % of errors)" in said.out and not said.err
+            assert said.out.startswith("accepted\nnext: jcr export out urdf\n") and not said.err
             continue
         with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
             show(result, Output())
+
+
+def test_one_notion_of_accepted_in_python_notebook_and_compare(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    given, _ = pairs(12, 12)
+    verdicts = {None: "accepted", (5.0, 1.0): "accepted", (0.5, 0.1): "rejected"}
+    for k, (asked, verdict) in enumerate(verdicts.items()):
+        hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
+        assert hand_eye.verdict == verdict and hand_eye.is_sound
+        assert f"</b>, {verdict}" in hand_eye_table(hand_eye, "")
+        write_calibration(tmp_path / f"{k}.json", page(given, hand_eye)[0])
+    # By default it is a wish: it warns, in the notebook too.
+    poor = calibrate_poses(PosePairs(given.source, given.images[:4], *_first(given, 4), False))
+    assert poor.verdict == "accepted with warnings"
+    table = hand_eye_table(poor, "")
+    assert "accepted with warnings: " in table and "not as exact as needed" in table
+    assert dispatch(["compare", str(tmp_path / "0.json"), str(tmp_path / "1.json")]) == 0
+    assert not capsys.readouterr().err
+    assert dispatch(["compare", str(tmp_path / "0.json"), str(tmp_path / "2.json"), "--json"]) == 3
+    said = capsys.readouterr()
+    assert list(json.loads(said.out)["rejected"]) == [str(tmp_path / "2.json")]
+    assert "2.json: its calibration is rejected: not as exact as needed" in said.err
+
+
+def _first(given: PosePairs, count: int) -> tuple[np.ndarray, np.ndarray]:
+    return given.base_from_gripper[:count], given.recon_from_camera[:count]
 
 
 @pytest.mark.parametrize("asked", [(0.0, 1.0), (2.0, -1.0), (float("nan"), 1.0)])

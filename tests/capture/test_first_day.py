@@ -70,3 +70,46 @@ def test_matrices_by_columns_and_inverted_poses_name_the_option_that_reads_them(
     assert np.allclose(capture.base_from_gripper, POSES)
     inverted = jcr.read_capture(folder, ReadOptions(pose_convention="franka", pose_inverted=True))
     assert np.allclose(inverted.base_from_gripper, inverse(POSES))
+
+
+HEADER = "image,x,y,z,qx,qy,qz,qw"
+
+
+def rows_of(names: list[str], poses: np.ndarray = POSES, *, metre: float = 1.0) -> list[str]:
+    numbers = numbers_from_poses(poses, "quat-xyzw") * ([metre] * 3 + [1] * 4)
+    return [f"{name}," + ",".join(f"{x:.9f}" for x in row) for name, row in zip(names, numbers, strict=True)]
+
+
+@pytest.mark.parametrize("header", [[HEADER.replace(",", ";")], []])
+def test_a_spreadsheet_with_decimal_commas_is_read(folder: Path, header: list[str]):
+    names = [f"{k}.png" for k in range(4)]
+    lines = [line.replace(",", ";").replace(".", ",") for line in rows_of(names)]
+    lines = [line.replace(",png", ".png") for line in lines]
+    assert ",5" in "".join(lines) or "0," in lines[0]
+    options = ReadOptions() if header else ReadOptions(pose_convention="quat-xyzw")
+    capture = jcr.read_capture(written(folder, header + lines), options)
+    assert np.allclose(capture.base_from_gripper, POSES, atol=1e-8)
+
+
+def test_centimetres_are_named_and_read(folder: Path):
+    written(folder, [HEADER, *rows_of([f"{k}.png" for k in range(4)], metre=100.0)])
+    with pytest.raises(jcr.InputError, match="look like centimetres: add --pose-units cm-rad"):
+        jcr.read_capture(folder)
+    assert np.allclose(jcr.read_capture(folder, ReadOptions(pose_units="cm-rad")).base_from_gripper, POSES)
+    in_header = HEADER.replace("x,y,z", "x_cm,y_cm,z_cm", 1)
+    written(folder, [in_header, *rows_of([f"{k}.png" for k in range(4)], metre=100.0)])
+    assert np.allclose(jcr.read_capture(folder).base_from_gripper, POSES)
+
+
+@pytest.mark.parametrize("name", ["/home/robot/run 7/{}.png", r"C:\run\{}.PNG", "IMAGES/{}.JPG"])
+def test_images_are_found_by_their_own_names(folder: Path, name: str):
+    capture = jcr.read_capture(written(folder, [HEADER, *rows_of([name.format(k) for k in range(4)])]))
+    assert capture.images == tuple(f"images/{k}.png" for k in range(4))
+    assert any(name.format(0) in note and "images/0.png" in note for note in capture.notes)
+
+
+def test_images_without_poses_are_named(folder: Path):
+    with pytest.raises(
+        jcr.InputError, match=r"no poses.csv beside its 6 images \(images/0.png … images/5.png\)"
+    ):
+        jcr.read_capture(folder)

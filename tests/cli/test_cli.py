@@ -201,7 +201,11 @@ def test_sizes_of_nothing_are_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["fly"], "not a jcr command"),
+        (["fly"], "not a jcr command; choose from"),
+        (["rum"], "not a jcr command; did you mean run?"),
+        (["run", "a", "b", "--requre", "1", "1"], "did you mean --require? (jcr run --help)"),
+        (["run", "a", "b", "--backend", "colmp"], "did you mean colmap?; choose from auto, "),
+        (["export", "a", "octomapp"], "did you mean octomap?"),
         (["run"], "required"),
         (
             ["run", "a", "b", "--require", "2"],
@@ -255,3 +259,28 @@ def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: 
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
     assert "--no-bundle-adjustment Use camera poses only" in text
     assert text.index("--pose-convention") < text.index("--require") < text.index("--backend")
+
+
+@pytest.mark.slow
+def test_an_unchanged_run_rebuilds_nothing_and_a_changed_one_does(
+    small_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    command = ["run", str(small_capture), str(out), "--no-map"]
+    assert dispatch(command) == 0
+    first, made = capsys.readouterr(), {file: file.stat().st_mtime_ns for file in out.iterdir()}
+    # The calibration comes first, then the verdict, and what to do next.
+    order = [
+        first.out.index(word)
+        for word in ("gripper_from_camera", "qx qy qz qw", "\naccepted", "report: ", "next: ")
+    ]
+    assert order == sorted(order) and first.out.count("jcr ") >= 3
+    assert dispatch(command) == 0
+    again = capsys.readouterr()
+    assert "unchanged" in again.err and again.out == first.out
+    assert {file: file.stat().st_mtime_ns for file in out.iterdir() if file.name != ".lock"} == {
+        file: time for file, time in made.items() if file.name != ".lock"
+    }
+    assert dispatch([*command, "--require", "50", "9"]) == 0
+    assert "unchanged" not in capsys.readouterr().err
+    assert (out / "report.html").stat().st_mtime_ns > made[out / "report.html"]

@@ -25,9 +25,9 @@ from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
-from jcr.errors import InputError
+from jcr.errors import InputError, NotTrustedError
 from jcr.export import ros
-from jcr.export.formats import FORMATS
+from jcr.export.formats import FORMATS, export_run
 from jcr.export.provenance import Provenance
 from jcr.files import write_bytes
 from jcr.geometry import apply, inverse, rotation_exp, transform
@@ -558,7 +558,9 @@ def test_command_gives_the_root_link_asked_for(
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
 
 
-def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_every_file(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     run = tmp_path / "run"
     run.mkdir()
     for name in ("cloud.ply", "map.safetensors", "reconstruction.npz", "run.json"):
@@ -574,10 +576,14 @@ def test_doubt_is_in_every_file_and_on_stderr(done: Path, tmp_path: Path, capsys
     for row in FORMATS:
         if row.name == "rerun":
             continue  # needs an extra; tested where it is
-        assert dispatch(["export", str(run), row.name]) == 3
-        complaint = capsys.readouterr().err
-        assert DOUBT in complaint and "rejected" in complaint
         path = run / "export" / row.file
+        assert dispatch(["export", str(run), row.name]) == 3 and not path.exists()
+        complaint = capsys.readouterr().err
+        assert DOUBT in complaint and "rejected" in complaint and "--force" in complaint
+        with pytest.raises(NotTrustedError, match="rejected"):
+            export_run(run, row.name)
+        assert dispatch(["export", str(run), row.name, "--force"]) == 0
+        assert DOUBT in capsys.readouterr().err
         files = (
             [path] if path.is_file() else [path / "README.txt", path / "transforms.json", path / "points.ply"]
         )

@@ -108,3 +108,15 @@ def test_a_run_that_is_told_to_end_leaves_nothing_half_written_and_goes_on(
             json.loads((out / name).read_text())
     assert subprocess.run(command, check=False, timeout=200).returncode == 0
     assert read_calibration(out).converged and not list(out.glob(".*.part*"))
+
+
+def test_too_little_address_space_is_one_line(tmp_path: Path):
+    finished = subprocess.run(
+        ["sh", "-c", 'ulimit -v 1200000; "$@"', "sh", sys.executable, "-m", "jcr", "check", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert finished.returncode == 2 and finished.stderr.count("\n") == 1
+    assert finished.stderr.startswith("error: out of memory: ") and "ulimit -v" in finished.stderr

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.poses import calibrate_poses
+from jcr.capture.names import paired_by_name
 from jcr.geometry import inverse, transform
-from jcr.handeye.conventions import better_reading, convention_finding
+from jcr.handeye.conventions import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
 from jcr.handeye.next_poses import next_poses
 from jcr.records import PosePairs
 from jcr.records.words import sentence
@@ -34,6 +35,7 @@ MISTAKES = {
     "reversed": (lambda g: g[::-1].copy(), "reverse order"),
     "late by one": (lambda g: np.roll(g, 1, 0), "1 ahead of the images"),
     "early by one": (lambda g: np.roll(g, -1, 0), "1 behind the images"),
+    "left-handed base": (lambda g: np.diag([1, 1, -1, 1.0]) @ g @ np.diag([1, 1, -1, 1.0]), "mirrored ones"),
     "w first": (lambda g: reordered_quaternion(g, [3, 0, 1, 2]), "quaternions w, x, y, z"),
     "w last": (lambda g: reordered_quaternion(g, [1, 2, 3, 0]), "quaternions x, y, z, w"),
     "Euler order": (
@@ -72,6 +74,31 @@ def test_each_mistake_is_named(mistake: str):
     # Where only rotations are misread, positions may still fit to 0.4 mm, with rotations that are tens of degrees off.
     assert found[0].misfit < 1.0 and found[0].translation_mm < 0.5
     assert found[1].misfit > 10.0
+
+
+@pytest.mark.slow
+def test_images_that_are_mirrored_are_named():
+    problem = hand_eye_problem(np.random.default_rng(3), 10, robot_noise=(2e-4, 5e-4))
+    mirror = np.diag([-1, 1, 1, 1.0])
+    found = better_reading(problem.base_from_gripper, mirror @ problem.recon_from_camera @ mirror)
+    assert found is not None and found[0].name == MIRRORED and found[0].used == 10
+
+
+@pytest.mark.slow
+def test_rows_in_another_order_of_the_images_names_are_named():
+    problem = hand_eye_problem(np.random.default_rng(2), 12, robot_noise=(2e-4, 5e-4))
+    names, poses = [f"images/{k}.png" for k in range(1, 13)], problem.base_from_gripper
+    by_text = sorted(range(12), key=lambda k: names[k])
+    # Rows of a table in order of the names as text, images paired as people count; and the other way round.
+    for images, rows, order in (
+        (names, poses[by_text], BY_TEXT),
+        ([names[k] for k in by_text], poses, BY_NUMBER),
+    ):
+        cameras = problem.recon_from_camera[[int(Path(name).stem) - 1 for name in images]]
+        assert better_reading(rows, cameras) is None
+        found = better_reading(rows, cameras, paired_by_name(images, rows))
+        assert found is not None and found[0].name == order
+        assert "add a column image" in sentence(convention_finding(found))
 
 
 @pytest.mark.slow

@@ -213,7 +213,8 @@ def test_others_need_the_token(tabletop: Path):
     with pytest.raises(jcr.InputError, match="token"):
         bound(Listen("0.0.0.0", 0))
     with serving(Listen(port=0, token="sesame", timeout_s=20.0)) as (port, heard):
-        for line in ({"token": "wrong"}, {"base_from_gripper": poses(tabletop)[0].tolist()}, {"done": True}):
+        wrong = {"token": "wrong"}, {"token": "\ud800"}
+        for line in (*wrong, {"base_from_gripper": poses(tabletop)[0].tolist()}, {"done": True}):
             stranger = Client(port)
             assert stranger.ask(line)["accepted"] is False
             assert stranger.lines.readline() == ""
@@ -256,6 +257,24 @@ def test_a_client_that_drips_or_floods_is_dropped_and_others_are_served(monkeypa
         assert friend.ask(half[20:]) == {"accepted": True}
         friend.close()
     assert len(heard) == 1
+
+
+def test_a_silent_client_gives_way_to_one_that_waits_and_alone_it_may_wait(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("jcr.live.line_server.LINE_S", 0.2)
+    with serving(Listen(port=0, timeout_s=20.0)) as (port, heard):
+        slow = Client(port)
+        time.sleep(0.5)
+        pose = {"base_from_gripper": [0.4, 0, 0.5, 0, np.pi, 0]}
+        assert slow.ask(pose) == {"accepted": True}
+        slow.close()
+        silent = Client(port)
+        friend = Client(port)
+        begun = time.monotonic()
+        assert friend.ask(pose) == {"accepted": True} and time.monotonic() - begun < 5
+        assert "another client waits" in json.loads(silent.lines.readline())["reason"]
+        silent.close()
+        friend.close()
+    assert len(heard) == 2
 
 
 def test_silence_ends_the_wait():

@@ -209,7 +209,8 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     within = (
         f"is placed within {significant(required.reached_mm)} mm and {significant(required.reached_deg)}°"
     )
-    assert f"Accepted: a point seen at {significant(1e-3 * required.distance_mm)} m {within}" in elements.text
+    seen = f"a point seen at {significant(1e-3 * required.distance_mm)} m {within}"
+    assert f"{written['verdict'].capitalize()}: {seen}" in elements.text
     for std in written["uncertainty"]["translation_std_mm"]:
         assert f"±{significant(std)} mm" in elements.text
     for image in written["images"]:
@@ -338,7 +339,7 @@ def test_untrusted_calibration_is_not_recommended(run: RunResult):
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
     page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
     text = Elements(page).text
-    assert f"Do not trust this calibration: {content.warnings[0]}." in text
+    assert f"Rejected: {content.warnings[0]}." in text
     assert "Accepted:" not in text and "no comfort" in text
     assert all(advice in text for advice in content.observability.advice)
 

@@ -209,13 +209,9 @@ class CalibrationFile(Part):
 
     @property
     def remarks(self) -> list[str]:
-        """What else the user must act on, in words."""
-        others = self.findings if self.converged else self.findings[1:]
-        return [
-            sentence(one)
-            for one in others
-            if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
-        ]
+        """What else the user must act on than why it is rejected or short, in words."""
+        first = self.short if self.converged else self.findings[0]
+        return [sentence(one) for one in self.findings if one.severity != "informs" and one is not first]
 
     def with_findings(self, *findings: Finding) -> "CalibrationFile":
         """The same with more findings, and what is derived of them."""

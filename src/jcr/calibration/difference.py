@@ -1,13 +1,14 @@
 """How far apart two calibrations are, whether what both report explains it, and which of its causes would."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
-from jcr.calibration.known_transform import Known
+from jcr.calibration.known_transform import Known, read_hand_eye
 from jcr.geometry import step_between
 
 OTHER = "reference"
@@ -28,6 +29,14 @@ class Difference:
     p_value: float | None
     explained_by: dict[str, float]
     """Shares of it, by cause, largest first; their sum is 1. Empty where there is no difference."""
+
+
+def compare(calibration: str | Path, reference: str | Path) -> Difference:
+    """The difference of two calibrations, each a run folder, a calibration.json or a JSON file with gripper_from_camera.
+
+    Raises InputError where one of them has no transform.
+    """
+    return difference(read_hand_eye(Path(calibration)), read_hand_eye(Path(reference)))
 
 
 def difference(ours: Known, other: Known) -> Difference:

@@ -26,6 +26,8 @@ class Known:
     """Of the first six of COVARIANCE_ORDER; None where the file has none."""
     parts: dict[str, Float[ndarray, "6 6"]]
     """Of the covariance, by cause; empty where the file names none."""
+    doubt: str | None = None
+    """Why it is rejected, by its own file; None where it is accepted, or the file has no verdict."""
 
 
 def read_hand_eye(path: Path) -> Known:
@@ -40,8 +42,7 @@ def read_hand_eye(path: Path) -> Known:
     if not file.is_file():
         raise InputError(f"{path}: no calibration.json or reference.json there; name a run folder or a file")
     content = read_content(file)
-    if "format" in content:
-        validated(content, file)
+    doubt = validated(content, file).doubt if "format" in content else None
     try:
         found = _Transform.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -56,6 +57,7 @@ def read_hand_eye(path: Path) -> Known:
             transform,
             np.array(uncertainty.covariance)[:6, :6],
             {name: np.array(part)[:6, :6] for name, part in parts.items() if part is not None},
+            doubt,
         )
     if found.std_mm is not None and found.std_deg is not None:
         std = np.r_[np.array(found.std_mm) / 1e3, np.radians(found.std_deg)]

@@ -57,8 +57,11 @@ def advised(
 
 
 def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
-    """That a calibration is not as exact as is required; `systematic`: mostly by systematic errors of the robot."""
-    if required.is_met:
+    """That a calibration is not as exact as is required, which rejects it where a user asked for it.
+
+    `systematic`: mostly by systematic errors of the robot.
+    """
+    if required.met:
         return None
     mend: Mend = "images" if required.more_images is not None else "robot" if systematic else "none"
     numbers = {
@@ -68,7 +71,7 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
     }
     return Finding(
         kind=Kind.NOT_EXACT_ENOUGH,
-        severity="warns",
+        severity="rejects" if required.asked else "warns",
         mend=mend,
         value=1e-3 * required.reached_mm,
         details=numbers,
@@ -116,7 +119,7 @@ def _worthwhile(
     if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
         stays = stays + systematic
     distance = 1e-3 * required.distance_mm
-    _, proposed = next_poses(used, PROPOSED if required.is_met else MOST, x, noise, distance_m=distance)
+    _, proposed = next_poses(used, PROPOSED if required.met else MOST, x, noise, distance_m=distance)
     added = np.stack([pose.base_from_gripper for pose in proposed])
     information = np.cumsum(
         np.concatenate([pose_information(used, x, noise).sum(0)[None], pose_information(added, x, noise)]), 0
@@ -130,14 +133,14 @@ def _worthwhile(
     proposed = [
         replace(pose, expected_std=np.sqrt(np.diag(then))) for pose, then in zip(proposed, left, strict=True)
     ]
-    if required.is_met:
+    if required.met:
         return 0, proposed
     point = point_ahead(x, distance)
     mm = _shrunk(required.reached_mm, 1e3 * within_95(point @ stays @ point.T), point @ expected @ point.T)
     deg_stays = np.degrees(within_95(stays[3:6, 3:6]))
     deg = _shrunk(required.reached_deg, float(deg_stays), expected[:, 3:6, 3:6])
     for count, (millimetres, degrees) in enumerate(zip(mm, deg, strict=True), start=1):
-        if replace(required, reached_mm=float(millimetres), reached_deg=float(degrees)).is_met:
+        if replace(required, reached_mm=float(millimetres), reached_deg=float(degrees)).met:
             return count, proposed[: max(PROPOSED, count)]
     return None, proposed[:PROPOSED]
 

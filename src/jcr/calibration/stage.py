@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.fit import fitted
@@ -30,7 +32,12 @@ def calibrate(
     case = adjusted(fitted(capture, reconstruction, options, robot))
     for check in CHECKS:
         if check.needs(case):
-            case = with_checked(case, check.run(case))
+            try:
+                case = with_checked(case, check.run(case))
+            except np.linalg.LinAlgError:
+                # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
+                if case.hand_eye.converged:
+                    raise
     scene = case.scene_in_base
     hand_eye = advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std, scene)
     if capture.intrinsics is None or scene is None:

@@ -3,9 +3,12 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck
-from jcr.records.words import network_scale, reached_in_words
+from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, verdict_of
+from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
 
 if TYPE_CHECKING:
@@ -54,6 +57,7 @@ def found(content: "CalibrationFile") -> list[str]:
         f"{content.mount}_from_camera ({content.images_used} of {len(content.images)} images, "
         f"back end {content.backend})",
         *(f"  {row}" for row in matrix),
+        f"  x y z (m), qx qy qz qw: {_as_quaternion(np.array(content.parent_from_camera))}",
         f"  ± {x:.2f} {y:.2f} {z:.2f} mm, {rx:.3f} {ry:.3f} {rz:.3f} ° (1 σ; worst {uncertainty.worst})",
     ]
     if uncertainty.budget is not None:
@@ -90,6 +94,17 @@ def given_in_words(given: "GivenIntrinsicsKept") -> str:
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
         f"{significant(given.differs_mm)} mm from there, and within {significant(given.seen.within_95_mm)} mm"
     )
+
+
+def verdict_in_words(content: "CalibrationFile") -> str:
+    """The verdict, with the first reason where it is rejected or accepted with warnings."""
+    reasons = [sentence(one) for one in content.findings if one.severity != "informs"]
+    return ": ".join((verdict_of(content.findings), *reasons[:1]))
+
+
+def _as_quaternion(matrix: Float[ndarray, "4 4"]) -> str:
+    quat_xyzw = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True)
+    return " ".join(f"{number:.6f}" for number in (*matrix[:3, 3], *quat_xyzw))
 
 
 def worst_direction(estimate: Estimate) -> str:

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
-from jcr.capture.checks import checked_capture, first_few, read_rigid, require_images
+from jcr.capture.checks import checked_capture, first_few, read_rigid, require_frames, require_images
 from jcr.capture.depth_images import depth_of_frames
 from jcr.capture.lens_json import lens_as_json, read_lens, read_std, std_as_json
-from jcr.capture.options import ReadOptions
+from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -21,6 +21,8 @@ from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.records import Capture
 
 FILE, URDF = "capture.json", "robot.urdf"
+MAX_BYTES = 32_000_000
+"""More takes long to read, and is no capture."""
 MOST_TURNS = 6 * np.pi + 0.01
 """rad: no joint rotates farther to either side."""
 
@@ -30,10 +32,15 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if not file.is_file():
         raise InputError(f"{folder}: holds no capture.json; name a capture folder")
+    if (size := file.stat().st_size) > MAX_BYTES:
+        raise InputError(
+            f"{file}: {size / 1e6:.0f} MB; {MAX_BYTES // 1_000_000} MB at most, which hold {MAX_FRAMES} frames"
+        )
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file}: has no list "frames"; expected {{"frames": [...], "intrinsics": ...}}')
     frames = content["frames"]
+    require_frames(len(frames), str(file), 0)
     images = [_image_name(frame, i, file) for i, frame in enumerate(frames)]
     require_images(folder, images, str(file))
     without_pose = [

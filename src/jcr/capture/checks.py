@@ -14,13 +14,16 @@ from numpy import ndarray
 from jcr.capture.images import TURNED, how_stored, read_image
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
+from jcr.capture.robot_poses import likely_unit
 from jcr.errors import InputError
-from jcr.geometry import require_rigid
+from jcr.geometry import require_rigid, step_between
 from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
 
 NAMED = 10
 """Images that a message names; of more it says how many."""
 MIRRORED = (2, 4, 5, 7)
+SAME_POSE = (0.5e-3, np.radians(0.05))
+"""m, rad: within this, poses are one at which the arm rests."""
 MAX_REACH = 10.0
 """Metres; no arm reaches farther from its base, so larger numbers are millimetres."""
 
@@ -77,6 +80,18 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
         raise InputError(f"{where}: {count} frames; at least {at_least} are needed, 8 to 12 are good")
 
 
+def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:
+    """Raises InputError where three gripper poses or more are one and the same."""
+    metres, radians = np.abs(step_between(base_from_gripper[:1], base_from_gripper).reshape(-1, 2, 3)).max(
+        axis=(0, 2), initial=0.0
+    )
+    if len(base_from_gripper) >= MIN_FRAMES and metres < SAME_POSE[0] and radians < SAME_POSE[1]:
+        raise InputError(
+            f"{where}: all {len(base_from_gripper)} gripper poses are the same (within {1e3 * metres:.2g} mm and "
+            f"{np.degrees(radians):.2g}°); read the pose again for each image"
+        )
+
+
 def checked_lens(
     focal_and_centre: Sequence[Any],
     distortion: Sequence[Any],
@@ -126,9 +141,10 @@ def check_metres(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None
     """InputError when positions are too far from the base to be metres."""
     farthest = float(np.abs(base_from_gripper[:, :3, 3]).max())
     if farthest > MAX_REACH:
+        name, short, a_metre = likely_unit(farthest)
         raise InputError(
-            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like millimetres: "
-            "divide the translations by 1000 (a pose table: --pose-units mm-rad or mm-deg)"
+            f"{where}: the gripper is up to {farthest:.4g} from the base; these look like {name}: "
+            f"divide the translations by {a_metre} (a pose table: --pose-units {short}-rad or {short}-deg)"
         )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image, ImageOps
 
@@ -38,6 +38,8 @@ BITS_PER_SAMPLE = 258
 """The TIFF tag."""
 DEFECTIVE = 10_000
 """One pixel in this many may be one that the sensor does not read."""
+ONE_VIEW = 0.5
+"""Of the sum of the squared details of two images, which unrelated images differ by."""
 DARK, BRIGHT = 12, 243
 """Mean grey levels of 255 beyond which an image shows nothing."""
 
@@ -143,6 +145,23 @@ def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, flo
     """Mean grey level, and variance of the Laplacian, which falls when an image is blurred."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:
+    """Whether two images differ by less than their detail, as two of a camera at rest do but for noise and exposure.
+
+    Of a camera that moved by a few pixels the details of some pixels' size have nothing in common.
+    """
+    one, two = (_detail(image) for image in (first, other))
+    return float(((one - two) ** 2).mean()) < ONE_VIEW * float((one**2).mean() + (two**2).mean())
+
+
+def _detail(image: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns"]:
+    """Details of some pixels' size, of unit contrast: noise is smaller, shading larger."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = cv2.resize(grey, None, fx=(scale := 640 / max(grey.shape)), fy=scale).astype(np.float32)
+    band = cv2.GaussianBlur(grey, (0, 0), 2.0) - cv2.GaussianBlur(grey, (0, 0), 8.0)
+    return band / max(float(band.std()), 1e-6)
 
 
 def exposure_fault(brightness: float) -> str | None:

@@ -41,7 +41,7 @@ ConventionName = Literal[
     "unitree",
     "realman",
 ]
-UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg"]
+UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-deg"]
 
 
 @dataclass(frozen=True)

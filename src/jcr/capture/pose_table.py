@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -148,10 +149,9 @@ def _units(convention: str, said: frozenset[str], options: ReadOptions) -> Units
     if options.pose_units != "auto" or not said:
         return options.pose_units
     form = CONVENTIONS[convention]
-    millimetres = "mm" in said or ("m" not in said and form.millimetres)
-    if "deg" in said or ("rad" not in said and form.degrees):
-        return "mm-deg" if millimetres else "m-deg"
-    return "mm-rad" if millimetres else "m-rad"
+    length = next((unit for unit in ("mm", "cm", "m") if unit in said), "mm" if form.millimetres else "m")
+    angle = next((unit for unit in ("deg", "rad") if unit in said), "deg" if form.degrees else "rad")
+    return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
 
 
 def _numbers(cells: tuple[str, ...], name: str, where: str) -> list[float]:

@@ -1,20 +1,22 @@
 """Reading a capture, whatever it was written as: the format is known by its files, and each has its own reader."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import how_scaled, how_turned, require_frames
+from jcr.capture.checks import how_scaled, how_turned, require_frames, require_motion
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
-from jcr.capture.table import find_table
+from jcr.capture.table import find_table, pictures
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
 from jcr.geometry import inverse
+from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.records.words import sentence
@@ -52,7 +54,7 @@ FORMATS = {
 
 def read_capture(
     path: str | Path,
-    options: ReadOptions | None = None,
+    options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
@@ -73,21 +75,21 @@ def read_capture(
 
 def read_source(
     path: str | Path,
-    options: ReadOptions | None = None,
+    options: ReadOptions | Mapping[str, Any] | None = None,
     *,
     into: str | Path | None = None,
     progress: Progress | None = None,
     at_least: int = MIN_FRAMES,
 ) -> Capture | PosePairs:
     """As `read_capture`, and poses of cameras without images where that is what the file holds."""
-    path, options = Path(path), options or ReadOptions()
+    path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
         raise InputError(
             f"{path}: no such capture; name a folder that holds a capture.json, or another format"
         )
     if options.frames < 3:
         raise InputError(f"--frames {options.frames}: at least 3 frames are needed, 8 to 15 are good")
-    row = FORMATS[format_of(path) if options.format == "auto" else options.format]
+    row = FORMATS[format_of(path, options) if options.format == "auto" else options.format]
     module, function = row.reader.split(":")
     reader: Any = getattr(import_module(f"jcr.capture.{module}"), function)
     if not row.recording:
@@ -96,8 +98,10 @@ def read_source(
             found = replace(found, base_from_gripper=inverse(found.base_from_gripper))
         if not isinstance(found, Capture):
             require_frames(len(found.base_from_gripper), str(path), 0)
+            require_motion(found.base_from_gripper, str(path))
             return found
         require_frames(len(found), str(path), at_least)
+        require_motion(found.base_from_gripper, str(path))
         turned = how_turned(found)
         remarks = (None if turned is None else sentence(turned), how_scaled(found))
         return replace(found, notes=(*found.notes, *filter(None, remarks)))
@@ -128,12 +132,12 @@ def _content(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def format_of(path: Path) -> str:
+def format_of(path: Path, options: ReadOptions | None = None) -> str:
     """The name of the format that the files at a path show; InputError when they show none."""
-    return _of_folder(path) if path.is_dir() else _of_file(path)
+    return _of_folder(path, options or ReadOptions()) if path.is_dir() else _of_file(path)
 
 
-def _of_folder(folder: Path) -> str:
+def _of_folder(folder: Path, options: ReadOptions) -> str:
     for name, sign in (
         ("capture", "capture.json"),
         ("bag", "metadata.yaml"),
@@ -145,10 +149,15 @@ def _of_folder(folder: Path) -> str:
             return name
     if find_model(folder) is not None:
         return "colmap"
-    if find_table(folder) is not None:
+    if options.poses is not None or find_table(folder) is not None:
         return "table"
     if any(file.suffix in BAGS for file in folder.iterdir()):
         raise InputError(f"{folder}: holds bags; name one of them")
+    if taken := pictures(folder):
+        raise InputError(
+            f"{folder}: no capture.json and no poses.csv beside its {len(taken)} images ({taken[0]} … {taken[-1]}); "
+            "add a table of gripper poses with the columns image,x,y,z,qx,qy,qz,qw (m), or name one with --poses"
+        )
     raise InputError(
         f"{folder}: holds no capture.json, nor anything else that jcr reads ({', '.join(FORMATS)}); "
         "see jcr docs captures"

@@ -14,8 +14,12 @@ from jcr.geometry import HUGE, require_rigid, transform
 
 QUATERNION_TOLERANCE = 1e-2
 """On its length; three printed digits pass."""
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+"""Of a unit of length."""
 RADIANS_LIMIT = 2 * np.pi + 0.01
 """No angle in radians is larger, and no wrist worth calibrating keeps all of its angles smaller in degrees."""
+LEAST_REACH = 0.25
+"""m: no arm with a camera stays nearer to its base."""
 METRES_LIMIT = 10.0
 """No position in metres is larger, and no gripper is always within 1 cm of its base in millimetres."""
 
@@ -152,7 +156,12 @@ def _units(form: Convention, units: UnitsName) -> tuple[float, float]:
     length, angle = ("mm" if form.millimetres else "m", "deg" if form.degrees else "rad")
     if units != "auto":
         length, angle = units.split("-")
-    return 1e-3 if length == "mm" else 1.0, np.radians(1.0) if angle == "deg" else 1.0
+    return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
+
+
+def likely_unit(farthest: float) -> tuple[str, str, int]:
+    """The unit of positions up to so far from the base, too far for metres; its sign, and how many are a metre."""
+    return ("centimetres", "cm", 100) if farthest < 1000 * LEAST_REACH else ("millimetres", "mm", 1000)
 
 
 def _check_quaternion(quaternion: Float[ndarray, "n 4"], where: str) -> None:
@@ -169,9 +178,10 @@ def _check_quaternion(quaternion: Float[ndarray, "n 4"], where: str) -> None:
 def _check_position(position: Float[ndarray, "n 3"], unit: float, units: UnitsName, where: str) -> None:
     farthest = float(np.linalg.norm(position, axis=1).max(initial=0.0))
     if farthest > METRES_LIMIT:
+        name, short, _ = likely_unit(farthest)
         raise InputError(
-            f"{where}: the gripper is up to {farthest / unit:.4g} from the base; these look like millimetres: "
-            "add --pose-units mm-rad (or mm-deg where angles are in degrees)"
+            f"{where}: the gripper is up to {farthest / unit:.4g} from the base; these look like {name}: "
+            f"add --pose-units {short}-rad (or {short}-deg where angles are in degrees)"
         )
     if units == "auto" and unit < 1 and 0 < farthest < METRES_LIMIT * unit:
         raise InputError(

@@ -1,9 +1,8 @@
 """Images and a table of gripper poses: which image belongs to which row."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +11,7 @@ from numpy import ndarray
 from jcr.capture.camera_info import FILE, read_camera_info
 from jcr.capture.checks import checked_capture
 from jcr.capture.depth_images import depth_beside
+from jcr.capture.names import natural
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.capture.pose_table import PoseTable, read_pose_table, stamp_ns
@@ -94,15 +94,20 @@ def _paired(
     folder: Path, file: Path, table: PoseTable, options: ReadOptions
 ) -> tuple[list[str], Float[ndarray, "n 4 4"], tuple[str, ...]]:
     if table.images is not None:
-        located = [_located(folder, name, file) for name in table.images]
-        return located, table.base_from_gripper, _without_pose(folder, located, file)
-    pictures = _pictures(folder)
-    if not pictures:
+        located = _located(folder, table.images, file)
+        notes = _without_pose(folder, located, file)
+        named = zip(table.images, located, strict=True)
+        if other := [(name, found) for name, found in named if found not in (name, f"images/{name}")]:
+            found = " is ".join(other[0])
+            notes = (f"{len(other)} names in {file.name} are not those of files: {found}, and so on", *notes)
+        return located, table.base_from_gripper, notes
+    taken = pictures(folder)
+    if not taken:
         raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
-    stems = [Path(name).stem for name in pictures]
+    stems = [Path(name).stem for name in taken]
     if table.stamp_ns is not None and all(map(is_number, stems)):
         stamps = np.array(
-            [stamp_ns(stem, str(folder / name)) for stem, name in zip(stems, pictures, strict=True)]
+            [stamp_ns(stem, str(folder / name)) for stem, name in zip(stems, taken, strict=True)]
         )
         if (stamps >= table.stamp_ns.min()).any() and (stamps <= table.stamp_ns.max()).any():
             poses, gap_ns = pose_track(table.stamp_ns, table.base_from_gripper).at(stamps)
@@ -110,23 +115,23 @@ def _paired(
             if not fresh.all():
                 stale = int(gap_ns.argmax())
                 raise InputError(
-                    f"{file}: no pose within {options.max_gap_ms:.0f} ms around {pictures[stale]}; drop that image "
+                    f"{file}: no pose within {options.max_gap_ms:.0f} ms around {taken[stale]}; drop that image "
                     "or raise --max-gap-ms"
                 )
-            return pictures, poses, (f"poses interpolated at the {len(pictures)} images' time stamps",)
-    if len(pictures) != len(table.base_from_gripper):
+            return taken, poses, (f"poses interpolated at the {len(taken)} images' time stamps",)
+    if len(taken) != len(table.base_from_gripper):
         raise InputError(
-            f"{file}: {len(table.base_from_gripper)} poses for {len(pictures)} images in {folder} "
-            f"({pictures[0]} … {pictures[-1]}), and no column says which belongs to which; add a column image with "
+            f"{file}: {len(table.base_from_gripper)} poses for {len(taken)} images in {folder} "
+            f"({taken[0]} … {taken[-1]}), and no column says which belongs to which; add a column image with "
             "their names"
         )
-    how = f"rows paired with images in order of their names: {pictures[0]} … {pictures[-1]}"
-    return pictures, table.base_from_gripper, (how,)
+    how = f"rows paired with images in order of their names: {taken[0]} … {taken[-1]}"
+    return taken, table.base_from_gripper, (how,)
 
 
 def _without_pose(folder: Path, named: list[str], file: Path) -> tuple[str, ...]:
     """A note on images that the table does not name; InputError where it names images that are not there."""
-    here = [name for name in _pictures(folder) if name not in named]
+    here = [name for name in pictures(folder) if name not in named]
     left_out = (
         f"{len(here)} images have no pose in {file.name} and are left out: {_listed(here)}" if here else ""
     )
@@ -143,21 +148,32 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-def _located(folder: Path, name: str, file: Path) -> str:
-    """The image's path in the folder: as written, or in images/."""
-    beside = contained(folder, name, str(file))
-    if not beside.is_file() and (folder / "images" / name).is_file():
-        return f"images/{name}"
-    return name
+def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
+    """The images' paths in the folder: as written, in images/, or by their own names whatever folder, case and ending.
+
+    A name that more than one image has decides nothing.
+    """
+    own: dict[str, list[str]] = {}
+    for picture in pictures(folder):
+        for key in {Path(picture).name.casefold(), Path(picture).stem.casefold()}:
+            own.setdefault(key, []).append(picture)
+    found = []
+    for name in names:
+        plain = PureWindowsPath(name).name  # which takes both kinds of slashes
+        like = own.get(plain.casefold()) or own.get(Path(plain).stem.casefold()) or []
+        if (folder / "images" / name).is_file() and not (folder / name).is_file():
+            found.append(f"images/{name}")
+        elif len(like) == 1 and not (folder / name).is_file():
+            found.append(like[0])
+        else:
+            contained(folder, name, str(file))
+            found.append(name)
+    return found
 
 
-def _pictures(folder: Path) -> list[str]:
+def pictures(folder: Path) -> list[str]:
     """Images of a folder, or of its images/, as people count: img2 before img10."""
     inside = folder / "images" if (folder / "images").is_dir() else folder
     files = [file for file in inside.iterdir() if file.suffix.lower() in PICTURES]
     names = [str(file.relative_to(folder)) for file in files]
-    return sorted(names, key=_natural)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return sorted(names, key=natural)

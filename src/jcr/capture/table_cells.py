@@ -20,7 +20,8 @@ _ALIASES |= {
 }
 _ALIASES |= {f"{prefix}{axis}": f"r{axis}" for axis in "xyz" for prefix in ("rvec_", "rotvec_", "r_")}
 _UR_POSE = re.compile(r"\bp\s*\[([^\]]*)\]")
-_UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|m|deg|rad|s|ns)[\])]?$")
+_UNIT = re.compile(r"^(.+?)(?:_|_?[\[(])(mm|cm|m|deg|rad|s|ns)[\])]?$")
+_DECIMAL_COMMA = re.compile(r"^([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)$")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Cells:
     names: tuple[str, ...] | None
     """Lower case, without units; tx, pos_x, q_x … as x and qx."""
     units: frozenset[str]
-    """That the names give: of mm, m, deg, rad."""
+    """That the names give: of mm, cm, m, deg, rad."""
     rows: list[list[str]]
     convention: ConventionName = "auto"
     """That the notation gives away: UR's p[…]."""
@@ -103,8 +104,10 @@ def _text(file: Path) -> tuple[list[str] | None, list[list[str]]]:
     lines = [line for line in lines if not line.startswith("#")]
     if not lines:
         return None, []
-    separator = next((mark for mark in "\t,;" if mark in lines[0]), None)
+    separator = next((mark for mark in "\t;," if mark in lines[0]), None)
     rows = [[cell.strip().strip('"') for cell in line.split(separator)] for line in lines]
+    if separator != ",":  # as spreadsheets write numbers where the comma is the decimal mark
+        rows = [[_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows]
     if not any(is_number(cell) for cell in rows[0]):
         return rows[0], rows[1:]
     # TUM and ethz-asl write the names of their columns as a comment.

@@ -77,7 +77,7 @@ def refined(
     poses as they were reported. One that is rejected stays as it was, with what explains it where that is known.
     """
     options = options or CalibrateOptions()
-    if not found.converged:
+    if not found.is_sound:
         return _explained(capture, reconstruction, found)
     robot = robot_errors(capture, options).of(reconstruction.image_index)
     case = Case(

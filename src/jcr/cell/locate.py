@@ -37,7 +37,7 @@ def locate_cameras(
             by_name[camera.name] = calibrated_alone(
                 capture, camera, moving / camera.name, reconstruct_options, options, progress
             )
-        elif hand_eye.converged and sees_another_scene(camera, by_name[camera.name]):
+        elif hand_eye.is_sound and sees_another_scene(camera, by_name[camera.name]):
             by_name[camera.name] = calibrated_elsewhere(
                 capture, camera, by_name[camera.name], reconstruct_options, options, progress
             )

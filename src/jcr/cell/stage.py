@@ -86,7 +86,7 @@ def place_cameras(
     options, progress = options or CalibrateOptions(), progress or silent
     if not others:
         return CellFound((), (), None)
-    if not hand_eye.converged:
+    if not hand_eye.is_sound:
         seen = map(_Seen.nothing_of, others)
         refused = [one.refused(Kind.OWN_REJECTED, camera=capture.camera_name) for one in seen]
         return CellFound(tuple(refused), (), None)

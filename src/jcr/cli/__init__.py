@@ -17,7 +17,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from jcr.errors import InputError, NotTrustedError, printable
+from jcr.errors import InputError, NotTrustedError, did_you_mean, printable
+from jcr.memory import MORE_MEMORY, require_address_space
 
 COMMANDS = {
     "board": "draw a calibration board to print, if you want one",
@@ -126,7 +127,10 @@ def dispatch(arguments: Sequence[str]) -> int:
             return _fail(2, str(error))
         return 0
     if name not in COMMANDS:
-        return _fail(2, f"{name!r} is not a jcr command; choose from {', '.join(COMMANDS)} (jcr --help)")
+        like = did_you_mean(name, COMMANDS)
+        return _fail(
+            2, f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
+        )
     return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
 
 
@@ -151,6 +155,8 @@ def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str])
         # Of a renaming the second name is what it would have replaced.
         named = error.filename2 or error.filename or "the output"
         return _fail(2, f"{named}: {error.strerror}; {_DISK[error.errno]}")
+    except MemoryError as error:
+        return _fail(2, f"out of memory ({error or 'no more is given'}); {MORE_MEMORY}")
     except BaseException as error:
         if not _interrupted(error):
             raise
@@ -201,7 +207,9 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
         if not stop.code:
             sys.stdout.write(NO_DEFAULT.sub(_blank, told.getvalue()))
             return 0
-        return _fail(2, f"{_flatten(complaint.getvalue())} ({program} --help)")
+        like = _like_unknown_option(command, arguments)
+        return _fail(2, f"{_flatten(complaint.getvalue())}{like} ({program} --help)")
+    require_address_space()
     with contextlib.ExitStack() as silence:
         if parsed.output.quiet:
             nowhere = silence.enter_context(open(os.devnull, "w", encoding="utf-8"))
@@ -238,7 +246,7 @@ def _flatten(box: str) -> str:
     line = re.sub(r"Error parsing (\S+): could not convert string to float:", r"\1 takes a number, not", line)
     line = re.sub(r"Error parsing (\S+): invalid literal for int.*?:", r"\1 takes a whole number, not", line)
     line = re.sub(r"Error parsing (\S+): no type matching \{(.*?)\} .*? from \[(.*?)\]\..*", _values, line)
-    return re.sub(r"Expected one of \((.*?)\)", _choices, line)
+    return re.sub(r"invalid choice '(.*?)'(.*?)\. Expected one of \((.*?)\)\.?", _choices, line)
 
 
 def _values(refused: re.Match[str]) -> str:
@@ -248,9 +256,21 @@ def _values(refused: re.Match[str]) -> str:
     return f"{option} takes {len(words)} values ({', '.join(words)}), not {given}"
 
 
-def _choices(listed: re.Match[str]) -> str:
+def _choices(refused: re.Match[str]) -> str:
     """tyro lists choices in the order of a set, among them the None that stands for none given."""
-    return "Expected one of " + ", ".join(sorted(set(re.findall(r"'([^']*)'", listed[1])) - {"None"}))
+    word, argument, listed = refused.groups()
+    known = sorted(set(re.findall(r"'([^']*)'", listed)) - {"None"})
+    return f"invalid choice '{word}'{argument}{did_you_mean(word, known)}; choose from {', '.join(known)}"
+
+
+def _like_unknown_option(command: ModuleType, arguments: Sequence[str]) -> str:
+    """The option of a command that is like the first one that it does not have; nothing where it has all."""
+    from jcr.cli.completion import arguments_of
+
+    known = {argument.flag for argument in arguments_of(command.Arguments) if argument.flag is not None}
+    given = (word.partition("=")[0] for word in arguments if re.match(r"--[a-z]", word))
+    unknown = next((word for word in given if word.replace("_", "-") not in {*known, "--help"}), None)
+    return "" if unknown is None else did_you_mean(unknown, known)
 
 
 def _fail(status: int, message: str) -> int:

@@ -45,7 +45,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run all and print the table."""
-    from jcr.batch import batch
+    from jcr.batch import batch, is_accepted
     from jcr.errors import InputError, NotTrustedError
     from jcr.pipeline import RunOptions
     from jcr.progress import progress_bars
@@ -65,7 +65,7 @@ def main(arguments: Arguments) -> int:
     arguments.output.result(
         _table(rows) + f"table: {out / 'summary.html'}\n", {"captures": [asdict(row) for row in rows]}
     )
-    doubtful = sum(row.status != "done" for row in rows)
+    doubtful = sum(not is_accepted(row) for row in rows)
     if doubtful:
         raise NotTrustedError(
             f"{doubtful} of {len(rows)} captures failed or are rejected; see {out / 'summary.html'}"
@@ -78,6 +78,6 @@ def _table(rows: "list[Row]") -> str:
     for rank, row in enumerate(rows, start=1):
         std = "" if row.offset_std_mm is None else f"± {row.offset_std_mm:.2f} mm, {row.turn_std_deg:.3f}°"
         used = f"{row.used:3d}/{row.images:<3d}"
-        line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<12} {used} {std}  {row.reason}"
+        line = f"{rank:3d}  {Path(row.out).name:<24} {row.status:<22} {used} {std}  {row.reason}"
         lines += line.rstrip() + "\n"
     return lines

@@ -9,7 +9,7 @@ import tyro
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
-from jcr.cli.result import show
+from jcr.cli.result import show, show_calibration
 from jcr.cli.source import source
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
@@ -51,7 +51,9 @@ def main(arguments: Arguments) -> int:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):
             found = calibrate_poses(capture, arguments.out, arguments.calibrate)
+            show_calibration(found, arguments.output)
             about = "the scale is 1, as the marker's size says\n" if found.scale_is_one else ""
             return show(found, arguments.output, f"{about}report: {found.out / 'report.html'}\n")
         result = calibrate(capture, arguments.out, options, progress=progress)
+    show_calibration(result, arguments.output)
     return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")

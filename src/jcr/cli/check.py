@@ -78,7 +78,7 @@ def main(arguments: Arguments) -> int:
         )
     arguments.output.result(_as_text(capture, found), _as_json(capture, found))
     if found.faults:
-        raise NotTrustedError(found.faults[0])
+        raise NotTrustedError(f"rejected: {found.faults[0]}")
     return 0
 
 
@@ -109,7 +109,7 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
             *(f"  {row}" for row in matrix.splitlines()),
         ]
     if not found.faults:
-        lines.append("good to calibrate")
+        lines.append(f"{found.verdict}: good to calibrate")
     return "\n".join(lines) + "\n"
 
 
@@ -132,6 +132,7 @@ def _std(std: np.ndarray) -> str:
 def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
     noise = None if found.hand_eye is None else found.hand_eye.robot_noise
     return {
+        "verdict": found.verdict,
         "images": [
             {"image": name, "sharpness": float(found.sharpness[k]) if len(found.sharpness) else None}
             for k, name in enumerate(capture.images)

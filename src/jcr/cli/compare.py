@@ -20,7 +20,7 @@ class Arguments:
     Each is a run folder, a calibration.json, or any JSON with a `gripper_from_camera` (a capture's reference.json, or
     the folder that holds one; with `std_mm` and `std_deg` if its errors are known). χ² is the squared difference in
     units of both covariances, p the probability of a larger one if nothing else is wrong. For two calibrations of one
-    arm p is too large, because they share systematic errors.
+    arm p is too large, because they share systematic errors. The exit status is 3 if one of the two is rejected.
 
     examples:
       jcr compare out/tabletop examples/tabletop
@@ -38,12 +38,15 @@ def main(arguments: Arguments) -> int:
     """Print the difference, χ² and p where standard deviations are known, and what explains it."""
     from jcr.calibration.difference import difference
     from jcr.calibration.known_transform import read_hand_eye
+    from jcr.errors import NotTrustedError
 
-    found = difference(read_hand_eye(arguments.out), read_hand_eye(arguments.reference))
+    known = {path: read_hand_eye(path) for path in (arguments.out, arguments.reference)}
+    found = difference(known[arguments.out], known[arguments.reference])
     result: dict[str, object] = {
         "translation_mm": 1e3 * float(np.linalg.norm(found.translation_m)),
         "rotation_deg": float(np.degrees(np.linalg.norm(found.rotation_vector))),
         "translation_xyz_mm": (1e3 * found.translation_m).tolist(),
+        "rejected": {str(path): one.doubt for path, one in known.items() if one.doubt is not None},
     }
     text = f"{result['translation_mm']:.3f} mm, {result['rotation_deg']:.4f}°"
     if found.sigmas is not None:
@@ -61,4 +64,7 @@ def main(arguments: Arguments) -> int:
         if found.p_value is not None and found.p_value < UNLIKELY:
             text += "\nmore than what both report: something has moved, or is not in their errors"
     arguments.output.result(text + "\n", result)
+    for path, one in known.items():
+        if one.doubt is not None:
+            raise NotTrustedError(f"{path}: its calibration is rejected: {one.doubt}")
     return 0

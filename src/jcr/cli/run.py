@@ -1,5 +1,6 @@
 """`jcr run`: everything, from a capture to a calibrated camera and a map."""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,7 @@ import tyro
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
-from jcr.cli.result import show
+from jcr.cli.result import show, show_calibration
 from jcr.cli.source import source
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
@@ -45,21 +46,21 @@ class Arguments:
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     no_map: bool = False
-    """Calibration and report only: no dense depth, cloud or map. Needs no torch."""
+    """Calibration and report only: no dense depth, cloud or map; so without torch, too."""
     output: Output = field(default_factory=Output)
 
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
     from jcr.errors import InputError
-    from jcr.mapping import require_map
-    from jcr.pipeline import RunOptions, run
+    from jcr.mapping import require_dense
+    from jcr.pipeline import RunOptions, finished, run
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
     map_options = None if arguments.no_map else arguments.map
     if map_options is not None:
-        require_map(arguments.depth)  # before a recording is read
+        require_dense(arguments.depth)  # before a recording is read
     options = RunOptions(
         reconstruct=arguments.reconstruct,
         calibrate=arguments.calibrate,
@@ -74,5 +75,15 @@ def main(arguments: Arguments) -> int:
             raise InputError(
                 f"{arguments.capture}: gives poses and no images, nothing to map; use `jcr calibrate`"
             )
-        result = run(capture, arguments.out, options, progress=progress)
+        if (before := finished(capture, arguments.out, options)) is not None:
+            sys.stderr.write(f"unchanged: {arguments.out} is the run of this capture with these options\n")
+            show_calibration(before, arguments.output)
+            return show(before, arguments.output, f"report: {before.out / 'report.html'}\n")
+        result = run(
+            capture,
+            arguments.out,
+            options,
+            progress=progress,
+            calibrated=lambda found: show_calibration(found, arguments.output),
+        )
     return show(result, arguments.output, f"report: {result.out / 'report.html'}\n")

@@ -14,8 +14,16 @@ if TYPE_CHECKING:
     from jcr.records import Capture, PosePairs
 
 
+def _announce(path: Path) -> None:
+    """A first sign of life, before the packages that read images are imported."""
+    if sys.stderr.isatty() and path.exists():
+        sys.stderr.write(f"reading {path}\n")
+        sys.stderr.flush()
+
+
 def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") -> "Capture | PosePairs":
     """What lies at a path, a recording's frames put in the run folder `out`; remarks of the reader on stderr."""
+    _announce(path)
     from jcr.capture.read import read_source
     from jcr.run_folder import CAPTURE, held
 
@@ -31,6 +39,7 @@ def looked_at(
     path: Path, options: ReadOptions, progress: "Progress", at_least: int = MIN_FRAMES
 ) -> "Iterator[Capture | PosePairs]":
     """What lies at a path, a recording's frames put where they vanish afterwards."""
+    _announce(path)
     from jcr.capture.read import read_source
 
     with tempfile.TemporaryDirectory(prefix="jcr-capture-") as scratch:

@@ -32,7 +32,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Print each error beside what was expected."""
     from jcr.errors import NotTrustedError
-    from jcr.touch import UNLIKELY, touch
+    from jcr.touch_test import UNLIKELY, touch
 
     found = touch(arguments.out, arguments.points)
     lines = [

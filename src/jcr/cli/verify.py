@@ -1,4 +1,4 @@
-"""`jcr verify`: is yesterday's calibration still valid of today's few images?"""
+"""`jcr verify`: has the camera moved since it was calibrated?"""
 
 import sys
 from dataclasses import dataclass, field
@@ -86,7 +86,7 @@ def _as_text(found: "Verification") -> str:
     angle, angle_std = _spaced(np.degrees(found.offset[3:]), 3), _spaced(np.degrees(found.std[3:]), 3)
     parent = "gripper" if found.fixed is None else "base"
     return (
-        f"{found.verdict}: {drift} from the calibration, p = {found.p_value:.2g}\n"
+        f"{found.verdict}: {found.finding}: {drift} from the calibration, p = {found.p_value:.2g}\n"
         f"  drift in {parent} axes {offset} ± {std} mm, {angle} ± {angle_std} ° (1 σ)\n"
         f"  {len(found.images)} images, {found.how}; a drift of {1e3 * found.detectable[0]:.1f} mm or "
         f"{np.degrees(found.detectable[1]):.2f}° would be noticed 9 times in 10\n"
@@ -99,6 +99,7 @@ def _spaced(values: np.ndarray, digits: int) -> str:
 
 def _as_json(found: "Verification") -> dict[str, object]:
     return {
+        "verdict": found.verdict,
         "moved": found.moved,
         "cause": found.cause if found.moved else None,
         "drift_mm": (1e3 * found.offset[:3]).tolist(),

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.errors import InputError
+from jcr.errors import InputError, NotTrustedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportOptions, FormatName
 from jcr.export.provenance import Provenance
 from jcr.files import write_text
 from jcr.geometry import transform
+from jcr.options import checked_options
 from jcr.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -41,11 +42,11 @@ def export_run(
 ) -> Path:
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does; if the
-    calibration is rejected, the file says so.
+    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does, and
+    NotTrustedError if the calibration is rejected; with force=True it is exported, and the file says why it is rejected.
     """
     named = None if path is None else Path(path)
-    made = ExportOptions(**options)  # pyright: ignore[reportArgumentType]
+    made = checked_options(options, ExportOptions)
     return written(Path(out), format, named, made)[2]
 
 
@@ -54,14 +55,23 @@ def written(
 ) -> "tuple[Run, Format, Path]":
     """Write a run folder in a format, and return what was exported, the row of the table and the path.
 
-    Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it needs.
+    Raises InputError for a format that does not exist, options that it cannot serve, and a run that lacks what it
+    needs; NotTrustedError for a calibration that is rejected, unless `options` force it.
     """
     row = next((row for row in FORMATS if row.name == format), None)
     if row is None:
-        raise InputError(f"{format}: no such format; choose one of {', '.join(get_args(FormatName))}")
+        names = get_args(FormatName)
+        raise InputError(
+            f"{format}: no such format{did_you_mean(format, names)}; choose one of {', '.join(names)}"
+        )
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     run = Run(out, options)
+    if run.doubt is not None and not options.force:
+        raise NotTrustedError(
+            f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
+            "with this reason in the file, add --force"
+        )
     path = path or out / "export" / row.file
     if path.is_dir() and not row.file.endswith("/"):
         raise InputError(f"{path}: is a folder; name a file for {row.name}")
@@ -86,8 +96,10 @@ class Run:
 
     @property
     def doubt(self) -> str | None:
-        """Why the calibration is rejected; None when it is."""
-        return self.calibration.doubt
+        """Why the calibration is rejected, or that of the camera asked for; None where it is accepted."""
+        if self.calibration.doubt is not None or self.options.camera is None:
+            return self.calibration.doubt
+        return self._camera(self.options.camera).doubt
 
     @property
     def provenance(self) -> Provenance:
@@ -148,14 +160,14 @@ class Run:
 
     @property
     def others(self) -> list[ros.CameraMount]:
-        """Further cameras and arms; none where one camera is asked for."""
+        """Further cameras that are accepted (all of them by force) and arms; none where one camera is asked for."""
         cameras = self.folder.cameras()
         if cameras is None or self.options.camera is not None:
             return []
         mounts = [
             self._mount_of(camera, f"{camera.name}_optical_frame")
             for camera in cameras.cameras
-            if camera.parent_from_camera is not None
+            if camera.parent_from_camera is not None and (camera.doubt is None or self.options.force)
         ]
         base = self.options.base_frame
         return mounts + [

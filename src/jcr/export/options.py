@@ -43,5 +43,7 @@ class ExportOptions:
     """Metres by which spheres may extend into free space; by default two cells of the map."""
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
+    force: bool = False
+    """Export a calibration that is rejected, too; the file then says why it is."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""

@@ -5,7 +5,7 @@ camera's), and the best of them solved. Nothing is ever applied: a reading that 
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -15,6 +15,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from jcr.geometry import fit_similarity, inverse, retract, rotation_exp, skew, transform
+from jcr.handeye.closed_form import closed_form
 from jcr.handeye.fit import Poses
 from jcr.handeye.robust import least_trimmed
 from jcr.handeye.solve import solve_hand_eye
@@ -39,7 +40,13 @@ INVERSES = "their inverses (gripper_from_base was given)"
 WXYZ = "quaternions w, x, y, z that were taken as x, y, z, w"
 XYZW = "quaternions x, y, z, w that were taken as w, x, y, z"
 TRANSPOSED = "transposed rotations"
+MIRRORED = "mirrored ones (the images are mirrored, or the base's axes are left-handed)"
+BY_NUMBER = "those of the images in order of their names as numbers (1, 2, … 10)"
+BY_TEXT = "those of the images in order of their names as text (1, 10, 11, … 2)"
 OPTIONS = {
+    BY_NUMBER: "add a column image with the images' names",
+    BY_TEXT: "add a column image with the images' names",
+    MIRRORED: "switch off the driver's mirroring or flip the images back, or correct the sign of one axis of the poses",
     INVERSES: "add --pose-inverted",
     WXYZ: "in a table add --pose-convention quat-wxyz",
     XYZW: "in a table add --pose-convention quat-xyzw",
@@ -78,10 +85,18 @@ class _Candidate:
     """Row of the camera that each pose belongs to."""
 
 
-def better_reading(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Reading, Reading] | None:
-    """The reading that fits far better than the poses as given, and those; None when there is none."""
+def better_reading(
+    base_from_gripper: Poses, recon_from_camera: Poses, by_name: Mapping[bool, Poses] | None = None
+) -> tuple[Reading, Reading] | None:
+    """The reading that fits far better than the poses as given, and those; None when there is none.
+
+    `by_name` holds the poses by other orders of the images' names: as numbers (True), as text (False).
+    """
     n = len(base_from_gripper)
     candidates = list(_candidates(base_from_gripper))
+    every = np.arange(n)
+    for by_number, poses in (by_name or {}).items():
+        candidates.append(_Candidate(BY_NUMBER if by_number else BY_TEXT, poses, every))
     as_given = _solved(candidates[0], recon_from_camera)
     if as_given.misfit < FITS and as_given.used >= MIN_SHARE * n:
         return None
@@ -100,7 +115,7 @@ def better_reading(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
     rough = np.array([_roughly(candidate, recon_from_camera) for candidate in worth])
-    if rough.min() > _roughly(candidates[0], recon_from_camera) / ROUGHLY:
+    if not np.isfinite(rough.min()) or rough.min() > _roughly(candidates[0], recon_from_camera) / ROUGHLY:
         return None
     readings = [
         _solved(candidate, recon_from_camera)
@@ -142,8 +157,14 @@ def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
 
 
 def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> float:
-    """Error (m) that a closed form leaves in the images that agree best: in a hundredth of the time of a fit."""
-    return least_trimmed(candidate.base_from_gripper, recon_from_camera[candidate.image])[1]
+    """Error (m) that a closed form leaves in the images that agree best: in a hundredth of the time of a fit.
+
+    Infinite where its scale is negative: so it fits mirrored poses, which nobody can see from.
+    """
+    camera = recon_from_camera[candidate.image]
+    agree, error = least_trimmed(candidate.base_from_gripper, camera)
+    _, scale, _ = closed_form(candidate.base_from_gripper, camera, agree.astype(float))
+    return error if scale > 0 else np.inf
 
 
 def _incongruence(candidate: _Candidate, camera_angle: Float[ndarray, "n n"]) -> float:
@@ -166,6 +187,8 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
     every = np.arange(n)
     yield _Candidate("they are given", base_from_gripper, every)
     yield _Candidate(INVERSES, inverse(base_from_gripper), every)
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    yield _Candidate(MIRRORED, mirror @ base_from_gripper @ mirror, every)
     yield _Candidate("listed in reverse order of the images", base_from_gripper[::-1], every)
     for shift in (1, 2):
         if n - shift >= 5:

@@ -8,6 +8,7 @@ import contextlib
 import hmac
 import ipaddress
 import json
+import select
 import socket
 import time
 from collections.abc import Iterator
@@ -55,6 +56,9 @@ def served_poses(server: socket.socket, listen: Listen) -> Iterator[Ask]:
             raise _silence(listen) from None
         with client:
             client.settimeout(listen.timeout_s)
+            if _gives_way(client, server, listen):
+                _dismiss(client, f"silent for {LINE_S:.0f} s, and another client waits")
+                continue
             done = yield from _served(client, listen)
         if done:
             return
@@ -75,6 +79,15 @@ def bound(listen: Listen) -> socket.socket:
         ) from None
     server.settimeout(listen.timeout_s)
     return server
+
+
+def _gives_way(client: socket.socket, server: socket.socket, listen: Listen) -> bool:
+    """Whether a client has sent nothing for LINE_S and another waits to connect; one that waits alone may."""
+    end = time.monotonic() + listen.timeout_s
+    if select.select([client], [], [], min(LINE_S, listen.timeout_s))[0]:
+        return False
+    ready, _, _ = select.select([client, server], [], [], max(end - time.monotonic(), 0.0))
+    return client not in ready and server in ready
 
 
 def _served(client: socket.socket, listen: Listen):
@@ -103,7 +116,7 @@ def _served(client: socket.socket, listen: Listen):
         refused += 1
         if not welcome:
             given = message.get("token") if isinstance(message, dict) else None
-            if not hmac.compare_digest(str(given).encode(), str(listen.token).encode()):
+            if not hmac.compare_digest(_bytes(given), _bytes(listen.token)):
                 _dismiss(client, "the first line must be the right token")
                 return False
             welcome, refused = True, 0
@@ -193,6 +206,11 @@ def _dismiss(client: socket.socket, reason: str) -> None:
         for _ in range(16):
             if not client.recv(MAX_LINE):
                 return
+
+
+def _bytes(token: object) -> bytes:
+    """A token to compare; JSON may hold half of a surrogate pair, which is no UTF-8."""
+    return str(token).encode("utf-8", "surrogatepass")
 
 
 def _refusal(reason: str) -> Answer:

@@ -261,8 +261,8 @@ class Requirement:
     """What the millimetres and degrees are of."""
 
     @property
-    def is_met(self) -> bool:
-        """Whether the errors are within what is required."""
+    def met(self) -> bool:
+        """Whether 95 % of the errors are within what is required."""
         return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
 
 
@@ -455,6 +455,11 @@ class HandEye:
     def converged(self) -> bool:
         """Whether it is accepted."""
         return self.verdict != "rejected"
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
+        return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
 
     @property
     def doubt(self) -> str | None:

@@ -65,6 +65,9 @@ class Kind(StrEnum):
     AT_ANOTHER_CAMERA = "camera stands where another was"
     POINTS_CROWDED = "points crowded"
     ANOTHER_SCENE = "camera sees another scene"
+    STATIC_IMAGES = "images show no motion"
+    POSES_SWAPPED = "gripper poses exchanged"
+    POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +128,8 @@ CAUSES = CAMERA | {
     Kind.DELAY,
     Kind.POSE_CONVENTION,
     Kind.WRONG_MOUNT,
+    Kind.STATIC_IMAGES,
+    Kind.POSES_SWAPPED,
 }
 """Kinds that explain others: what is uncertain, or does not fit, is so because of them."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}

@@ -72,8 +72,8 @@ def _reached(required: Mapping[str, Any]) -> str:
     asked = "asked for" if required["asked"] else "needed to grasp"
     mm, degrees = significant(required["reached_mm"]), significant(required["reached_deg"])
     reached = {
-        "seen": f"a point seen at {significant(1e-3 * far)} m is placed within {mm} mm and {degrees}° in the robot's base "
-        "frame (95 % of errors)",
+        "seen": f"a point seen at {significant(1e-3 * far)} m is placed within {mm} mm and {degrees}° in the robot's "
+        "base frame (95 % of errors)",
         "camera": f"95 % of errors of the camera on the gripper are below {mm} mm and {degrees}°",
         "scene": f"95 % of errors of mapped points are below {mm} mm and {degrees}°",
     }
@@ -492,6 +492,13 @@ _TEXT: dict[Kind, Words] = {
     ),
     Kind.POINTS_CROWDED: "its points lie in {percent:.0f} % of the image",
     Kind.ANOTHER_SCENE: _another_scene,
+    Kind.STATIC_IMAGES: (
+        "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates by {deg:.0f}°"
+    ),
+    Kind.POSES_SWAPPED: "{images[0]} and {images[1]} have each other's gripper pose",
+    Kind.POSE_CONTRADICTS_IMAGE: (
+        "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the gripper"
+    ),
 }
 _REMEDY: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _to_observe,
@@ -528,5 +535,10 @@ _REMEDY: dict[Kind, Words] = {
     Kind.NOT_FIXED: "of a camera on the gripper write mount gripper, of several cameras give each its own name",
     Kind.PLACE_UNCERTAIN: _to_place,
     Kind.POINTS_CROWDED: "more of the scene in view would help",
+    Kind.STATIC_IMAGES: (
+        "check that the camera is on the gripper and its stream is live, and take each image at its own pose"
+    ),
+    Kind.POSES_SWAPPED: "exchange the two poses",
+    Kind.POSE_CONTRADICTS_IMAGE: "correct that pose, or drop the image",
 }
 """Of kinds that have one."""

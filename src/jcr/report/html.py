@@ -21,7 +21,7 @@ from jcr.calibration.words import (
 )
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
-from jcr.records import COEFFICIENTS, Capture, Intrinsics, Kind
+from jcr.records import COEFFICIENTS, Capture, Intrinsics, Kind, verdict_of
 from jcr.records.words import SHORT, reached_in_words, remedy, sentence, text
 from jcr.report.cell_cameras import cameras_section
 from jcr.report.features import features_section
@@ -196,15 +196,15 @@ def _links(sections: Sequence[str]) -> str:
 def _verdict(calibration: CalibrationFile) -> str:
     held_out, required = calibration.held_out, calibration.requirement
     miss = "" if held_out is None else missed(held_out)
-    short = calibration.short
+    short, verdict = calibration.short, verdict_of(calibration.findings).capitalize()
     if calibration.doubt is not None:
-        kind, headline = "bad", f"<b>Do not trust this calibration:</b> {escape(calibration.doubt)}."
+        kind, headline = "bad", f"<b>{verdict}:</b> {escape(calibration.doubt)}."
     elif short is not None:
         say = "" if required is None else f"{reached_in_words(required)}; {remedy(short)}"
-        kind, headline = "fair", f"<b>{SHORT.capitalize()}:</b> {escape(say)}."
+        kind, headline = "fair", f"<b>{verdict}:</b> {SHORT}: {escape(say)}."
     else:
         within = "nothing speaks against it" if required is None else escape(reached_in_words(required))
-        kind, headline = "good", f"<b>Accepted:</b> {within}."
+        kind, headline = "good", f"<b>{verdict}:</b> {within}."
     if held_out is None:
         believe = "There were too few images to leave one out and see how well the others predict it."
     elif not calibration.observability.observable:

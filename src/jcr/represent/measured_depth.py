@@ -34,7 +34,7 @@ def with_measured_depth(
     check = hand_eye.scale_evidence.depth
     if capture.depths is None:
         return reconstruction, ()
-    if check is None or not hand_eye.converged:
+    if check is None or not hand_eye.is_sound:
         return reconstruction, ("the depth images are not used: the robot cannot tell their scale",)
     if abs(check.off_percent) > TOO_WRONG:
         return reconstruction, (

@@ -13,6 +13,7 @@ from viser.extras import ViserUrdf
 
 from jcr.geometry import apply
 from jcr.progress import Progress, silent
+from jcr.records import verdict_of
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.figures import TRACK_COLOR, label_colors
 from jcr.represent.scene import Unknown
@@ -80,13 +81,13 @@ class Viewer:
 
     def _verdict(self) -> str:
         calibration, held_out = self.run.calibration, self.run.calibration.held_out
-        lines = []
+        verdict, lines = verdict_of(calibration.findings).capitalize(), []
         if not calibration.converged:
-            lines.append(f"**Do not trust this calibration:** {calibration.doubt}")
+            lines.append(f"**{verdict}:** {calibration.doubt}")
         elif (short := calibration.short) is not None:
-            lines.append(f"**{sentence(short)}**")
+            lines.append(f"**{verdict}:** {sentence(short)}")
         elif calibration.requirement is not None:
-            lines.append(f"**Accepted:** {reached_in_words(calibration.requirement)}")
+            lines.append(f"**{verdict}:** {reached_in_words(calibration.requirement)}")
         if calibration.converged and held_out is not None:
             lines.append(
                 f"Leave-one-out error {held_out.translation_mm:.2f} mm, {held_out.rotation_deg:.3f}°; "

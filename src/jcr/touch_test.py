@@ -49,7 +49,7 @@ class Touched:
         return self.error.mean(0)
 
 
-def touch(out: Path, points: Path) -> Touched:
+def touch(out: str | Path, points: str | Path) -> Touched:
     """Compare points that the tip touched with the surface that the images show at their pixels.
 
     `points` is a CSV with the columns image, x_px, y_px (where an image of the run shows the point) and x_m, y_m, z_m
@@ -57,7 +57,7 @@ def touch(out: Path, points: Path) -> Touched:
     share, and of each touch the robot's random and systematic errors. Raises InputError on fewer than three points, an
     image that is not in the run, or a pixel without a surface.
     """
-    folder = RunFolder(out)
+    folder, points = RunFolder(Path(out)), Path(points)
     calibration, reconstruction = folder.calibrated()
     capture = folder.capture()
     assert (

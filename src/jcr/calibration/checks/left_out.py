@@ -1,0 +1,76 @@
+"""Are the gripper poses of images that take no part in an accepted calibration wrong, and whose are they?"""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.capture.images import read_image
+from jcr.geometry import step_between
+from jcr.handeye.equation import predict
+from jcr.reconstruct.relocate import Located, relocate
+from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
+
+SAME = (10e-3, np.radians(1.0))
+"""m, rad: nearer than this a pose is that of the image."""
+
+
+def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) -> tuple[Finding, ...]:
+    """Poses that were exchanged, and those that their images contradict; of images that cannot be located, nothing.
+
+    The matching leaves out images whose poses contradict it. Located by their features alone, they show where the
+    gripper was.
+    """
+    shown = _shown_poses(capture, made, hand_eye)
+    is_pose_of: dict[int, int] = {}
+    findings = []
+    for row, pose in shown.items():
+        metres, radians = np.linalg.norm(
+            step_between(capture.base_from_gripper, pose).reshape(-1, 2, 3), axis=2
+        ).T
+        fits = (metres < SAME[0]) & (radians < SAME[1])
+        if fits[row]:
+            continue
+        if fits.any():
+            is_pose_of[row] = int(np.where(fits, metres, np.inf).argmin())
+        findings.append(
+            Finding(
+                kind=Kind.POSE_CONTRADICTS_IMAGE,
+                severity="warns",
+                mend="poses",
+                images=(capture.images[row],),
+                value=float(metres[row]),
+                details={"rotation": float(radians[row])},
+            )
+        )
+    swapped = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
+    named = {capture.images[row] for pair in swapped for row in pair}
+    return (
+        *(
+            Finding(
+                kind=Kind.POSES_SWAPPED,
+                severity="rejects",
+                mend="poses",
+                images=(capture.images[i], capture.images[j]),
+            )
+            for i, j in swapped
+        ),
+        *(finding for finding in findings if finding.images[0] not in named),
+    )
+
+
+def _shown_poses(
+    capture: Capture, made: Reconstruction, hand_eye: HandEye
+) -> dict[int, Float[ndarray, "4 4"]]:
+    """base_from_gripper, by row, of each image that is left out, from where the others show its camera."""
+    used = set(made.image_index[hand_eye.inliers].tolist())
+    camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
+    unseen = [row for row in range(len(capture)) if row not in camera]
+    if unseen:
+        older, new = (
+            [read_image(capture.folder / capture.images[row]) for row in rows]
+            for rows in (made.image_index, unseen)
+        )
+        places = zip(unseen, relocate(made, older, new), strict=True)
+        camera |= {row: place.recon_from_camera for row, place in places if isinstance(place, Located)}
+    x, scale, z = hand_eye.gripper_from_camera, hand_eye.scale, hand_eye.base_from_recon
+    return {row: predict(x, scale, z, one[None])[0] for row, one in camera.items() if row not in used}

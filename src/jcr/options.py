@@ -1,0 +1,58 @@
+"""Options given in Python, checked as the command line checks its own."""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from jcr.errors import InputError, did_you_mean
+
+Options = TypeVar("Options")
+
+
+def checked_options(options: object, kind: type[Options]) -> Options:
+    """The options as a record of that kind, from such a record, a dict of its fields, or None for the defaults.
+
+    Text stands for a path and a list for a tuple. Raises InputError with the field for anything else.
+    """
+    if options is None:
+        return kind()
+    if not isinstance(options, kind | Mapping):
+        raise InputError(f"{options!r:.80}: give jcr.{kind.__name__}(...), not {type(options).__name__}")
+    known = {field.name for field in fields(kind)}  # pyright: ignore[reportArgumentType]
+    given = dict(options) if isinstance(options, Mapping) else vars(options)
+    for name in given:
+        if name not in known:
+            raise InputError(
+                f"{kind.__name__}: no option {name!r}{did_you_mean(str(name), known)}; it has {', '.join(sorted(known))}"
+            )
+    kinds = _kinds_of_records(kind)
+    content = {
+        name: checked_options(value, kinds[name]) if name in kinds and value is not None else value
+        for name, value in given.items()
+    }
+    from pydantic import ValidationError  # half a second, which the command line's help need not wait for
+
+    try:
+        return _adapter(kind).validate_python(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        allowed = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")
+        like = did_you_mean(str(first["input"]), allowed.split(", ")) if allowed else ""
+        raise InputError(f"{kind.__name__}: {place}: {first['input']!r:.80}: {first['msg']}{like}") from None
+
+
+@cache
+def _kinds_of_records(kind: type) -> dict[str, type]:
+    """The fields that are records of options themselves, with their kinds."""
+    hints = get_type_hints(kind)
+    found = {name: next(filter(is_dataclass, (hint, *get_args(hint))), None) for name, hint in hints.items()}
+    return {name: record for name, record in found.items() if isinstance(record, type)}
+
+
+@cache
+def _adapter(kind: type) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)

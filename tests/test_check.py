@@ -1,0 +1,108 @@
+"""What `jcr check` names before heavy work: a camera at rest, poses that were exchanged, images that show nothing."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import jcr
+from benchmarks.simulated.problem import hand_eye_problem
+from jcr.calibration.checks.left_out import left_out_poses
+from jcr.capture.images import read_image, show_one_view
+from jcr.cli import dispatch
+from jcr.handeye.solve import solve_hand_eye
+from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
+
+RNG = np.random.default_rng(0)
+LENS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+
+
+def written(folder: Path, images: list[np.ndarray], frames: list[dict]) -> Path:
+    (folder / "images").mkdir(parents=True)
+    for image, frame in zip(images, frames, strict=True):
+        cv2.imwrite(str(folder / frame["image"]), image)
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": None}))
+    return folder
+
+
+def test_a_camera_at_rest_is_named_before_anything_is_matched(tabletop: Path, tmp_path: Path, capsys):
+    frames = json.loads((tabletop / "capture.json").read_text())["frames"][:4]
+    one = cv2.imread(str(tabletop / frames[0]["image"])).astype(float)
+    noisy = [np.clip(one + RNG.normal(0, 6, one.shape), 0, 255).astype(np.uint8) for _ in frames]
+    assert dispatch(["check", str(written(tmp_path / "still", noisy, frames)), "--json"]) == 3
+    said = capsys.readouterr()
+    assert json.loads(said.out)["verdict"] == "rejected" and "all images show the same view" in said.err
+
+
+def test_no_two_images_of_a_camera_that_moves_show_one_view(tabletop: Path):
+    first, *others = (read_image(tabletop / f"images/{k:02d}.jpg") for k in range(12))
+    assert not any(show_one_view(first, other) for other in others)
+    # Nor does a plain wall with noise, which shows no view at all.
+    plain = [RNG.normal(120, 4, first.shape).astype(np.uint8) for _ in range(2)]
+    assert not show_one_view(*plain)
+
+
+def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
+    problem = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4))
+    gripper = problem.base_from_gripper.copy()
+    gripper[[3, 8]] = gripper[[8, 3]]
+    gripper[5, :3, 3] += 0.08
+    names = tuple(f"{k}.png" for k in range(12))
+    made = Reconstruction(
+        image_index=np.arange(12),
+        recon_from_camera=problem.recon_from_camera,
+        intrinsics=LENS,
+        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        backend="given",
+    )
+    hand_eye = solve_hand_eye(gripper, problem.recon_from_camera)
+    assert hand_eye.converged and not hand_eye.inliers[[3, 5, 8]].any()
+    found = left_out_poses(Capture(Path(), names, gripper, (640, 480)), made, hand_eye)
+    assert [(one.kind, one.severity, one.images) for one in found] == [
+        (Kind.POSES_SWAPPED, "rejects", ("3.png", "8.png")),
+        (Kind.POSE_CONTRADICTS_IMAGE, "warns", ("5.png",)),
+    ]
+    assert found[1].value == pytest.approx(0.08 * np.sqrt(3), rel=0.05)
+    right = problem.base_from_gripper
+    of_right = solve_hand_eye(right, problem.recon_from_camera)
+    images = replace(of_right.images, inliers=np.arange(12) != 4)
+    assert not left_out_poses(
+        Capture(Path(), names, right, (640, 480)), made, replace(of_right, images=images)
+    )
+
+
+@pytest.mark.slow
+def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
+    tabletop: Path, tmp_path: Path, capsys
+):
+    content = json.loads((tabletop / "capture.json").read_text())
+    frames = content["frames"]
+    first, second = (frames[k]["base_from_gripper"] for k in (3, 8))
+    frames[3]["base_from_gripper"], frames[8]["base_from_gripper"] = second, first
+    shutil.copytree(tabletop / "images", tmp_path / "images")
+    (tmp_path / "capture.json").write_text(
+        json.dumps({"frames": frames, "intrinsics": content["intrinsics"]})
+    )
+    assert dispatch(["check", str(tmp_path)]) == 3
+    assert "images/03.jpg and images/08.jpg have each other's gripper pose" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_images_of_which_none_registers_are_no_good_capture(tabletop: Path, tmp_path: Path, capsys):
+    frames = json.loads((tabletop / "capture.json").read_text())["frames"][:3]
+    noise = [RNG.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in frames]
+    assert dispatch(["check", str(written(tmp_path / "noise", noise, frames))]) == 3
+    said = capsys.readouterr()
+    assert "registered 0 of 3 images" in said.err and "good to calibrate" not in said.out
+
+
+def test_one_pose_in_every_row_is_refused(tabletop: Path, tmp_path: Path):
+    frames = json.loads((tabletop / "capture.json").read_text())["frames"][:4]
+    still = [frame | {"base_from_gripper": frames[0]["base_from_gripper"]} for frame in frames]
+    images = [RNG.integers(0, 255, (24, 32, 3), dtype=np.uint8) for _ in frames]
+    with pytest.raises(jcr.InputError, match="all 4 gripper poses are the same"):
+        jcr.read_capture(written(tmp_path / "capture", images, still))
