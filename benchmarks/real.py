@@ -1,5 +1,6 @@
 """`benchmarks real DIR`: real captures against the references stored beside them."""
 
+import json
 import tempfile
 import time
 from collections.abc import Sequence
@@ -9,14 +10,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from PIL import Image
 
 from benchmarks.peers import opencv
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
+from jcr.camera import unproject
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import (
     Transforms,
+    apply,
     inverse,
     nearest_rotation,
     rotation_between_deg,
@@ -26,7 +30,7 @@ from jcr.geometry import (
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.marker import reconstruct
-from jcr.records import Capture, HeldOut
+from jcr.records import Capture, HandEye, HeldOut, Intrinsics, coefficients_of
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,10 @@ class Row:
     images: str
     off_mm: float | None = None
     off_deg: float | None = None
+    seen_mm: float | None = None
+    """How far apart the two pairs of intrinsics and transform place a point at the centre of the image."""
+    seen_95_mm: float | None = None
+    """What 95 % of its errors are said to be below."""
     sigmas: float | None = None
     """Largest distance on any axis in reported standard deviations; the reference's own error is in it."""
     joint_sigmas: float | None = None
@@ -72,12 +80,15 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "",
         "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
         "own. σ: the largest reported standard deviation of an axis; joint: that of the reference, where it states "
-        "one, counted as well (white noise of its board poses alone). Left out: each gripper pose predicted by the "
+        "one, counted as well (white noise of its board poses alone). The references were made with the intrinsics stored "
+        "with the capture, where there are any; a transform belongs to its intrinsics. Seen point: how far apart the "
+        "two pairs place a point at the centre of the image and the median distance of the scene, and what 95 % of the "
+        "errors of that are said to be below. Left out: each gripper pose predicted by the "
         "other images; where two calibrations predict alike, the images cannot tell which is the better one.",
         "",
-        "| capture | from | images used | off: mm | ° | in σ | joint | ±σ: mm | ° | leave-one-out "
-        "error: mm / ° | accepted | s |",
-        "|---" * 12 + "|",
+        "| capture | from | images used | off: mm | ° | seen point: mm | 95 % below | in σ | joint | ±σ: mm | ° | "
+        "leave-one-out error: mm / ° | accepted | s |",
+        "|---" * 14 + "|",
         *map(_line, rows),
         "",
         *(f"- {row.capture}, {row.how}: {row.says}" for row in rows if row.says),
@@ -92,10 +103,16 @@ def _claims(rows: Sequence[Row]) -> list[str]:
         if row.trusted and row.off_mm is not None and row.off_deg is not None
     ]
     refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
+    seen = [row.seen_mm for row in rows if row.trusted and row.seen_mm is not None]
+    placed = (
+        f" A seen point is {np.median(seen):.1f} mm (median) from where the references put it."
+        if seen
+        else ""
+    )
     joint = [row.joint_sigmas for row in rows if row.trusted and row.joint_sigmas is not None]
     beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
     told = f" Rejected, and said so: {', '.join(refused)}." if refused else ""
-    return [f"> Real captures: {'; '.join(said) or 'none is accepted'}.{told}{beyond}"]
+    return [f"> Real captures: {'; '.join(said) or 'none is accepted'}.{told}{beyond}{placed}"]
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:
@@ -124,6 +141,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
         f"{sum(image.used for image in result.calibration.images)} of {len(capture)}",
         off_mm,
         off_deg,
+        *_seen(folder, capture, result.hand_eye, reference),
         float(np.abs(error).max()),
         None if known.covariance is None else float(np.abs(error * std / joint).max()),
         max(uncertainty.translation_std_mm),
@@ -193,6 +211,33 @@ def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOut:
     return HeldOut(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
 
 
+def _seen(
+    folder: Path, capture: Capture, hand_eye: HandEye, reference: Float[ndarray, "4 4"]
+) -> tuple[float | None, float | None]:
+    """mm: from where the reference, with the intrinsics that it was made with, places a point at the image's centre at
+    the working distance, and what 95 % of its errors are said to be below; None where nobody says with which."""
+    lens, used = hand_eye.intrinsics, _intrinsics_of_reference(folder, capture)
+    if lens is None or used is None or hand_eye.in_use is None:
+        return None, None
+    seen = hand_eye.in_use.seen
+    x_px = np.array([lens.width - 1.0, lens.height - 1.0]) / 2
+    ours, theirs = (
+        apply(x, 1e-3 * seen.distance_mm * (ray := unproject(camera, x_px)) / np.linalg.norm(ray))
+        for x, camera in ((hand_eye.gripper_from_camera, lens), (reference, used))
+    )
+    return 1e3 * float(np.linalg.norm(ours - theirs)), seen.within_95_mm
+
+
+def _intrinsics_of_reference(folder: Path, capture: Capture) -> Intrinsics | None:
+    """Those that reference.json names, else those of the capture, which the others used."""
+    camera = json.loads((folder / "reference.json").read_text()).get("camera")
+    if camera is None:
+        return capture.intrinsics
+    (fx, _, cx), (_, fy, cy), _ = camera["K"]
+    with Image.open(capture.folder / capture.images[0]) as image:
+        return Intrinsics(fx, fy, cx, cy, *image.size, coefficients_of(camera["d"]))
+
+
 def _off(x: Float[ndarray, "4 4"], reference: Float[ndarray, "4 4"]) -> tuple[float, float]:
     metres = float(np.linalg.norm(x[:3, 3] - reference[:3, 3]))
     return 1e3 * metres, float(rotation_between_deg(x[:3, :3], reference[:3, :3]))
@@ -212,6 +257,8 @@ def _line(row: Row) -> str:
         row.images,
         shown(row.off_mm, 2),
         shown(row.off_deg, 3),
+        shown(row.seen_mm, 2),
+        shown(row.seen_95_mm, 2),
         shown(row.sigmas, 1),
         shown(row.joint_sigmas, 1),
         shown(row.std_mm, 2),
