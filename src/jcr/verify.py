@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.drift import Cause, Drift, detectable, drift
@@ -16,6 +15,7 @@ from jcr.calibration.robot_errors import of_poses, robot_errors
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.cell.added import camera_of, read_added_cameras
+from jcr.distributions import chi2
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.known_transform import Known
+from jcr.distributions import chi2
 from jcr.geometry import step_between
 
 OTHER = "reference"

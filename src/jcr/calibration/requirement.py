@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.options import CalibrateOptions
+from jcr.distributions import chi2
 from jcr.geometry import skew
 from jcr.handeye.equation import ASSUMED_NOISE, PRIOR_STD, pose_information
 from jcr.handeye.next_poses import looked_at, next_poses
