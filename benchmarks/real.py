@@ -80,7 +80,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "",
         "Distance of `gripper_from_camera` from the reference stored with each capture, which has an error of its "
         "own. σ: the largest reported standard deviation of an axis; joint: that of the reference, where it states "
-        "one, counted as well (white noise of its board poses alone). The references were made with the intrinsics stored "
+        "one, counted as well (white noise of its board poses alone). References were made with the intrinsics stored "
         "with the capture, where there are any; a transform belongs to its intrinsics. Seen point: how far apart the "
         "two pairs place a point at the centre of the image and the median distance of the scene, and what 95 % of the "
         "errors of that are said to be below. Left out: each gripper pose predicted by the "

@@ -14,7 +14,7 @@ SOURCE = ROOT / "src" / "jcr"
 LAYERS = [
     {"deflate", "errors"},
     {"compiled", "extras", "options"},
-    {"pages", "rounding", "geometry"},
+    {"distributions", "pages", "rounding", "geometry"},
     {"records", "files", "memory", "progress"},
     {"arrays_json", "camera", "least_squares"},
     {"intrinsics_json"},

@@ -45,6 +45,7 @@ ROWS: tuple[tuple[tuple[str, str, float], ...], ...] = (
     ),
     (
         ("geometry.py", "SE(3), one retraction", 1),
+        ("distributions.py", "tails, quantiles", 1),
         ("rounding.py", "digits that mean something", 1),
         ("pages.py", "the manual", 1),
     ),

@@ -7,6 +7,7 @@ Pixel (0, 0) is the centre of the top-left pixel, so an image of width w spans [
 precision: float32 points give float32 pixels.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -298,10 +299,26 @@ def undistort_image(
     image: UInt8[ndarray, "h w 3"], lens: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "h2 w2 3"]:
     """The image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
+    return undistortion(lens, pinhole)(image)
+
+
+def undistortion(
+    lens: Intrinsics, pinhole: Intrinsics
+) -> Callable[[UInt8[ndarray, "h w 3"]], UInt8[ndarray, "h2 w2 3"]]:
+    """`undistort_image` for many images of one camera: where the pixels come from is computed once."""
     factor = max(1, round(lens.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
-    u, v = np.moveaxis(project(lens, rays(fine)).astype(np.float32), -1, 0)
-    # In whole grey levels, averages of two by two would all be rounded up from a half.
-    resampled = cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    small = cv2.resize(resampled, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
-    return np.rint(small).astype(np.uint8)
+    u, v = (
+        np.ascontiguousarray(place)
+        for place in np.moveaxis(project(lens, rays(fine)), -1, 0).astype(np.float32)
+    )
+
+    def undistorted(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h2 w2 3"]:
+        # In whole grey levels, averages of two by two would all be rounded up from a half.
+        resampled = cv2.remap(
+            image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        small = cv2.resize(resampled, (pinhole.width, pinhole.height), interpolation=cv2.INTER_AREA)
+        return np.rint(small).astype(np.uint8)
+
+    return undistorted

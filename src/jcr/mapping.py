@@ -16,6 +16,7 @@ from jcr.represent.measured_depth import with_measured_depth
 from jcr.results import RunOptions, RunResult
 from jcr.segment.measure import Measured, measure
 from jcr.segment.segments import image_labels, label_cloud
+from jcr.segment.tabletop import Support, support_plane
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
@@ -65,20 +66,17 @@ def make_map(result: RunResult, added: Capture, options: RunOptions, progress: P
     device = device_of(options.reconstruct)
     result = _extended(result, added, options, progress)
     reconstruction, remarks = with_measured_depth(result.capture, result.reconstruction, result.hand_eye)
-    cloud, notes = _cloud(replace(result, reconstruction=reconstruction), options, progress)
+    cloud, support, notes = _cloud(replace(result, reconstruction=reconstruction), options, progress)
     give_back()
     scene = build_scene(cloud, options.map, progress, device=device)
-    try:
-        sizes = measured(cloud, result.calibration)
-    except InputError:
-        sizes = None
+    sizes = None if support is None else measured(cloud, result.calibration, support)
     return Mapped(cloud, scene, sizes, (*remarks, *notes))
 
 
-def measured(cloud: PointCloud, calibration: CalibrationFile) -> Measured:
-    """The support plane and what stands on it; InputError when no plane carries the scene."""
+def measured(cloud: PointCloud, calibration: CalibrationFile, support: Support | None = None) -> Measured:
+    """The support plane, found where it is not given, and what stands on it; InputError when none carries the scene."""
     uncertainty = calibration.uncertainty
-    return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100)
+    return measure(cloud, 0.0 if uncertainty is None else uncertainty.scale_std_percent / 100, support)
 
 
 def _extended(result: RunResult, added: Capture, options: RunOptions, progress: Progress) -> RunResult:
@@ -92,14 +90,20 @@ def _extended(result: RunResult, added: Capture, options: RunOptions, progress: 
     return replace(result, reconstruction=reconstruction)
 
 
-def _cloud(result: RunResult, options: RunOptions, progress: Progress) -> tuple[PointCloud, tuple[str, ...]]:
-    """The labelled cloud, and what the user should know of its labels."""
+def _cloud(
+    result: RunResult, options: RunOptions, progress: Progress
+) -> tuple[PointCloud, Support | None, tuple[str, ...]]:
+    """The labelled cloud, its support plane if there is one, and what the user should know of the labels."""
     capture, reconstruction, hand_eye = result.capture, result.reconstruction, result.hand_eye
     given = image_labels(capture, reconstruction, hand_eye, options.segment, progress)
     labels, names = (None, ("none",)) if given is None else (given.labels, given.names)
     cloud = point_cloud(capture, reconstruction, hand_eye, labels, options.cloud, names)
-    cloud, notes = label_cloud(cloud, options.segment)
+    try:
+        support = support_plane(cloud)
+    except InputError:
+        support = None
+    cloud, notes = label_cloud(cloud, options.segment, support)
     added = reconstruction.image_index >= len(capture)
     if added.any() and options.segment.segments in ("auto", "labels") and given is not None:
         notes += ("images added later have no label images; --segments tabletop labels what they show, too",)
-    return cloud, notes
+    return cloud, support, notes

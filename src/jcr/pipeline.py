@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jcr import __version__, stages
 from jcr.calibration.calibration_json import calibration_file
@@ -18,15 +18,16 @@ from jcr.capture.added import read_added, with_images
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, NotTrustedError
-from jcr.mapping import measured, require_dense, require_map, why_no_map
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
 from jcr.run_folder import CAPTURE, REPORT, RunFolder, held
-from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
+
+if TYPE_CHECKING:
+    from jcr.segment.measure import Measured
 
 
 def run(
@@ -52,6 +53,8 @@ def run(
     if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
         options = replace(options, map=None)
     if options.map is not None:
+        from jcr.mapping import require_dense, why_no_map
+
         require_dense(options.depth)
         if (missing := why_no_map()) is not None:
             options = replace(options, map=None)
@@ -70,6 +73,8 @@ def run(
 
 def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
     """The run in the folder `out`, if it was made from this capture with these options and nothing has changed."""
+    from jcr.mapping import why_no_map
+
     if not (Path(out) / REPORT).is_file():
         return None
     options = options.for_capture(capture)
@@ -130,6 +135,8 @@ def build_map(
     `add` are further images, oldest first, each with a file of its base_from_gripper. They change the map but not the
     calibration, and are used in every later map of the folder. Dense depth is estimated if the folder has none.
     """
+    from jcr.mapping import require_map
+
     before = RunFolder(Path(out))
     options = RunOptions.of(
         before.options(),
@@ -181,16 +188,20 @@ def add_camera(
         keep_camera(folder.path, capture, camera)
         result = stages.located(result, folder, options, report)
         if folder.has_map():
+            from jcr.mapping import measured
+
             cloud, scene = folder.cloud(), folder.scene()
             result = replace(result, cloud=cloud, scene=scene, measured=measured(cloud, result.calibration))
         return stages.reported(result, folder, options, report)
 
 
-def measure(out: str | Path) -> Measured:
+def measure(out: str | Path) -> "Measured":
     """Measure the support plane of a run and the objects on it, from its cloud and its calibration.
 
     Raises InputError if there is no map, or if there is no support plane.
     """
+    from jcr.mapping import measured
+
     folder = RunFolder(Path(out))
     return measured(folder.cloud(), folder.calibration())
 

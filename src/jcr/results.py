@@ -29,12 +29,12 @@ from jcr.records import (
 )
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith, RunFolder
-from jcr.segment.measure import Measured
 from jcr.segment.options import SegmentOptions
 
 if TYPE_CHECKING:
     from jcr.calibration.seen import SeenInBase
     from jcr.represent.scene import SceneMap
+    from jcr.segment.measure import Measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ class RunResult:
     reconstruction: Reconstruction
     cloud: PointCloud | None = None
     scene: "SceneMap | None" = None
-    measured: Measured | None = None
+    measured: "Measured | None" = None
     """None without a map, and where no plane carries the scene."""
     cameras: CamerasFile | None = None
     """The other cameras of the cell; None where there are none."""

@@ -11,7 +11,6 @@ from jcr.capture.added import write_added
 from jcr.cell.added import read_added_cameras
 from jcr.cell.cameras_json import CamerasFile, cameras_file
 from jcr.depth.densify import densify, plan_depth
-from jcr.mapping import make_map
 from jcr.memory import give_back
 from jcr.progress import Progress
 from jcr.reconstruct.backends import BACKENDS, tries
@@ -27,11 +26,8 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
 
     Where the camera watches the gripper, what the gripper carries is the scene.
     """
-    from jcr.cell.carried import refined
-    from jcr.cell.locate import carried_scene
-
     watches = capture.mount == "base"
-    seen = carried_scene(capture, folder.path / MOVING) if watches else capture
+    seen = _carried_scene(capture, folder) if watches else capture
     state = state_of(seen, options.made_with).model_copy(update={"capture": str(capture.folder.resolve())})
     try:
         tried, attempts = _reused(seen, folder, options, state, progress) or _chosen(
@@ -44,6 +40,8 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
     folder.keep_depth(tried.reconstruction, state)
     hand_eye = tried.hand_eye
     if watches:
+        from jcr.cell.carried import refined
+
         hand_eye = refined(capture, tried.reconstruction, hand_eye, options.calibrate)
     content = calibration_file(
         capture, tried.reconstruction, hand_eye, tried.timings_s, __version__, attempts
@@ -53,6 +51,12 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
         content = content if board is None else content.with_findings(board)
     folder.keep_calibration(content)
     return RunResult(folder.path, capture, content, hand_eye, tried.reconstruction)
+
+
+def _carried_scene(capture: Capture, folder: RunFolder) -> Capture:
+    from jcr.cell.locate import carried_scene
+
+    return carried_scene(capture, folder.path / MOVING)
 
 
 def located(result: RunResult, folder: RunFolder, options: RunOptions, progress: Progress) -> RunResult:
@@ -75,11 +79,11 @@ def cameras(
     progress: Progress,
 ) -> CamerasFile | None:
     """The other cameras of the cell as cameras.json has them; None where there are none."""
-    from jcr.cell.locate import locate_cameras
-
     others = (*result.capture.others, *added)
     if not others:
         return None
+    from jcr.cell.locate import locate_cameras
+
     found = locate_cameras(
         result.capture,
         others,
@@ -112,6 +116,8 @@ def mapped(
     result: RunResult, added: Capture, folder: RunFolder, options: RunOptions, progress: Progress
 ) -> RunResult:
     """With cloud, map, and what stands on the table; `added` are further images for it."""
+    from jcr.mapping import make_map  # labels and sizes need half of SciPy, a calibration does not
+
     start = time.perf_counter()
     made = make_map(result, added, options, progress)
     folder.keep_map(made.cloud, made.scene)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.cues import surface_at
+from jcr.distributions import chi2
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, skew
 from jcr.run_folder import RunFolder

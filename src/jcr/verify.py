@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.drift import Cause, Drift, detectable, drift
@@ -18,6 +17,7 @@ from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
+from jcr.distributions import chi2
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses

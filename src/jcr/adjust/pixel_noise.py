@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.adjust.elimination import point_blocks
 from jcr.adjust.scene import Observations
+from jcr.distributions import chi2
 from jcr.least_squares import loss_weight
 
 LOSS_SCALE = 2.0

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import f as f_distribution
 
 from jcr.adjust.images import ImageEvidence, evidence
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.robots import Adjusted, equations_of
 from jcr.adjust.scene import Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
+from jcr.distributions import f as f_distribution
 from jcr.handeye.components import POSES, solve
 from jcr.records import Intrinsics
 

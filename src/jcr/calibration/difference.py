@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.calibration.known_transform import Known, read_hand_eye
+from jcr.distributions import chi2
 from jcr.geometry import step_between
 
 OTHER = "reference"

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.stats import chi2
 
 from jcr.adjust.points import PointsPlaced
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
+from jcr.distributions import chi2
 from jcr.geometry import by_similarity, retract, skew
 from jcr.records import Estimate, HandEye, Intrinsics, InUse, SceneUncertainty, Seen, WithGivenIntrinsics
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.camera import project, undistort_image
+from jcr.camera import project, undistortion
 from jcr.capture.images import read_image
 from jcr.depth.dense import dense_pointmaps
 from jcr.depth.views import choose_neighbours, sweep_planes
@@ -53,20 +53,13 @@ def extend(
     )
     old, new = len(reconstruction.recon_from_camera), len(added)
     recon_from_camera = np.concatenate([reconstruction.recon_from_camera, recon_from_new])
-    pictures = [undistort_image(read_image(added.folder / name), lens, pinhole) for name in added.images]
-    colors = np.concatenate([dense.colors, np.stack(pictures)])
+    undistort = undistortion(lens, pinhole)
+    images = [undistort(read_image(added.folder / name)) for name in added.images]
+    colors = np.concatenate([dense.colors, np.stack(images)])
     tracks = _with_projections(reconstruction.tracks, recon_from_new, pinhole, old)
 
-    near = choose_neighbours(tracks, recon_from_camera, old + new - 1)
-    neighbours = {}
-    for row in range(old, old + new):
-        others = near[row]
-        latest = others[others >= old][: NEIGHBOURS // 2]
-        neighbours[row] = np.concatenate([latest, others[others < old][: NEIGHBOURS - len(latest)]])
-    # Old images take part with a depth of their own, so that depths can be cross-checked.
-    taken = np.unique(np.concatenate([*neighbours.values(), np.arange(old, old + new)]))
-    for row in taken[taken < old]:
-        neighbours[row] = near[row][np.isin(near[row], taken)][:NEIGHBOURS]
+    neighbours = _neighbours(tracks, recon_from_camera, old)
+    taken = np.array(sorted(neighbours))
     planes = sweep_planes(tracks, recon_from_camera)
     middle = planes.mean(1, keepdims=True)
     found = dense_pointmaps(
@@ -95,15 +88,7 @@ def extend(
         reason = np.where(dense.confidence > 0, MATCHED, NO_DEPTH).astype(np.uint8)
     points = np.concatenate([dense.points_in_recon, points])
     confidence = np.concatenate([dense.confidence, confidence])
-    camera_from_recon = inverse(recon_from_camera)
-    for later in range(old, old + new):
-        for earlier in range(later):
-            gone = contradicted(
-                (points[earlier], confidence[earlier] > 0, camera_from_recon[earlier]),
-                (points[later], confidence[later] > 0, camera_from_recon[later]),
-                pinhole,
-            )
-            confidence[earlier][gone] = 0.0
+    _forget_contradicted(points, confidence, recon_from_camera, old, pinhole)
     return replace(
         reconstruction,
         image_index=np.concatenate([reconstruction.image_index, capture_size + np.arange(new)]),
@@ -119,8 +104,47 @@ def extend(
     )
 
 
+def _neighbours(
+    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], old: int
+) -> dict[int, Int[ndarray, " _"]]:
+    """Rows that each new image is compared with, and each old one that takes part: those rows have keys, too.
+
+    Old images take part with a depth of their own, so that depths can be cross-checked.
+    """
+    count = len(recon_from_camera)
+    near = choose_neighbours(tracks, recon_from_camera, count - 1)
+    neighbours = {}
+    for row in range(old, count):
+        others = near[row]
+        latest = others[others >= old][: NEIGHBOURS // 2]
+        neighbours[row] = np.concatenate([latest, others[others < old][: NEIGHBOURS - len(latest)]])
+    taken = np.unique(np.concatenate([*neighbours.values(), np.arange(old, count)]))
+    for row in taken[taken < old].tolist():
+        neighbours[row] = near[row][np.isin(near[row], taken)][:NEIGHBOURS]
+    return neighbours
+
+
 View = tuple[Float[ndarray, "h w 3"], Bool[ndarray, "h w"], Float[ndarray, "4 4"]]
 """Points in the recon frame, where they are known, and camera_from_recon."""
+
+
+def _forget_contradicted(
+    points: Float[ndarray, "m h w 3"],
+    confidence: Float[ndarray, "m h w"],
+    recon_from_camera: Float[ndarray, "m 4 4"],
+    old: int,
+    pinhole: Intrinsics,
+) -> None:
+    """Write 0 as the confidence of what an image from row `old` on contradicts in an earlier one."""
+    camera_from_recon = inverse(recon_from_camera)
+    for later in range(old, len(points)):
+        for earlier in range(later):
+            gone = contradicted(
+                (points[earlier], confidence[earlier] > 0, camera_from_recon[earlier]),
+                (points[later], confidence[later] > 0, camera_from_recon[later]),
+                pinhole,
+            )
+            confidence[earlier][gone] = 0.0
 
 
 def contradicted(earlier: View, later: View, pinhole: Intrinsics) -> Bool[ndarray, "h w"]:

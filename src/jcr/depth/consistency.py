@@ -4,11 +4,39 @@ from typing import no_type_check
 
 import numpy as np
 
-from jcr.compiled import compiled
+from jcr.compiled import compiled, inlined
 
 SEEN_THROUGH = 0.01
 """A neighbour whose depth is farther by this share sees through the point. Beside an object's outline the plain
 table often gets the object's depth; the neighbours that look past the object there know better."""
+_ONE, _HALF, _FAR = np.float32(1), np.float32(0.5), np.float32(SEEN_THROUGH)
+# A number of Python among these makes a sum of double precision.
+
+
+@inlined
+@no_type_check
+def _in_other(n, ray, inverse_depth, a, b):
+    """Pixel x, y of a point in the n-th other image, and its depth there by that here."""
+    rx, ry = ray
+    z = a[n, 2, 0] * rx + a[n, 2, 1] * ry + a[n, 2, 2] + b[n, 2] * inverse_depth
+    iz = _ONE / z
+    x = (a[n, 0, 0] * rx + a[n, 0, 1] * ry + a[n, 0, 2] + b[n, 0] * inverse_depth) * iz
+    y = (a[n, 1, 0] * rx + a[n, 1, 1] * ry + a[n, 1, 2] + b[n, 1] * inverse_depth) * iz
+    return x, y, z
+
+
+@inlined
+@no_type_check
+def _interpolated(inverse_depth, known, j, x, y):
+    """Inverse depth of image j between its pixels, where all four are known, or else of the nearest."""
+    left, top = np.uint32(x), np.uint32(y)
+    right, low = left + np.uint32(1), top + np.uint32(1)
+    if known[j, top, left] and known[j, top, right] and known[j, low, left] and known[j, low, right]:
+        fx, fy = x - np.float32(left), y - np.float32(top)
+        upper = inverse_depth[j, top, left] * (_ONE - fx) + inverse_depth[j, top, right] * fx
+        lower = inverse_depth[j, low, left] * (_ONE - fx) + inverse_depth[j, low, right] * fx
+        return upper * (_ONE - fy) + lower * fy
+    return inverse_depth[j, np.uint32(y + _HALF), np.uint32(x + _HALF)]
 
 
 @compiled
@@ -21,6 +49,7 @@ def agreement(i, inverse_depth, known, trusted, others, a, b, centre, k, toleran
     each other image; `centre` (n) its camera's z in image i.
     """
     h, w = inverse_depth.shape[1:]
+    right, bottom, tolerance = np.float32(w - 1), np.float32(h - 1), np.float32(tolerance)
     mean = np.zeros((h, w), np.float32)
     count = np.zeros((h, w), np.uint8)
     through = np.zeros((h, w), np.uint8)
@@ -31,43 +60,26 @@ def agreement(i, inverse_depth, known, trusted, others, a, b, centre, k, toleran
             mean[v, u] = here
             if not known[i, v, u]:
                 continue
-            rx, ry = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
-            total = here
+            ray = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
+            total, moved, agreeing, seeing = here, np.float32(0), 0, 0
             for n in range(len(others)):
-                z = a[n, 2, 0] * rx + a[n, 2, 1] * ry + a[n, 2, 2] + b[n, 2] * here
-                if z <= 0:
+                x, y, z = _in_other(n, ray, here, a, b)
+                if not (z > 0 and x >= 0 and y >= 0 and x < right and y < bottom):
                     continue
-                x = (a[n, 0, 0] * rx + a[n, 0, 1] * ry + a[n, 0, 2] + b[n, 0] * here) / z
-                y = (a[n, 1, 0] * rx + a[n, 1, 1] * ry + a[n, 1, 2] + b[n, 1] * here) / z
-                if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
-                    continue
-                ix, iy = int(x), int(y)
-                j = others[n]
-                nx, ny = int(x + np.float32(0.5)), int(y + np.float32(0.5))
+                j, nx, ny = others[n], np.uint32(x + _HALF), np.uint32(y + _HALF)
                 if not known[j, ny, nx]:
                     continue
-                fx, fy = x - ix, y - iy
-                if (
-                    known[j, iy, ix]
-                    and known[j, iy, ix + 1]
-                    and known[j, iy + 1, ix]
-                    and known[j, iy + 1, ix + 1]
-                ):
-                    top = inverse_depth[j, iy, ix] * (1 - fx) + inverse_depth[j, iy, ix + 1] * fx
-                    low = inverse_depth[j, iy + 1, ix] * (1 - fx) + inverse_depth[j, iy + 1, ix + 1] * fx
-                    there = top * (1 - fy) + low * fy
-                else:
-                    there = inverse_depth[j, ny, nx]
-                ratio = z / here * there
-                if abs(ratio - 1) < tolerance:
+                ratio = z / here * _interpolated(inverse_depth, known, j, x, y)
+                if abs(ratio - _ONE) < tolerance:
                     # The point moves along the other's ray until it has the other's depth; its z here follows.
-                    total += 1 / (centre[n] + (1 / here - centre[n]) / ratio)
-                    count[v, u] += 1
+                    total += _ONE / (centre[n] + (_ONE / here - centre[n]) / ratio)
+                    agreeing += 1
                     moves_x, moves_y = (b[n, 0] - x * b[n, 2]) / z, (b[n, 1] - y * b[n, 2]) / z
-                    information[v, u] += moves_x * moves_x + moves_y * moves_y
-                elif ratio < 1 - SEEN_THROUGH and trusted[j, ny, nx]:
-                    through[v, u] += 1
-            mean[v, u] = total / (1 + count[v, u])
+                    moved += moves_x * moves_x + moves_y * moves_y
+                elif ratio < _ONE - _FAR and trusted[j, ny, nx]:
+                    seeing += 1
+            mean[v, u] = total / np.float32(1 + agreeing)
+            count[v, u], through[v, u], information[v, u] = agreeing, seeing, moved
     return mean, count, through, information
 
 
@@ -79,6 +91,7 @@ def colours_agree(i, inverse_depth, wanted, matched_depth, matched, colors, othe
     A point is hidden from an image whose matched depth there is nearer; such an image says nothing.
     """
     h, w = inverse_depth.shape
+    right, bottom, most = np.float32(w - 1), np.float32(h - 1), np.float32(tolerance * tolerance)
     same = np.zeros((h, w), np.uint8)
     other_colour = np.zeros((h, w), np.uint8)
     through = np.zeros((h, w), np.uint8)
@@ -87,29 +100,24 @@ def colours_agree(i, inverse_depth, wanted, matched_depth, matched, colors, othe
             if not wanted[v, u]:
                 continue
             here = inverse_depth[v, u]
-            rx, ry = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
+            ray = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
             for n in range(len(others)):
-                z = a[n, 2, 0] * rx + a[n, 2, 1] * ry + a[n, 2, 2] + b[n, 2] * here
-                if z <= 0:
+                x, y, z = _in_other(n, ray, here, a, b)
+                if not (z > 0 and x >= 0 and y >= 0 and x < right and y < bottom):
                     continue
-                x = (a[n, 0, 0] * rx + a[n, 0, 1] * ry + a[n, 0, 2] + b[n, 0] * here) / z
-                y = (a[n, 1, 0] * rx + a[n, 1, 1] * ry + a[n, 1, 2] + b[n, 1] * here) / z
-                if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
-                    continue
-                j = others[n]
-                nx, ny = int(x + np.float32(0.5)), int(y + np.float32(0.5))
+                j, nx, ny = others[n], np.uint32(x + _HALF), np.uint32(y + _HALF)
                 if matched[j, ny, nx]:
                     ratio = z / here * matched_depth[j, ny, nx]
-                    if ratio > 1 + SEEN_THROUGH:
+                    if ratio > _ONE + _FAR:
                         continue
-                    if ratio < 1 - SEEN_THROUGH:
+                    if ratio < _ONE - _FAR:
                         through[v, u] += 1
                         continue
                 difference = np.float32(0)
                 for c in range(3):
                     d = colors[i, v, u, c] - colors[j, ny, nx, c]
                     difference += d * d
-                if difference < tolerance * tolerance:
+                if difference < most:
                     same[v, u] += 1
                 else:
                     other_colour[v, u] += 1

@@ -76,8 +76,9 @@ def dense_pointmaps(
     )
     depth = 1 / found.inverse_depth.astype(np.float64)
     points = np.empty((*depth.shape, 3))
+    direction = rays(pinhole)
     for k, pose in enumerate(recon_from_camera):
-        points[k] = np.einsum("ij,hwj->hwi", pose[:3, :3], depth[k, ..., None] * rays(pinhole)) + pose[:3, 3]
+        points[k] = (depth[k, ..., None] * direction) @ pose[:3, :3].T + pose[:3, 3]
     return DenseDepth(
         points, found.confidence.astype(np.float64), found.reason, (found.std * depth).astype(np.float32)
     )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from jcr.camera import pinhole_inside, undistort_image
+from jcr.camera import pinhole_inside, undistortion
 from jcr.capture.images import read_image
 from jcr.depth.dense import dense_pointmaps
 from jcr.depth.options import DepthOptions
@@ -91,9 +91,8 @@ def undistorted(
 ) -> tuple[Intrinsics, UInt8[ndarray, "m h w 3"]]:
     """The pinhole grid of pointmaps whose long side is `size_px` at most, and the images on it."""
     pinhole = pinhole_inside(intrinsics, size_px)
-    return pinhole, np.stack(
-        [undistort_image(read_image(folder / name), intrinsics, pinhole) for name in names]
-    )
+    undistort = undistortion(intrinsics, pinhole)
+    return pinhole, np.stack([undistort(read_image(folder / name)) for name in names])
 
 
 def _planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m d 3"]:

@@ -1,8 +1,9 @@
 """Matched depths, checked across views, and planes where there are none: one depth, reason and sigma a pixel."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy import ndarray
 
 from jcr.camera import rays
 from jcr.depth.consistency import agreement
-from jcr.depth.matched import grid, relative
+from jcr.depth.matched import Relative, grid, relative
 from jcr.depth.priors import ON_PLANE, Prior, evened, planar_prior, support_plane
 from jcr.geometry import apply
 from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Intrinsics
@@ -67,46 +68,23 @@ def fused_depth(
     than twice as many as see through it. To see through, an image's own depth must have as many that agree: what is
     found where nothing matches is as often behind a surface as before it.
     """
-    m = len(colors)
     views = [relative(i, others, recon_from_camera, pinhole) for i, others in enumerate(neighbours)]
     needed = np.array([1 if len(view.others) < 3 else 2 for view in views])[:, None, None]
+    known = score >= LEAST_CORRELATION
     with ThreadPoolExecutor(threads) as pool:
-
-        def check(
-            depth: Float[ndarray, "m h w"],
-            known: Bool[ndarray, "m h w"],
-            trusted: Bool[ndarray, "m h w"],
-            tolerance: float,
-        ) -> list[ndarray]:
-            def one(i: int) -> tuple[ndarray, ...]:
-                v = views[i]
-                return agreement(
-                    i, depth, known, trusted, v.others, v.a, v.b, v.centre, grid(pinhole), tolerance
-                )
-
-            return [np.stack(maps) for maps in zip(*pool.map(one, range(m)), strict=True)]
-
-        known = score >= LEAST_CORRELATION
+        check = partial(_check, pool, views, grid(pinhole))
         count = through = information = np.zeros(0)
         trusted = known
         for tolerance in AGREEMENT:
             inverse_depth, count, through, information = check(inverse_depth, known, trusted, tolerance)
             trusted = known & (count >= needed)
         report(0.2)
-        matched = known & (count >= needed)
-        if not changing:
-            matched &= count > 2 * through
+        matched = trusted if changing else trusted & (count > 2 * through)
         std = MATCHING_STD_PX / np.sqrt(np.maximum(information, 1e-12)) / inverse_depth
-        reason = np.where(matched, MATCHED, NO_DEPTH).astype(np.uint8)
         confidence = (np.minimum(score, 1) * count).astype(np.float32)
         if not priors or matched.sum() < FEWEST_MATCHED:
-            nothing = np.float32(0)
-            return FusedDepth(
-                inverse_depth,
-                np.where(matched, confidence, nothing),
-                reason,
-                np.where(matched, std, nothing).astype(np.float32),
-            )
+            reason = np.where(matched, MATCHED, NO_DEPTH).astype(np.uint8)
+            return FusedDepth(inverse_depth, _where(matched, confidence), reason, _where(matched, std))
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
         even = evened(colors, inverse_depth, matched, views, pinhole)
@@ -118,32 +96,81 @@ def fused_depth(
                 i, even, inverse_depth, matched, views[i], support, recon_from_camera[i], pinhole
             )
 
-        found = list(pool.map(prior, range(m)))
+        found = _stacked(list(pool.map(prior, range(len(colors)))))
         report(0.8)
-        of_plane, holds, confirms, agreeing, contradicts, plane_std = (
-            np.stack([getattr(one, name) for one in found])
-            for name in ("inverse_depth", "holds", "confirms", "agreeing", "contradicts", "std")
+        alone = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION)
+        fused = _with_planes(
+            FusedDepth(inverse_depth, confidence, np.where(matched, MATCHED, NO_DEPTH).astype(np.uint8), std),
+            found,
+            alone,
+            needed,
+            check,
         )
-        plane_std = np.hypot(plane_std, PRIOR_FLOOR)
-        on_plane = np.abs(of_plane / inverse_depth - 1) < ON_PLANE
-        pair = known & (count == 1) & (through == 0) & (score >= PAIR_CORRELATION) & confirms & on_plane
-        matched = (matched & ~contradicts) | pair
-        both = matched & confirms & on_plane
-        filled = holds & ~matched
-        inverse_depth = np.where(filled, of_plane, inverse_depth)
-        there = matched | filled
-        _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
-        filled &= (count >= np.minimum(needed, agreeing)) & (count > 2 * through)
-        # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it knows better.
-        through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
-        matched &= both | (through == 0)
         report(1.0)
-    reason = np.select([both, matched, filled], [BOTH, MATCHED, PRIOR], NO_DEPTH).astype(np.uint8)
-    confidences = [BOTH_CONFIDENCE * confidence, confidence, PRIOR_CONFIDENCE * count]
-    confidence = np.select([both, matched, filled], confidences, 0).astype(np.float32)
-    stds = [1 / np.sqrt(std**-2 + plane_std**-2), std, plane_std]
-    std = np.select([both, matched, filled], stds, 0).astype(np.float32)
-    return FusedDepth(inverse_depth, confidence, reason, std)
+    return fused
+
+
+def _check(
+    pool: Executor,
+    views: Sequence[Relative],
+    k: Float[ndarray, "4"],
+    inverse_depth: Float[ndarray, "m h w"],
+    known: Bool[ndarray, "m h w"],
+    trusted: Bool[ndarray, "m h w"],
+    tolerance: float,
+) -> list[ndarray]:
+    """`agreement` of all images, (m,h,w) each."""
+
+    def one(i: int) -> tuple[ndarray, ...]:
+        v = views[i]
+        return agreement(i, inverse_depth, known, trusted, v.others, v.a, v.b, v.centre, k, tolerance)
+
+    return [np.stack(maps) for maps in zip(*pool.map(one, range(len(views))), strict=True)]
+
+
+def _where(there: Bool[ndarray, "m h w"], values: Float[ndarray, "m h w"]) -> Float[ndarray, "m h w"]:
+    """The values there, and 0 elsewhere."""
+    return np.where(there, values, 0).astype(np.float32)
+
+
+def _stacked(priors: Sequence[Prior]) -> Prior:
+    """Of all images, (m,h,w) each."""
+    return Prior(**{one.name: np.stack([getattr(p, one.name) for p in priors]) for one in fields(Prior)})
+
+
+def _with_planes(
+    matching: FusedDepth,
+    planes: Prior,
+    alone: Bool[ndarray, "m h w"],
+    needed: Int[ndarray, "m 1 1"],
+    check: Callable[..., list[ndarray]],
+) -> FusedDepth:
+    """Depths that were matched (by `reason`) where planes do not contradict them, and planes in place of the others.
+
+    `alone` are pixels on whose depth two images agree and no third.
+    """
+    inverse_depth, matched = matching.inverse_depth, matching.reason == MATCHED
+    plane_std = np.hypot(planes.std, PRIOR_FLOOR)
+    on_plane = np.abs(planes.inverse_depth / inverse_depth - 1) < ON_PLANE
+    matched = (matched & ~planes.contradicts) | (alone & planes.confirms & on_plane)
+    both = matched & planes.confirms & on_plane
+    filled = planes.holds & ~matched
+    inverse_depth = np.where(filled, planes.inverse_depth, inverse_depth)
+    there = matched | filled
+    _, count, through, _ = check(inverse_depth, there, there, ON_PLANE)
+    filled &= (count >= np.minimum(needed, planes.agreeing)) & (count > 2 * through)
+    # Beside outlines two images may give the nearer depth alike; a third that has the plane behind it knows better.
+    through = check(inverse_depth, there, both | filled, ON_PLANE)[2]
+    matched &= both | (through == 0)
+    which = [both, matched, filled]
+    confidences = [BOTH_CONFIDENCE * matching.confidence, matching.confidence, PRIOR_CONFIDENCE * count]
+    stds = [1 / np.sqrt(matching.std**-2 + plane_std**-2), matching.std, plane_std]
+    return FusedDepth(
+        inverse_depth,
+        np.select(which, confidences, 0).astype(np.float32),
+        np.select(which, [BOTH, MATCHED, PRIOR], NO_DEPTH).astype(np.uint8),
+        np.select(which, stds, 0).astype(np.float32),
+    )
 
 
 def _support(

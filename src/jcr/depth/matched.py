@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8, UInt16, UInt64
 from numpy import ndarray
 
 from jcr.camera import rays, resized
@@ -18,8 +18,8 @@ from jcr.depth.patch_match import (
     score_all,
     spread_planes,
     to_the_peak,
-    window_weights,
 )
+from jcr.depth.window import ALIKE, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
@@ -70,6 +70,40 @@ def grid(pinhole: Intrinsics) -> Float[ndarray, "4"]:
     return np.array([pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy], np.float32)
 
 
+@dataclass(frozen=True)
+class _Level:
+    """All images at one resolution."""
+
+    pinhole: Intrinsics
+    colors: UInt8[ndarray, "m h w 3"]
+    greys: UInt16[ndarray, "m h w"]
+    """The sums of the three colours."""
+    packed: UInt64[ndarray, "m y x"]
+    """The greys as the windows of other images read them."""
+
+    @classmethod
+    def of(cls, colors: UInt8[ndarray, "m _ _ 3"], pinhole: Intrinsics) -> "_Level":
+        size = (pinhole.width, pinhole.height)
+        fitting = [cv2.resize(color, size, interpolation=cv2.INTER_AREA) for color in colors]
+        greys = [cv2.transform(color.astype(np.uint16), np.ones((1, 3))) for color in fitting]
+        packed = [quads(np.pad(grey, PAD, "edge")) for grey in greys]
+        return cls(pinhole, np.stack(fitting), np.stack(greys), np.stack(packed))
+
+    def views(
+        self, i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"]
+    ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
+        """`packed`, `motions`, `windows` and k of image i, as the loops take them."""
+        near = relative(i, others, recon_from_camera, self.pinhole)
+        motions = np.concatenate([near.a.reshape(-1, 9), near.b], 1)
+        k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
+        return self.packed[others], motions, windows(self.colors[i], self.greys[i], ALIKE), k
+
+    def enlarged(self, map_of_half: ndarray) -> ndarray:
+        """A map of the level below, each number for the pixels that it covers here."""
+        size = (self.pinhole.width, self.pinhole.height)
+        return cv2.resize(map_of_half, size, interpolation=cv2.INTER_NEAREST)
+
+
 def match_depth(
     colors: UInt8[ndarray, "m h w 3"],
     recon_from_camera: Float[ndarray, "m 4 4"],
@@ -84,42 +118,31 @@ def match_depth(
     `planes`, evenly spaced as `views.sweep_planes` does, span what is searched, and half of the first guesses are
     parallel to them. The same whatever the number of threads.
     """
-    half = resized(pinhole, pinhole.width // 2, pinhole.height // 2)
-    coarse, fine = _shrunk(colors, half), colors.astype(np.float32) / 255
-    greys = [level.mean(-1) - np.float32(0.5) for level in (coarse, fine)]
-    continued = [np.pad(grey, ((0, 0), (PAD, PAD), (PAD, PAD)), "edge") for grey in greys]
+    half = _Level.of(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
+    full = _Level.of(colors, pinhole)
+    h, w = half.greys.shape[1:]
 
     def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
+        others, seed = neighbours[i][:COMPARED], 100 * i
         family = np.ascontiguousarray(planes[i][[0, -1]])
-        reach = np.einsum("di,hwi->dhw", family, rays(half))
-        highest = float(reach.max())
-        lowest = max(float(reach.min()), LEAST * highest)
-        others = neighbours[i][:COMPARED]
-        found = asked = None
-        k, score = grid(half), np.empty((half.height, half.width), np.float32)
-        for level, color, grey, padded in zip((half, pinhole), (coarse, fine), greys, continued, strict=True):
-            near, k = relative(i, others, recon_from_camera, level), grid(level)
-            size = (level.width, level.height)
-            window = window_weights(color[i], grey[i])
-            if found is None or asked is None:
-                found = random_planes(family, lowest, highest, k, level.height, level.width, i)
-                asked = np.full(size[::-1], 255, np.uint8)
-                passes, tries = _COARSE, _COARSE_TRIES
-            else:
-                found = cv2.resize(found, size, interpolation=cv2.INTER_NEAREST)
-                asked = cv2.resize(asked, size, interpolation=cv2.INTER_NEAREST)
-                passes, tries = _FINE, _FINE_TRIES
-            score = np.empty(size[::-1], np.float32)
-            views = (padded, near.others, asked, *window, near.a, near.b, k)
-            score_all(found, score, *views)
-            for n, step in enumerate(passes):
-                bounds = (np.float32(lowest), np.float32(highest))
-                spread_planes(found, score, *views, *bounds, step, tries, n % 2 == 1, 100 * i + n)
-            if level is half:
-                asked = best_neighbours(found, ASKED, padded, near.others, *window, near.a, near.b, k)
-            else:
-                to_the_peak(found, score, *views, _PEAK)
-        return np.maximum(inverse_depths(found, k), np.float32(0.5 * lowest)), score
+        reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
+        span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
+
+        views = half.views(i, others, recon_from_camera)
+        found = random_planes(family, span, views[-1], h, w, i)
+        asked = np.full((h, w), 255, np.uint8)
+        score_all(found, asked, *views)
+        for n, size in enumerate(_COARSE):
+            spread_planes(found, asked, *views, (*span, size, _COARSE_TRIES), seed + n)
+        asked = full.enlarged(best_neighbours(found, ASKED, *views))
+        found = full.enlarged(found)
+
+        views = full.views(i, others, recon_from_camera)
+        score_all(found, asked, *views)
+        for n, size in enumerate(_FINE):
+            spread_planes(found, asked, *views, (*span, size, _FINE_TRIES), seed + n)
+        to_the_peak(found, asked, *views, _PEAK)
+        return np.maximum(inverse_depths(found, views[-1]), np.float32(0.5 * span[0])), found[..., 3]
 
     depths, scores = [], []
     with ThreadPoolExecutor(threads) as pool:
@@ -128,9 +151,3 @@ def match_depth(
             scores.append(score)
             report((n + 1) / len(colors))
     return np.stack(depths), np.stack(scores)
-
-
-def _shrunk(colors: UInt8[ndarray, "m h w 3"], pinhole: Intrinsics) -> Float[ndarray, "m y x 3"]:
-    size = (pinhole.width, pinhole.height)
-    small = [cv2.resize(color, size, interpolation=cv2.INTER_AREA) for color in colors]
-    return np.stack(small).astype(np.float32) / 255

@@ -48,19 +48,19 @@ _PAIRS = 600
 
 @dataclass(frozen=True)
 class Prior:
-    """What the planes say of one image."""
+    """What the planes say of one image, or of all."""
 
-    inverse_depth: Float[ndarray, "h w"]
-    holds: Bool[ndarray, "h w"]
+    inverse_depth: Float[ndarray, "*m h w"]
+    holds: Bool[ndarray, "*m h w"]
     """Colours agree with it and nothing sees through it."""
-    confirms: Bool[ndarray, "h w"]
+    confirms: Bool[ndarray, "*m h w"]
     """It holds, or the one other image that looks there agrees: enough where the pixel's own match lies on it."""
-    agreeing: UInt8[ndarray, "h w"]
+    agreeing: UInt8[ndarray, "*m h w"]
     """Images that show the plane's point in the pixel's colour; of the support plane one is enough. No more of them
     than that need to agree."""
-    contradicts: Bool[ndarray, "h w"]
+    contradicts: Bool[ndarray, "*m h w"]
     """Matched pixels that a well-carried plane shows to be wrong."""
-    std: Float[ndarray, "h w"]
+    std: Float[ndarray, "*m h w"]
     """Relative, of inverse depth."""
 
 

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import root_scalar
-from scipy.stats import chi2
 
+from jcr.distributions import chi2
 from jcr.handeye.systematic import REACH, Region
 from jcr.records import Budget
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.stats import chi2
 
+from jcr.distributions import chi2
 from jcr.handeye.components import Equations, most_likely, restricted_log_likelihood, solve
 from jcr.handeye.equation import PRIOR_STD, Poses, residuals
 from jcr.handeye.robots import Arm, Joints, error_jacobian

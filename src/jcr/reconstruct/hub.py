@@ -12,6 +12,11 @@ def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES) -> list[Path]:
     """Files of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
     if not is_installed("huggingface_hub"):
         return []
+    from huggingface_hub import constants
+
+    # Its client for the network takes a tenth of a second to import, which most machines can spare.
+    if not (Path(constants.HF_HUB_CACHE) / f"models--{hub_id.replace('/', '--')}").is_dir():
+        return []
     from huggingface_hub import try_to_load_from_cache
 
     # Not a path where a file is missing, or known to be missing on the hub.

@@ -180,8 +180,9 @@ def rendered_points(
     square = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
     columns = (column[far_to_near, None] + square[:, 0]).clip(0, width - 1)
     rows = (row[far_to_near, None] + square[:, 1]).clip(0, height - 1)
-    rgba[rows, columns, :3] = color[far_to_near, None]
-    rgba[rows, columns, 3] = 255
+    # A pixel's four bytes are written as one number.
+    opaque = np.column_stack([color, np.full(len(color), 255, np.uint8)]).view(np.uint32)
+    rgba.view(np.uint32).reshape(-1)[rows * width + columns] = opaque[far_to_near]
     return rgba
 
 

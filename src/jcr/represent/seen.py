@@ -166,14 +166,19 @@ def _before_nearest(
 
 def dilate(mask: Bool[Tensor, "nz ny nx"], cells: int) -> Bool[Tensor, "nz ny nx"]:
     """The mask grown by this many cells along every axis."""
-    grown = mask[None].float()
     for axis in range(3):
-        size, padding = [1, 1, 1], [0, 0, 0]
-        size[axis], padding[axis] = 2 * cells + 1, cells
-        grown = F.max_pool3d(grown, size, 1, padding)
-    return grown[0] > 0
+        grown, n = mask.clone(), mask.shape[axis]
+        for step in range(1, min(cells, n - 1) + 1):
+            grown.narrow(axis, step, n - step).logical_or_(mask.narrow(axis, 0, n - step))
+            grown.narrow(axis, 0, n - step).logical_or_(mask.narrow(axis, step, n - step))
+        mask = grown
+    return mask
 
 
 def halve(mask: Bool[Tensor, "nz ny nx"]) -> Bool[Tensor, "z y x"]:
     """The mask at half the resolution: set where any of eight cells is."""
-    return F.max_pool3d(mask[None].float(), 2)[0] > 0
+    z, y, x = (n // 2 * 2 for n in mask.shape)
+    for axis, n in enumerate((z, y, x)):
+        mask = mask.narrow(axis, 0, n).unflatten(axis, (n // 2, 2))
+        mask = mask.select(axis + 1, 0) | mask.select(axis + 1, 1)
+    return mask

@@ -5,7 +5,7 @@ from jcr.progress import Progress
 from jcr.records import Capture, HandEye, PointCloud, Reconstruction
 from jcr.segment.labels import LabelImages, read_labels
 from jcr.segment.options import SegmentOptions
-from jcr.segment.tabletop import label_tabletop
+from jcr.segment.tabletop import Support, label_tabletop
 
 
 def image_labels(
@@ -34,15 +34,18 @@ def image_labels(
     return None
 
 
-def label_cloud(cloud: PointCloud, options: SegmentOptions) -> tuple[PointCloud, tuple[str, ...]]:
+def label_cloud(
+    cloud: PointCloud, options: SegmentOptions, support: Support | None = None
+) -> tuple[PointCloud, tuple[str, ...]]:
     """The cloud with labels from its geometry, where nothing else gave any, and what the user should know of it.
 
-    Raises InputError when the tabletop was asked for and no plane carries the scene.
+    `support` is found here where it is not given. Raises InputError when the tabletop was asked for and no plane
+    carries the scene.
     """
     if options.segments not in ("auto", "tabletop") or len(cloud.label_names) > 1:
         return cloud, ()
     try:
-        labelled = label_tabletop(cloud, options.tabletop)
+        labelled = label_tabletop(cloud, options.tabletop, support)
     except InputError as error:
         if options.segments == "tabletop":
             raise

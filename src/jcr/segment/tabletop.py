@@ -74,7 +74,9 @@ def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     one_sided = (np.abs(side.sum(0)) == len(side)) & (length[:, 0] > 1e-9)
     # A table's points are spread about it by the noise of depth, which is larger the farther the cameras are.
     far = np.median(np.linalg.norm(x - cloud.camera_centers_in_base[image], axis=1))
-    count = (np.abs(some @ normal.T - offset) < 0.005 * far).sum(0) * one_sided
+    count = np.zeros(PLANES, int)
+    for k in np.flatnonzero(one_sided):  # one by one, each stays in the processor's cache
+        count[k] = np.count_nonzero(np.abs(some @ normal[k] - offset[k]) < 0.005 * far)
     # A wall behind the table may be seen more; arms that stand upright are the rule.
     level = np.abs(normal[:, 2]) > LEAST_LEVEL
     best = int((count * np.where(level, LEVEL_WEIGHT, 1)).argmax())

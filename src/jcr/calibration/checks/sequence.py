@@ -15,10 +15,10 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation, RotationSpline
-from scipy.stats import f as f_distribution
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
+from jcr.distributions import f as f_distribution
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind
 

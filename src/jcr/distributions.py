@@ -1,0 +1,46 @@
+"""Tails and quantiles of chi-squared and F, of scipy.special: scipy.stats takes as long to import as all else.
+
+Names and results are those of scipy.stats.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from scipy.special import chdtr, chdtrc, chdtri, fdtrc, gammaincinv
+
+Number = float | int | np.number | ndarray
+
+
+class chi2:  # noqa: N801
+    """Sum of `freedom` squares of standard normal numbers."""
+
+    @staticmethod
+    def cdf(x: Number, freedom: Number) -> Any:
+        """Probability of at most x."""
+        return chdtr(freedom, x)
+
+    @staticmethod
+    def sf(x: Number, freedom: Number) -> Any:
+        """Probability of more than x."""
+        return chdtrc(freedom, x)
+
+    @staticmethod
+    def ppf(share: Number, freedom: Number) -> Any:
+        """What is exceeded with a probability of 1 - share."""
+        return 2 * gammaincinv(np.asarray(freedom) / 2, share)
+
+    @staticmethod
+    def isf(share: Number, freedom: Number) -> Any:
+        """What is exceeded with a probability of share."""
+        return chdtri(freedom, share)
+
+
+class f:  # noqa: N801
+    """Ratio of two mean squares."""
+
+    @staticmethod
+    def logsf(x: Number, over: Number, under: Number) -> Any:
+        """Logarithm of the probability of more than x; minus infinity where that is too small for a number."""
+        with np.errstate(divide="ignore"):
+            return np.log(fdtrc(over, under, x))
