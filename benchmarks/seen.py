@@ -197,6 +197,7 @@ def _estimate(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "4 
         intrinsics=found.placed.scene.cameras[0],
         intrinsics_covariance=found.intrinsics_covariance(0),
         intrinsics_cross=found.intrinsics_cross(0),
+        model_error=found.model_error(),
     )
 
 

@@ -14,10 +14,12 @@ from numpy.polynomial.legendre import legvander2d
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, unproject
-from jcr.records import Intrinsics
+from jcr.records import Intrinsics, ModelError
 
 DEGREE = 5
-"""Of the polynomials: what a seventh power of the radius leaves beside k1, k2 and k3 has this."""
+"""Of the polynomials."""
+RADIAL = (3, 4, 5)
+"""Powers of the squared radius, by which rays move outwards beside them: what k1, k2 and k3 leave of wide angles."""
 TYPICAL = 1e-4
 """Of the width, per polynomial: the middle of the prior of their size, a weak one."""
 UPDATES, SETTLED = 100, 1e-3
@@ -36,10 +38,10 @@ def displacements(
     blocks = [np.zeros((len(camera), 2, 0))]
     for c, (intrinsics, prior) in enumerate(zip(cameras, priors, strict=True)):
         rows = np.flatnonzero(camera == c)
-        if len(prior.std) == 0 or len(rows) <= _polynomials_count():
+        if len(rows) <= (count := polynomials_of(prior)) or count == 0:
             continue
         by_prior = by_parameters(intrinsics, unproject(intrinsics, x_px[rows])) @ prior.directions
-        block = np.zeros((len(camera), 2, 2 * _polynomials_count()))
+        block = np.zeros((len(camera), 2, count))
         block[rows] = intrinsics.width * _beside(_polynomials(x_px[rows], intrinsics), by_prior)
         blocks.append(block)
     return np.concatenate(blocks, axis=2)
@@ -68,18 +70,43 @@ def size_of(
     return np.full(len(std), np.sqrt(variance))
 
 
-def _polynomials_count() -> int:
-    return (DEGREE + 1) * (DEGREE + 2) // 2
+def expressed(
+    camera: Intrinsics, prior: IntrinsicsPrior, x_px: Float[ndarray, "k 2"]
+) -> Float[ndarray, "q e"]:
+    """By how much the camera's parameters express each polynomial over these pixels."""
+    by_prior = by_parameters(camera, unproject(camera, x_px)) @ prior.directions
+    polynomials = camera.width * _polynomials(x_px, camera)
+    fit = np.linalg.lstsq(by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1))[0]
+    return prior.directions @ fit
+
+
+def second_moment_px2(
+    left: ModelError, camera: Intrinsics, x_px: Float[ndarray, "*points 2"]
+) -> Float[ndarray, "*points 2 2"]:
+    """Of the displacement at pixels (px²): who projects with the camera alone errs by it and by what is unknown of
+    it."""
+    flat = x_px.reshape(-1, 2)
+    by = camera.width * _polynomials(flat, camera)
+    by = by - by_parameters(camera, unproject(camera, flat)) @ left.expressed
+    moment = left.covariance + np.outer(left.likeliest, left.likeliest)
+    return (by @ moment @ np.swapaxes(by, 1, 2)).reshape(*x_px.shape, 2)
+
+
+def polynomials_of(prior: IntrinsicsPrior) -> int:
+    """How many displacements a camera has whose intrinsics are known like this; 0 where they are exact."""
+    return (DEGREE + 1) * (DEGREE + 2) + len(RADIAL) if len(prior.std) else 0
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Of x, then of y: products of Legendre polynomials, up to a total degree, over a square about the image."""
+    """Of x, of y: products of Legendre polynomials, up to a total degree, over a square about the image; then radial."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     kept = every[:, i, j]
     nothing = np.zeros_like(kept)
-    return np.stack([np.hstack([kept, nothing]), np.hstack([nothing, kept])], axis=1)
+    radial = np.stack([(u * u + v * v) ** power for power in RADIAL], axis=1)
+    across, down = u[:, None] * radial, v[:, None] * radial
+    return np.stack([np.hstack([kept, nothing, across]), np.hstack([nothing, kept, down])], axis=1)
 
 
 def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:

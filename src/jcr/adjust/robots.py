@@ -33,6 +33,7 @@ from jcr.adjust.images import (
     view_of,
     with_model_error_of,
 )
+from jcr.adjust.model_error import expressed, polynomials_of
 from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped
 from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import POSES, Equations, most_likely, posterior, solve
@@ -40,7 +41,7 @@ from jcr.handeye.equation import PRIOR_STD, SCALE, Poses, predict, residuals, re
 from jcr.handeye.fit import left_out
 from jcr.handeye.systematic import Region
 from jcr.least_squares import one_blas_thread
-from jcr.records import Budget
+from jcr.records import Budget, ModelError
 
 START_NOISE = (1e-3, np.radians(0.2))
 """m, rad; of gripper poses, until it is estimated."""
@@ -132,6 +133,23 @@ class Adjusted:
         """Of the first arm's X and scale with the parameters of a camera."""
         own, directions = self._intrinsics_of(c)
         return self.covariance[:7, own] @ directions.T
+
+    def model_error(self) -> ModelError | None:
+        """What the first camera's model leaves of its distortion; None where its intrinsics are exact."""
+        evidence = self.given.evidence
+        problem, freedom = evidence.problem, evidence.problem.freedom
+        count = polynomials_of(freedom.intrinsics[0])
+        begin = freedom.model_error_columns.start
+        if count == 0 or len(freedom.model_error_std) < count:
+            return None
+        first = self.first_camera_column
+        own = slice(first + begin, first + begin + count)
+        rows = problem.layout.camera == 0
+        return ModelError(
+            likeliest=self.placed.scene.camera_steps[begin : begin + count],
+            covariance=self.covariance[own, own],
+            expressed=expressed(freedom.start[0], freedom.intrinsics[0], problem.observations.x_px[rows]),
+        )
 
     def _intrinsics_of(self, c: int) -> tuple[slice, Float[ndarray, "q e"]]:
         """The columns of a camera's intrinsics, and the directions that they are of."""

@@ -97,6 +97,7 @@ def estimate_of(found: Adjusted, case: Case) -> Estimate:
         intrinsics=found.placed.scene.cameras[0],
         intrinsics_covariance=found.intrinsics_covariance(0),
         intrinsics_cross=found.intrinsics_cross(0),
+        model_error=found.model_error(),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.model_error import second_moment_px2
 from jcr.adjust.points import PointsPlaced
 from jcr.camera import NORMALIZED, by_parameters, by_point, parameters, unproject
 from jcr.distributions import chi2
@@ -59,7 +60,9 @@ def seen_uncertainty(
     is along the ray, in the metres of the reconstruction. The robot's pose errors are not in it.
     """
     by = _derivatives(estimate, intrinsics, x_px, distance_m)
-    return by @ joint_covariance(estimate) @ np.swapaxes(by, -1, -2)
+    by_pixel = _by_pixel(intrinsics, x_px, distance_m)
+    of_model = by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ np.swapaxes(by_pixel, -1, -2)
+    return by @ joint_covariance(estimate) @ np.swapaxes(by, -1, -2) + of_model
 
 
 def seen_in_base(
@@ -96,14 +99,16 @@ def seen(estimate: Estimate, intrinsics: Intrinsics, x_px: Float[ndarray, "2"], 
     # Two directions across the ray, and the ray: rows.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
     joint = joint_covariance(estimate)
-    moved = axes @ by @ joint @ by.T @ axes.T
+    by_pixel = axes @ _by_pixel(intrinsics, x_px, distance_m)
+    of_model = by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ by_pixel.T
+    moved = axes @ by @ joint @ by.T @ axes.T + of_model
     # Of the direction, what moves the camera as a whole is left out; the rotation about the ray stands beside.
     by_direction = axes @ by
     by_direction[:, :3] = 0.0
     by_direction /= distance_m
     by_direction[2] = 0.0
     by_direction[2, 3:6] = axes[2] @ estimate.gripper_from_camera[:3, :3].T
-    rotated = by_direction @ joint @ by_direction.T
+    rotated = by_direction @ joint @ by_direction.T + of_model / distance_m**2
     return Seen(
         distance_mm=1e3 * distance_m,
         within_95_mm=1e3 * within_95(moved),
@@ -207,6 +212,25 @@ def _in_camera(intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances) -> F
     return np.asarray(distance_m)[..., None] * ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
 
+def _model_error_px2(
+    estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels
+) -> Float[ndarray, "*points 2 2"]:
+    x_px = np.asarray(x_px, float)
+    if estimate.model_error is None:
+        return np.zeros((*x_px.shape, 2))
+    return second_moment_px2(estimate.model_error, intrinsics, x_px)
+
+
+def _by_pixel(intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances) -> Float[ndarray, "*points 3 2"]:
+    """By how much the point moves in the camera with its pixel."""
+    ray = unproject(intrinsics, np.asarray(x_px, float))
+    length = np.linalg.norm(ray, axis=-1)[..., None, None]
+    unit = ray / length[..., 0]
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    of_ray = np.linalg.inv(by_point(intrinsics, ray)[..., :2])
+    return np.asarray(distance_m)[..., None, None] * across[..., :2] @ of_ray / length
+
+
 def _derivatives(
     estimate: Estimate, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
 ) -> Float[ndarray, "*points 3 j"]:
@@ -218,12 +242,6 @@ def _derivatives(
     by_x[..., 3:6] = by_x[..., 3:6] @ camera_from_gripper_axes
     if estimate.intrinsics_cross is None:
         return by_x
-    ray = unproject(intrinsics, np.asarray(x_px, float))
-    length = np.linalg.norm(ray, axis=-1)[..., None, None]
-    unit = ray / length[..., 0]
     # The pixel stays: what the parameters add to the projection, the ray takes back.
-    of_ray = np.zeros((*p.shape[:-1], 3, len(estimate.intrinsics_cross.T)))
-    of_ray[..., :2, :] = -np.linalg.solve(by_point(intrinsics, ray)[..., :2], by_parameters(intrinsics, ray))
-    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
-    by_intrinsics = np.asarray(distance_m)[..., None, None] * across @ of_ray / length
-    return np.concatenate([by_x, by_intrinsics], axis=-1)
+    by_parameter = by_parameters(intrinsics, unproject(intrinsics, np.asarray(x_px, float)))
+    return np.concatenate([by_x, -_by_pixel(intrinsics, x_px, distance_m) @ by_parameter], axis=-1)

@@ -267,6 +267,17 @@ class Requirement:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ModelError:
+    """What the intrinsics leave of the distortion: polynomials over the image (adjust/model_error.py), in widths of
+    it."""
+
+    likeliest: Float[ndarray, " e"]
+    covariance: Float[ndarray, "e e"]
+    expressed: Float[ndarray, "q e"]
+    """By how much the parameters (camera.parameters) express each polynomial where the images have points."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Estimate:
     """What was estimated, and how well it is known."""
 
@@ -285,6 +296,8 @@ class Estimate:
     """In the order of camera.parameters; None where they were not refined."""
     intrinsics_cross: Float[ndarray, "7 q"] | None = None
     """Covariance of COVARIANCE_ORDER (rows) with camera.parameters (columns); None where these were not refined."""
+    model_error: ModelError | None = None
+    """None where the intrinsics were not refined."""
 
     @property
     def intrinsics_std(self) -> Float[ndarray, " q"] | None:
