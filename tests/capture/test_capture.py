@@ -171,7 +171,10 @@ def link_out(capture: Path) -> None:
 
 
 FAULTS = {
-    "no capture.json": (lambda c: (c / "capture.json").unlink(), "no capture.json and no poses.csv beside its"),
+    "no capture.json": (
+        lambda c: (c / "capture.json").unlink(),
+        "no capture.json and no poses.csv beside its",
+    ),
     "not JSON": (lambda c: (c / "capture.json").write_text("{'frames': []"), "not JSON at line 1"),
     "not UTF-8": (lambda c: (c / "capture.json").write_bytes(b'{"frames": "\xff"}'), "not UTF-8"),
     "deeply nested": (lambda c: (c / "capture.json").write_text("[" * 100_000), "nested too deeply"),
