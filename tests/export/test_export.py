@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import jcr
 from benchmarks.simulated.surface import solid_labels
+from jcr.calibration.calibration_json import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
@@ -35,6 +36,7 @@ from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
 from jcr.simulate.scenes import make_scene
 from jcr.simulate.truth import read_truth
+from places import ROOT
 
 if TYPE_CHECKING:
     import trimesh
@@ -210,6 +212,53 @@ def test_camera_info_is_what_image_proc_reads():
         x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")
     )
     np.testing.assert_allclose(seen[0, 0], project(lens, x[0]), atol=1e-9)
+
+
+def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path: Path):
+    content = json.loads((done / "calibration.json").read_text())
+    kept = content["with_given_intrinsics"]
+    pairs = {
+        "estimated": (content["gripper_from_camera"], content["intrinsics"]),
+        "given": (kept["gripper_from_camera"], kept["intrinsics"]),
+    }
+    stated = jcr.read_capture(ROOT / "examples" / "tabletop").intrinsics
+    assert stated is not None and kept["intrinsics"]["fx"] == stated.fx
+    for which, (transform_of_pair, lens) in pairs.items():
+        file = export_run(done, "camera_info", tmp_path / f"{which}.yaml", intrinsics=which)
+        written = yaml.safe_load(file.read_text())["camera_matrix"]["data"]
+        assert written[0] == pytest.approx(lens["fx"]) and written[2] == pytest.approx(lens["cx"])
+        file = export_run(done, "covariance", tmp_path / f"{which}.covariance.yaml", intrinsics=which)
+        text = file.read_text()
+        position = yaml.safe_load(text)["pose"]["pose"]["position"]
+        assert [position[axis] for axis in "xyz"] == pytest.approx([row[3] for row in transform_of_pair[:3]])
+        assert f"belongs to these intrinsics (640 x 480 px): fx {lens['fx']:.6g}" in text
+    del content["with_given_intrinsics"]
+    (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
+    with pytest.raises(InputError, match="--intrinsics given"):
+        export_run(done, "camera_info", tmp_path / "none.yaml", intrinsics="given")
+    (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": kept}))
+
+
+def test_a_run_says_how_exactly_a_seen_point_is_placed(done: Path):
+    content = json.loads((done / "calibration.json").read_text())
+    seen, joint = content["uncertainty"]["seen"], content["uncertainty"]["joint"]
+    assert 300 < seen["distance_mm"] < 800
+    assert seen["lateral_95_mm"] < seen["within_95_mm"] < seen["corners"]["within_95_mm"] < 1
+    assert len(joint["order"]) == 16 and joint["order"][:2] == ["x_m", "y_m"] and joint["order"][7] == "fx"
+    assert content["requirement"]["at"] == "seen"
+    assert content["requirement"]["reached_mm"] == seen["within_95_mm"]
+    # The truth of the bundled capture: at the centre and in a corner of its images, at the distance of the scene.
+    truth, found = read_truth(ROOT / "examples" / "tabletop"), read_calibration(done).intrinsics
+    assert found is not None
+    lens = found.record()
+    pairs = (np.array(content["gripper_from_camera"]), lens), (truth.gripper_from_camera, truth.intrinsics)
+    for x_px, below in (([319.5, 239.5], seen), ([2.0, 2.0], seen["corners"])):
+        rays = [unproject(camera, np.array(x_px)) for _, camera in pairs]
+        found_at, true_at = (
+            apply(x, 1e-3 * seen["distance_mm"] * ray / np.linalg.norm(ray))
+            for (x, _), ray in zip(pairs, rays, strict=True)
+        )
+        assert 1e3 * np.linalg.norm(found_at - true_at) < 1.5 * below["within_95_mm"]
 
 
 @pytest.mark.parametrize("name", ["", "/tool0", "tool 0", 'a"b', "<x>", "ü"])
