@@ -18,8 +18,6 @@ from jcr.records import Intrinsics, ModelError
 
 DEGREE = 5
 """Of the polynomials."""
-RADIAL = (3, 4, 5)
-"""Powers of the squared radius, by which rays move outwards beside them: what k1, k2 and k3 leave of wide angles."""
 TYPICAL = 1e-4
 """Of the width, per polynomial: the middle of the prior of their size, a weak one."""
 UPDATES, SETTLED = 100, 1e-3
@@ -94,19 +92,17 @@ def second_moment_px2(
 
 def polynomials_of(prior: IntrinsicsPrior) -> int:
     """How many displacements a camera has whose intrinsics are known like this; 0 where they are exact."""
-    return (DEGREE + 1) * (DEGREE + 2) + len(RADIAL) if len(prior.std) else 0
+    return (DEGREE + 1) * (DEGREE + 2) if len(prior.std) else 0
 
 
 def _polynomials(x_px: Float[ndarray, "k 2"], camera: Intrinsics) -> Float[ndarray, "k 2 e"]:
-    """Of x, of y: products of Legendre polynomials, up to a total degree, over a square about the image; then radial."""
+    """Of x, then of y: products of Legendre polynomials, up to a total degree, over a square about the image."""
     u, v = ((2 * x_px - [camera.width - 1, camera.height - 1]) / max(camera.width, camera.height)).T
     every = legvander2d(u, v, [DEGREE, DEGREE]).reshape(-1, DEGREE + 1, DEGREE + 1)
     i, j = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     kept = every[:, i, j]
     nothing = np.zeros_like(kept)
-    radial = np.stack([(u * u + v * v) ** power for power in RADIAL], axis=1)
-    across, down = u[:, None] * radial, v[:, None] * radial
-    return np.stack([np.hstack([kept, nothing, across]), np.hstack([nothing, kept, down])], axis=1)
+    return np.stack([np.hstack([kept, nothing]), np.hstack([nothing, kept])], axis=1)
 
 
 def _beside(by: Float[ndarray, "k 2 e"], expressed: Float[ndarray, "k 2 q"]) -> Float[ndarray, "k 2 e"]:
