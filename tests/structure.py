@@ -240,7 +240,7 @@ def _batch_state(folder: Path, capture: Capture, in_file: Any) -> None:
     task = Task(capture.folder, folder / "batch", RunOptions(), True, ReadOptions())
     task.out.mkdir()
     row = vars(
-        Row(str(capture.folder), str(task.out), "done", "colmap", 4, 4, 1.0, 0.1, 0.1, 1.0, 0.1, 1.0, "")
+        Row(str(capture.folder), str(task.out), "accepted", "colmap", 4, 4, 1.0, 0.1, 0.1, 1.0, 0.1, 1.0, "")
     )
     as_json(task.out / BATCH, {"made_from": "x", "row": row})
     in_file(f"{BATCH} of a batch", task.out / BATCH, lambda: _finished(task, "x"))

@@ -61,9 +61,7 @@ def test_thirty_thousand_missing_images_are_refused_at_once(tmp_path: Path):
     frames = [{"image": f"images/{k}.png", "base_from_gripper": np.eye(4).tolist()} for k in range(30_000)]
     (tmp_path / "capture.json").write_text(json.dumps({"frames": frames}))
     start = time.process_time()
-    with pytest.raises(
-        InputError, match=r"30000 of 30000 images are not there: images/0.png, .* and 29990 more"
-    ):
+    with pytest.raises(InputError, match="30000 frames; choose 1000 at most"):
         jcr.read_capture(tmp_path)
     assert time.process_time() - start < TOO_LONG_S
 
@@ -75,7 +73,7 @@ def link(folder: Path) -> None:
 
 FRAME = {"image": "0.png", "base_from_gripper": np.eye(4).tolist()}
 MANY = {
-    "the same image": ("capture.json", {"frames": [FRAME] * 30_000}, "0.png more than once"),
+    "the same image": ("capture.json", {"frames": [FRAME] * 30_000}, "30000 frames; choose 1000 at most"),
     "this many images": (
         "capture.json",
         {"frames": [FRAME | {"image": f"l{k}.png"} for k in range(1001)]},

@@ -90,7 +90,7 @@ def test_a_chessboard_before_a_plain_background(real_captures: Path):
     std = np.sqrt(np.diag(hand_eye.covariance))
     off = hand_eye.gripper_from_camera[:3, 3] - [0.0590, -0.0331, -0.0770]
     assert (np.abs(off) < 2 * std[:3]).all()
-    assert std[6] > 0.015, "its motions leave the scale nearly open"
+    assert std[6] > 0.01, "its motions leave the scale nearly open"
 
 
 @needs_aliked
