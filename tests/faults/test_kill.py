@@ -44,6 +44,14 @@ class Run:
         self.process.join(300)
         assert self.process.exitcode in (0, 3)
 
+    def stop(self) -> None:
+        assert self.process.pid is not None
+        os.kill(self.process.pid, signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        assert self.process.pid is not None
+        os.kill(self.process.pid, signal.SIGCONT)
+
     def wait_for_lock(self) -> None:
         while self.process.is_alive() and not (self.out / ".lock").exists():
             time.sleep(0.01)
@@ -118,9 +126,12 @@ def test_a_killed_run_leaves_whole_files_and_resumes_to_the_same_calibration(
     draw = random.Random(0)
     undisturbed = Run(small_capture, tmp_path / "undisturbed")
     undisturbed.wait_for_lock()
-    start = time.monotonic()
+    time.sleep(2.0)  # from the lock's file to the lock
+    undisturbed.stop()  # on a busy machine it could end before the second run has read its capture
     assert dispatch(["run", str(small_capture), str(undisturbed.out), "--quiet"]) == 2
     assert "another jcr is writing there; wait for it" in capsys.readouterr().err
+    start = time.monotonic()
+    undisturbed.go_on()
     undisturbed.finish()
     working_s = time.monotonic() - start
     expected = results(undisturbed.out)

@@ -74,7 +74,9 @@ def expressed(
     """By how much the camera's parameters express each polynomial over these pixels."""
     by_prior = by_parameters(camera, unproject(camera, x_px)) @ prior.directions
     polynomials = camera.width * _polynomials(x_px, camera)
-    fit = np.linalg.lstsq(by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1))[0]
+    fit = np.linalg.lstsq(
+        by_prior.reshape(2 * len(x_px), -1), polynomials.reshape(2 * len(x_px), -1), rcond=None
+    )[0]
     return prior.directions @ fit
 
 
