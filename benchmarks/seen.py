@@ -10,8 +10,8 @@ from numpy import ndarray
 from benchmarks.simulated.bent import BentProblem, bent_problem
 from benchmarks.simulated.observations import LENS, observed
 from jcr.adjust.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
-from jcr.adjust.robots import Adjusted
-from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.adjust.wrist import adjust_wrist
+from jcr.calibration.adjust import estimate_of
 from jcr.calibration.seen import seen_uncertainty, within_95
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.geometry import apply, step_between
@@ -141,11 +141,10 @@ def _row(preset: PresetName, count: int, known: Knowledge, draws: int) -> Row:
     within, three, errors, said, camera = [], [], [], [], []
     for seed in range(draws):
         problem = bent_problem(arm_named(ROBOT_NAMES[seed % len(ROBOT_NAMES)]), preset, count, seed)
-        found = _adjusted(problem, known, np.random.default_rng([seed, 9]))
-        if found is None:
+        estimate = _adjusted(problem, known, np.random.default_rng([seed, 9]))
+        if estimate is None:
             continue
-        estimate, scale = found
-        off, covariance = _placed(problem, known.camera, estimate, scale)
+        off, covariance = _placed(problem, known.camera, estimate)
         length = np.linalg.norm(off, axis=1)
         below = np.array([within_95(one) for one in covariance])
         within.append(length < below)
@@ -168,9 +167,7 @@ def _row(preset: PresetName, count: int, known: Knowledge, draws: int) -> Row:
     )
 
 
-def _adjusted(
-    problem: BentProblem, known: Knowledge, rng: np.random.Generator
-) -> tuple[Estimate, float] | None:
+def _adjusted(problem: BentProblem, known: Knowledge, rng: np.random.Generator) -> Estimate | None:
     tracks = observed(problem, rng, POINTS, PIXEL_STD, known.camera)
     if len(tracks.image) < 100 * len(problem.base_from_gripper):
         return None
@@ -184,25 +181,11 @@ def _adjusted(
         tracks,
         prior=known.prior(start),
     )
-    scale, base_from_recon = recon_frame(found, tracks)
-    return _estimate(found, scale, base_from_recon), scale
-
-
-def _estimate(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "4 4"]) -> Estimate:
-    return Estimate(
-        gripper_from_camera=found.placed.x[0],
-        scale=scale,
-        base_from_recon=base_from_recon,
-        covariance=found.covariance[:7, :7],
-        intrinsics=found.placed.scene.cameras[0],
-        intrinsics_covariance=found.intrinsics_covariance(0),
-        intrinsics_cross=found.intrinsics_cross(0),
-        model_error=found.model_error(),
-    )
+    return estimate_of(found, tracks)
 
 
 def _placed(
-    problem: BentProblem, camera: Intrinsics, estimate: Estimate, scale: float
+    problem: BentProblem, camera: Intrinsics, estimate: Estimate
 ) -> tuple[Float[ndarray, "k 3"], Float[ndarray, "k 3 3"]]:
     """Errors of seen points in axes of the estimated camera, and the covariance that is said of each."""
     u, v = np.meshgrid(np.array([0.1, 0.5, 0.9]) * camera.width, np.array([0.1, 0.5, 0.9]) * camera.height)
@@ -211,7 +194,7 @@ def _placed(
     placed, true = (
         apply(x, distance * (ray := unproject(own, x_px)) / np.linalg.norm(ray, axis=1, keepdims=True))
         for x, own, distance in (
-            (estimate.gripper_from_camera, estimate.intrinsics, DISTANCE_M * scale / problem.scale),
+            (estimate.gripper_from_camera, estimate.intrinsics, DISTANCE_M * estimate.scale / problem.scale),
             (problem.gripper_from_camera, camera, DISTANCE_M),
         )
     )

@@ -15,6 +15,7 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
+from jcr.errors import InputError
 from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
 from jcr.records import (
@@ -165,9 +166,16 @@ class RunResult:
         distance_m: Float[ndarray, "*points"] | float,
         base_from_gripper: Float[ndarray, "4 4"],
     ) -> "SeenInBase":
-        """The same in the base frame for a reported gripper pose, with the errors of that pose beside it."""
+        """The same in the base frame for a reported gripper pose, with the errors of that pose beside it.
+
+        Raises InputError for a camera that is fixed, which no gripper pose moves.
+        """
         from jcr.calibration.seen import seen_in_base
 
+        if self.capture.mount == "base":
+            raise InputError(
+                f"{self.out}: its camera is fixed and no gripper pose places its points; use seen_uncertainty"
+            )
         x_px = np.asarray(x_px, float)
         return seen_in_base(self.hand_eye, self.lens, x_px, distance_m, np.asarray(base_from_gripper, float))
 

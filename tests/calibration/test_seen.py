@@ -13,6 +13,7 @@ from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
 from jcr.adjust.points import points_in_base
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.wrist import adjust_wrist
+from jcr.calibration.adjust import estimate_of
 from jcr.calibration.seen import (
     Scene,
     in_use,
@@ -26,14 +27,14 @@ from jcr.calibration.seen import (
 from jcr.camera import parameters, unproject, with_parameters
 from jcr.geometry import apply, inverse, retract
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import Estimate, HandEye, Intrinsics
+from jcr.records import Estimate, HandEye, Intrinsics, Tracks
 
 X_PX = np.array([[319.5, 239.5], [40.0, 30.0], [600.0, 450.0]])
 DISTANCE_M = 0.45
 
 
-def adjusted(problem: HandEyeProblem, camera: Intrinsics = LENS, seed: int = 0) -> tuple[Adjusted, HandEye]:
-    tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3, camera)
+def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Adjusted, Tracks, HandEye]:
+    tracks = observed(problem, np.random.default_rng([seed, 1]), 300, 0.3)
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     found = adjust_wrist(
         problem.base_from_gripper,
@@ -43,23 +44,15 @@ def adjusted(problem: HandEyeProblem, camera: Intrinsics = LENS, seed: int = 0) 
         tracks,
         prior=prior_of(LENS, ESTIMATED),
     )
-    return found, start
+    return found, tracks, start
 
 
 @cache
 def estimated(seed: int = 0) -> tuple[Estimate, HandEye]:
     rng = np.random.default_rng(seed)
     problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
-    found, start = adjusted(problem, seed=seed)
-    return Estimate(
-        gripper_from_camera=found.placed.x[0],
-        scale=1.0,
-        base_from_recon=np.eye(4),
-        covariance=found.covariance[:7, :7],
-        intrinsics=found.placed.scene.cameras[0],
-        intrinsics_covariance=found.intrinsics_covariance(0),
-        intrinsics_cross=found.intrinsics_cross(0),
-    ), start
+    found, tracks, start = adjusted(problem, seed)
+    return estimate_of(found, tracks), start
 
 
 def placed(x: np.ndarray, camera: Intrinsics, log_scale: float = 0.0) -> np.ndarray:
@@ -145,7 +138,7 @@ def test_points_of_the_scene_are_where_they_are_said_to_be():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 10, robot_noise=(5e-4, np.radians(0.05)))
-        found, _ = adjusted(problem, seed=seed)
+        found, _, _ = adjusted(problem, seed)
         points = points_in_base(found)
         # The tracks are of points that the problem drew first, in the base.
         true = np.random.default_rng([seed, 1]).uniform([0.25, -0.25, 0.0], [0.75, 0.25, 0.12], (300, 3))

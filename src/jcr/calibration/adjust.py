@@ -29,6 +29,7 @@ from jcr.records import (
     PaperResiduals,
     RobotExamined,
     RobotNoise,
+    Tracks,
 )
 
 
@@ -85,9 +86,9 @@ def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
     return focal_lengths(case.reconstruction.intrinsics, len(case.used))
 
 
-def estimate_of(found: Adjusted, case: Case) -> Estimate:
-    """What an adjustment of a case came to, in the case's reconstruction."""
-    scale, base_from_recon = recon_frame(found, case.tracks)
+def estimate_of(found: Adjusted, tracks: Tracks) -> Estimate:
+    """What an adjustment came to, in the reconstruction whose tracks were adjusted."""
+    scale, base_from_recon = recon_frame(found, tracks)
     return Estimate(
         gripper_from_camera=found.placed.x[0],
         scale=scale,
@@ -135,7 +136,7 @@ def _is_nearer(one: HeldOut | None, other: HeldOut | None) -> bool:
 def refined_by(case: Case, found: Adjusted) -> HandEye:
     """The calibration of a case as an adjustment has it; not judged yet."""
     before, used = case.hand_eye.before or case.hand_eye, case.used
-    estimate = estimate_of(found, case)
+    estimate = estimate_of(found, case.tracks)
     x = estimate.gripper_from_camera
     gripper, camera = case.base_from_gripper, case.recon_from_camera
     # Rejected poses are measured against where their cameras show them.

@@ -274,7 +274,10 @@ def calibration_file(
         depth_check=hand_eye.scale_evidence.depth,
         requirement=hand_eye.requirement,
         attempts=list(attempts),
-        with_given_intrinsics=GivenIntrinsicsKept.of(hand_eye.with_given_intrinsics),
+        # Of a fixed camera the transform is another one, and it has no name for this.
+        with_given_intrinsics=None
+        if mount == "base"
+        else GivenIntrinsicsKept.of(hand_eye.with_given_intrinsics),
     )
 
 

@@ -101,7 +101,7 @@ def seen(estimate: Estimate, intrinsics: Intrinsics, x_px: Float[ndarray, "2"], 
     joint = joint_covariance(estimate)
     by_pixel = axes @ _by_pixel(intrinsics, x_px, distance_m)
     of_model = by_pixel @ _model_error_px2(estimate, intrinsics, x_px) @ by_pixel.T
-    moved = axes @ by @ joint @ by.T @ axes.T + of_model
+    moved = axes @ seen_uncertainty(estimate, intrinsics, x_px, distance_m) @ axes.T
     # Of the direction, what moves the camera as a whole is left out; the rotation about the ray stands beside.
     by_direction = axes @ by
     by_direction[:, :3] = 0.0

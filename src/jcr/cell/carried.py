@@ -95,7 +95,7 @@ def refined(
     return judged(
         replace(
             found,
-            estimate=estimate_of(answer, case).with_fault(faults),
+            estimate=estimate_of(answer, case.tracks).with_fault(faults),
             robot=replace(found.robot, noise=robot_noise_of(answer)),
             plan=replace(found.plan, next_poses=()),
         )

@@ -134,7 +134,7 @@ class _State:
 
     def shift_from(self, before: "_State") -> Float[ndarray, "7"]:
         """How far the calibration is from what it was, in records.COVARIANCE_ORDER."""
-        then, now = (estimate_of(one.adjusted, one.case) for one in (before, self))
+        then, now = (estimate_of(one.adjusted, one.case.tracks) for one in (before, self))
         step = step_between(then.gripper_from_camera, now.gripper_from_camera)
         return np.r_[step, np.log(now.scale / then.scale)]
 

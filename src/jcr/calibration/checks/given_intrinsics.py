@@ -53,7 +53,7 @@ def intrinsics_contradiction(case: Case) -> Checked:
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
         return Checked((contradicted,), refined, freed)
     with_found, as_given = (
-        estimate_of(one, case) for one in (freed, adjust_case(case, prior=prior_of(held, HELD)))
+        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(held, HELD)))
     )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shift = max(
