@@ -72,6 +72,14 @@ def test_covariance_is_that_of_the_errors():
     assert adjusted(0, "size")[0].noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
 
 
+def test_what_no_camera_focuses_on_counts_nothing():
+    found, _ = adjusted(0, "size")
+    depth = found.view.depth.copy()
+    depth[:3] = np.median(depth) * np.array([-1.0, 1e-6, 0.01])
+    weight = found.noise.weights(found.view.residual_px, depth, found.problem.layout)
+    assert (weight[:3] == 0).all() and (weight[3:] > 0).all()
+
+
 def test_stated_sizes_follow_their_observations():
     tracks = Tracks(
         np.array([0, 1, 1]),

@@ -29,6 +29,9 @@ FAR_OFF = 6.0
 COMMON = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 """Shares of the variance of the median observation that are tried as what all observations have in common."""
 SCALE_STEPS = 10
+NEAREST = 0.05
+"""Of the median depth: no camera focuses on what is nearer, and a mismatch that two images place in front of both
+fixes them where it lies, the surer the nearer it comes."""
 LEAST_LEFT = 0.1
 """Of an observation's variance after its point took its part: below, the residual shows nothing of it."""
 
@@ -56,11 +59,13 @@ class PixelNoise:
     def weights(
         self, residual_px: Float[ndarray, "k 2"], depth: Float[ndarray, " k"], layout: "Layout"
     ) -> Float[ndarray, " k"]:
-        """Inverse variances of observations under the Cauchy loss; those of points behind a camera are 0."""
+        """Inverse variances of observations under the Cauchy loss; those of points behind a camera, or so near that no
+        camera shows them, are 0."""
         variance = self.variance_px2(layout)
         squared = (residual_px**2).sum(1) / variance
         weight = loss_weight("cauchy", squared / LOSS_SCALE**2) / (variance * self.inflation)
-        return (depth > 1e-9) * weight
+        nearest = NEAREST * max(float(np.median(depth)), 0.0) if len(depth) else 0.0
+        return (depth > max(nearest, 1e-9)) * weight
 
 
 @dataclass(frozen=True)
