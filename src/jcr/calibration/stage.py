@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.fit import fitted
@@ -38,8 +39,12 @@ def calibrate(
                 # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
                 if case.hand_eye.converged:
                     raise
-    scene = case.scene_in_base
-    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std, scene)
+    scene, of_images = case.scene_in_base, None
+    if scene is not None and case.adjusted is not None:
+        of_images = ForeseenCamera.of(case.adjusted)
+    hand_eye = advised(
+        case.hand_eye, case.base_from_gripper, options, robot, reconstruction.metric_std, scene, of_images
+    )
     if capture.intrinsics is None or scene is None:
         return hand_eye
     pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)

@@ -1,23 +1,16 @@
-"""Which gripper poses to add: those that shrink the reported standard deviations most, before any image.
+"""Which gripper poses to add: those that tell most of a seen point, the rotation and the scale, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
-the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design).
+the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). Random errors of
+the gripper poses alone choose; what a calibration with the poses comes to is for calibration/expected.py to say.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_angle, rotation_exp, transform
-from jcr.handeye.equation import (
-    ASSUMED_NOISE,
-    Poses,
-    expected_std,
-    most_informative,
-    point_ahead,
-    pose_information,
-)
-from jcr.records import NextPose
+from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_exp, transform
+from jcr.handeye.equation import ASSUMED_NOISE, Poses, most_informative, point_ahead, pose_information
 
 CANDIDATES = 600
 
@@ -30,8 +23,8 @@ def next_poses(
     reach: Float[ndarray, "2 3"] | None = None,
     seed: int = 0,
     distance_m: float | None = None,
-) -> tuple[Float[ndarray, "7"], list[NextPose]]:
-    """Standard deviations expected now, and `count` poses to add, best first.
+) -> Float[ndarray, "c 4 4"]:
+    """`count` gripper poses to add, best first.
 
     `reach` is the box (m, base) that gripper positions stay in; by default that of the capture and a quarter
     more. Without a hand-eye transform the camera is taken to sit at the gripper and look along its z axis. They are best
@@ -42,10 +35,13 @@ def next_poses(
     known = pose_information(base_from_gripper, x, noise).sum(0)
     if distance_m is None:
         distance_m = float(np.median(looked_at(base_from_gripper @ x)[1]))
-    point = point_ahead(x, distance_m)
-    rows, stds = most_informative(known, pose_information(candidates, x, noise), count, point)
-    described = zip(candidates[rows], stds, strict=True)
-    return expected_std(known), [_described(pose, std, base_from_gripper) for pose, std in described]
+    information = pose_information(candidates, x, noise)
+    return candidates[most_informative(known, information, count, point_ahead(x, distance_m))]
+
+
+def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
+    """The existing pose that each pose is nearest to."""
+    return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
 def _candidates(
@@ -102,10 +98,3 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
     turn = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
     return rotation_exp(cross / np.maximum(sine, 1e-12) * turn) @ rotation
-
-
-def _described(pose: Float[ndarray, "4 4"], std: Float[ndarray, "7"], existing: Poses) -> NextPose:
-    motion = inverse(existing) @ pose
-    like = int(np.argmin(motion_length(motion)))
-    moved, turned = np.linalg.norm(motion[like, :3, 3]), rotation_angle(motion[like, :3, :3])
-    return NextPose(pose, std, like, float(moved), float(turned))
