@@ -106,6 +106,18 @@ BENCHES = {
         measures=(*SOLVER, "benchmarks/simulated"),
         long="40 draws of every row instead of 10",
     ),
+    "expected": Bench(
+        "what jcr check and the live page expect, against what the calibration reports: captures in DIR, and simulated",
+        of_captures=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/check.py",
+            "benchmarks/simulated",
+            "benchmarks/seen.py",
+        ),
+    ),
     "matching": Bench(
         "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
         of_captures=True,

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
@@ -18,9 +17,10 @@ from jcr.calibration.expected import (
     Ahead,
     Assumptions,
     Expectation,
-    scene_distance,
+    assumed,
+    assumed_of,
+    assumed_of_poses,
     typical_camera,
-    typical_noise,
 )
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
@@ -148,7 +148,12 @@ def check(
     counted = held.registered
     if counted is None:
         counted = np.arange(len(gripper)) if looks is None else np.flatnonzero(looks.are_clear)
-    assumptions = held.assumptions or _typical(capture, gripper[counted], robot_noise)
+    assumptions = held.assumptions
+    if assumptions is None:
+        camera = None
+        if isinstance(capture, Capture):
+            camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
+        assumptions = assumed(gripper[counted], camera, robot_noise)
     seen = held.observability
     if seen is None:
         x = None if held.assumptions is None else assumptions.gripper_from_camera
@@ -194,21 +199,6 @@ class _Held:
         return self.hand_eye.observability
 
 
-def _typical(
-    capture: Capture | PosePairs, gripper: Float[ndarray, "c 4 4"], noise: tuple[float, float] | None
-) -> Assumptions:
-    """What is assumed where nothing has been found: a camera at the gripper that looks along its z axis."""
-    camera = None
-    if isinstance(capture, Capture):
-        camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-    return Assumptions(
-        gripper_from_camera=np.eye(4),
-        distance_m=scene_distance(gripper),
-        noise=typical_noise(noise),
-        camera=camera,
-    )
-
-
 def _looked_at(
     capture: Capture,
     robot: RobotErrors,
@@ -219,12 +209,17 @@ def _looked_at(
 ) -> _Held:
     """The gripper poses held against few small images, and where that is not enough, against all."""
     if not thorough and len(capture) > QUICK:
-        rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
+        rows = spread_rows(len(capture))
         few = _of_rows(capture, rows)
         held = _registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
         if not held.faults and held.registered is not None and len(held.registered) == QUICK:
             return replace(held, registered=None)
     return _registered(capture, robot, robot_noise, seed, progress)
+
+
+def spread_rows(count: int) -> Int[ndarray, " k"]:
+    """Of so many images those that are looked at first."""
+    return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)
 
 
 def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
@@ -255,7 +250,7 @@ def _registered(
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Held(faults=(str(error),), remarks=() if board is None else (sentence(board),))
     rows = found.image_index
-    case = _calibrated(capture, found, robot.of(rows), robot_noise)
+    case = calibrated(capture, found, robot.of(rows), robot_noise)
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
     held = _held_against(
         capture.base_from_gripper[rows],
@@ -275,11 +270,11 @@ def _registered(
         faults=(*held.faults, *named["rejects"]),
         remarks=(*held.remarks, *named["warns"], *found.warnings, *found.notes),
         registered=rows[case.hand_eye.inliers],
-        assumptions=_assumptions_of(case) if case.hand_eye.converged else None,
+        assumptions=assumed_of(case) if case.hand_eye.converged else None,
     )
 
 
-def _calibrated(
+def calibrated(
     capture: Capture, found: Reconstruction, robot: RobotErrors, noise: tuple[float, float] | None
 ) -> Case:
     """The first steps of a calibration: the fit, and where that is accepted the adjustment of images and robot."""
@@ -288,30 +283,14 @@ def _calibrated(
     return adjusted(case) if case.hand_eye.converged else case
 
 
-def _assumptions_of(case: Case) -> Assumptions:
-    """That the other images and poses are as those of a calibration."""
-    x, distance = case.hand_eye.gripper_from_camera, case.scene_distance_m
-    images = None if case.adjusted is None or distance is None else ForeseenCamera.of(case.adjusted)
-    return Assumptions(
-        gripper_from_camera=x,
-        distance_m=scene_distance(case.base_from_gripper @ x) if distance is None else distance,
-        noise=case.hand_eye.robot_noise,
-        camera=images,
-    )
-
-
 def _pairs_held(pairs: PosePairs, noise: tuple[float, float] | None) -> _Held:
     """Gripper poses held against camera poses that somebody else found."""
     gripper, camera = pairs.base_from_gripper, pairs.recon_from_camera
     hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise)
-    x, assumptions = hand_eye.gripper_from_camera, None
+    assumptions = None
     if hand_eye.converged:
-        assumptions = Assumptions(
-            gripper_from_camera=x,
-            distance_m=scene_distance(gripper @ x),
-            noise=hand_eye.robot_noise,
-            scale_std=SCALE_STD if pairs.is_metric and is_one(hand_eye) else None,
-        )
+        scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
+        assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], scale_std)
     held = _held_against(gripper, pairs, hand_eye)
     return replace(held, registered=np.flatnonzero(hand_eye.inliers), assumptions=assumptions)
 

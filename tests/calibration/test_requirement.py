@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated.problem import HandEyeProblem, disturbed, hand_eye_problem
 from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, write_calibration
+from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.requirement import GRASPING, advised
@@ -120,7 +121,9 @@ def test_a_scale_that_was_known_is_not_promised_again():
     cameras[:, :3, 3] *= problem.scale
     given = PosePairs(Path("a.yaml"), tuple("abcdefgh"), problem.base_from_gripper, cameras, True)
     known = calibrate_poses(given)
-    free = advised(known, given.base_from_gripper, CalibrateOptions(), errors_of(given.base_from_gripper))
+    gripper = given.base_from_gripper
+    assumptions = assumed_of_poses(known, gripper)
+    free = advised(known, gripper, CalibrateOptions(), errors_of(gripper), assumptions)
     first, other = (found.next_poses[0].expected_std for found in (known, free))
     assert other[6] < 0.9 * first[6] and first[6] > 0.95 * np.sqrt(known.covariance[6, 6])
 

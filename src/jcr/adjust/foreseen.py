@@ -31,6 +31,9 @@ TYPICAL_OBSERVATIONS, TYPICAL_SIGMA_PX, TYPICAL_INFLATION, TYPICAL_MODEL_ERROR =
 """Of images that nobody has matched yet: the geometric mean over eleven real captures (jcr docs results/expected)."""
 LEAST_MODEL_ERROR = 1e-9
 """Widths of the image; an exact model's."""
+ROUNDING = 1e-9
+"""Of the information on each unknown: what an image that shares hardly a point with others says of its place is lost in
+the rounding of the points' elimination."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Rotation of the line of sight, and ratio of distances, up to which a matcher finds a feature again."""
 
@@ -85,7 +88,9 @@ def foreseen(arm: ArmPoses, camera: ForeseenCamera, noise: RobotNoise, distance_
     # As much information as the images' own observations have is shared by these.
     share = len(problem.observations.point) / len(arm.rigs) / camera.observations
     pixels = PixelNoise(np.array([camera.sigma_px]), camera.inflation * share)
-    given = Given(evidence=evidence(scene, problem, pixels), arms=(arm,), noise=noise.given)
+    images = evidence(scene, problem, pixels)
+    images.information[np.diag_indices(len(images.information))] *= 1 + ROUNDING
+    given = Given(evidence=images, arms=(arm,), noise=noise.given)
     placed = Placed(x=x[None], scale=1.0, z=z[None], scene=scene)
     equations, region = equations_of(placed, given)
     found = expected_posterior(equations, noise, region)

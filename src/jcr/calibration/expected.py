@@ -16,15 +16,16 @@ from jcr.adjust.foreseen import ForeseenCamera, foreseen
 from jcr.adjust.intrinsics_prior import prior_about
 from jcr.adjust.robots import ArmPoses
 from jcr.calibration.adjust import estimate_in
+from jcr.calibration.case import Case
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.components import GIVEN_SHARE, TYPICAL
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import Cues, expected_fit
-from jcr.handeye.next_poses import looked_at, nearest, next_poses
+from jcr.handeye.next_poses import assumed_camera, looked_at, nearest, next_poses
 from jcr.least_squares import one_blas_thread
-from jcr.records import Estimate, Intrinsics, NextPose, RobotNoise, Seen, Where
+from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where
 
 FEWEST = 3
 """Poses, from which on something is expected."""
@@ -120,6 +121,41 @@ class Ahead:
             moved_m=float(np.linalg.norm(motion[:3, 3])),
             turned_rad=float(rotation_angle(motion[:3, :3])),
         )
+
+
+def assumed_of(case: Case) -> Assumptions:
+    """That further images and gripper poses are as those of an accepted calibration."""
+    assumptions = assumed_of_poses(
+        case.hand_eye, case.base_from_gripper[case.used], case.reconstruction.metric_std
+    )
+    if case.adjusted is None or (distance := case.scene_distance_m) is None:
+        return assumptions
+    return replace(assumptions, distance_m=distance, camera=ForeseenCamera.of(case.adjusted))
+
+
+def assumed_of_poses(
+    hand_eye: HandEye, used: Float[ndarray, "n 4 4"], scale_std: float | None = None
+) -> Assumptions:
+    """The same of a calibration from camera poses that were given; `used` are the gripper poses that it rests on."""
+    return Assumptions(
+        gripper_from_camera=hand_eye.gripper_from_camera,
+        distance_m=scene_distance(used @ hand_eye.gripper_from_camera),
+        noise=hand_eye.robot_noise,
+        scale_std=scale_std,
+    )
+
+
+def assumed(
+    base_from_gripper: Poses, camera: ForeseenCamera | None, noise: tuple[float, float] | None = None
+) -> Assumptions:
+    """Before anything is found: a usual robot, `noise` (m, rad) being a lower bound, and the camera at its gripper."""
+    x = assumed_camera(base_from_gripper)
+    return Assumptions(
+        gripper_from_camera=x,
+        distance_m=scene_distance(base_from_gripper @ x),
+        noise=typical_noise(noise),
+        camera=camera,
+    )
 
 
 def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from jcr.calibration.cues import height_cue
+from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, errors_of
@@ -27,7 +28,9 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     robot = errors_of(pairs.base_from_gripper, None if options.robot is None else arm_named(options.robot))
     hand_eye = _calibrated_poses(pairs, options, robot)
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
-    return advised(hand_eye, pairs.base_from_gripper, options, robot, SCALE_STD if is_known else None)
+    gripper = pairs.base_from_gripper
+    assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
+    return advised(hand_eye, gripper, options, robot, assumptions)
 
 
 def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrors) -> HandEye:

@@ -7,17 +7,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.expected import (
     Ahead,
     Assumptions,
-    scene_distance,
     typical_noise,
     worse_of,
 )
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
+from jcr.handeye.next_poses import assumed_camera
 from jcr.handeye.observability import excitation
 from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
@@ -35,36 +34,25 @@ def advised(
     gripper: Float[ndarray, "m 4 4"],
     options: CalibrateOptions,
     robot: RobotErrors,
-    scale_std: float | None = None,
+    assumptions: Assumptions,
     scene: Scene | None = None,
-    camera: ForeseenCamera | None = None,
 ) -> HandEye:
     """With what the motions show of each direction, how exact it is in use, the requirement, and the poses to add.
 
-    `gripper` are the poses that the solver was given, in its order, `robot` is of these; `scale_std` is how well the
-    scale was known beforehand (relative); `scene` is what the camera sees, and `camera` the camera, where images were
-    adjusted.
+    `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
+    calibration, `scene` is what the camera sees, where images were adjusted.
     """
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
-    if scene is None:
-        scene = Scene(scene_distance(used @ hand_eye.gripper_from_camera))
-    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene))
+    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
     required = _required(hand_eye, options)
-    assumptions = Assumptions(
-        gripper_from_camera=hand_eye.gripper_from_camera,
-        distance_m=scene.distance_m,
-        noise=hand_eye.robot_noise,
-        camera=camera,
-        scale_std=scale_std,
-        faults=_by_intrinsics(hand_eye),
-    )
+    assumptions = replace(assumptions, faults=_by_intrinsics(hand_eye))
     if hand_eye.converged:
         reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
     else:
         # An X that is not trusted is not used, nor a robot that is worse than usual promised away.
         noise = worse_of(hand_eye.robot_noise, typical_noise())
-        assumptions = replace(assumptions, gripper_from_camera=np.eye(4), noise=noise, camera=None)
+        assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
         ahead = Ahead.of(assumptions, used, robot, PROPOSED)
         proposed = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, PROPOSED + 1)]
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None

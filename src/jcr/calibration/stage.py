@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
+from jcr.calibration.expected import assumed_of
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
@@ -39,12 +39,8 @@ def calibrate(
                 # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
                 if case.hand_eye.converged:
                     raise
-    scene, of_images = case.scene_in_base, None
-    if scene is not None and case.adjusted is not None:
-        of_images = ForeseenCamera.of(case.adjusted)
-    hand_eye = advised(
-        case.hand_eye, case.base_from_gripper, options, robot, reconstruction.metric_std, scene, of_images
-    )
+    scene = case.scene_in_base
+    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, robot, assumed_of(case), scene)
     if capture.intrinsics is None or scene is None:
         return hand_eye
     pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)

@@ -291,7 +291,8 @@ def posterior(
     off = steps - step
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
     covariance *= _widening(weight, off[:, :POSES], each[:, :POSES, :POSES], covariance[:POSES, :POSES])
-    return Posterior(step, covariance, _budget(equations, log_sizes, region, covariance), log_sizes)
+    elsewhere = _elsewhere(equations, solve(equations, log_sizes), log_sizes, region)
+    return Posterior(step, covariance, _budget(equations, log_sizes, elsewhere, covariance), log_sizes)
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
@@ -308,15 +309,21 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
         fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
+    def of_region(sizes: LogSizes) -> Float[ndarray, "*k p p"]:
+        # What residuals will show of the systematic part is, on average, as large as it is before.
+        if region is None or equations.systematic is None:
+            return np.zeros((*sizes.shape[:-1], *equations.prior_information.shape))
+        return region.spread(
+            equations.variances(sizes)[..., 2, None, None, None] * _own(equations.systematic)
+        )
+
     found = over_sizes(equations, mode, _score(equations, mode)[2], density)
     weight = np.concatenate([share for share, _, _ in found])
-    each = np.concatenate(
-        [solution.covariance + _elsewhere(equations, solution, sizes, region) for _, sizes, solution in found]
-    )
+    each = np.concatenate([solution.covariance + of_region(sizes) for _, sizes, solution in found])
     covariance = np.einsum("k,kij->ij", weight, each)
-    off = np.zeros((len(weight), POSES))
+    off = np.zeros((len(weight), len(covariance[:POSES])))
     covariance *= _widening(weight, off, each[:, :POSES, :POSES], covariance[:POSES, :POSES])
-    budget = _budget(equations, mode, region, covariance)
+    budget = _budget(equations, mode, of_region(mode), covariance)
     return Posterior(np.zeros(len(covariance)), covariance, budget, mode)
 
 
@@ -438,15 +445,19 @@ def _elsewhere(
     expected = part @ over(solution.root, left)
     shown = lower(solution.root, part)
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ part)
-    m = len(equations.residual) // 6
-    blocks = np.arange(m)
-    own = part.reshape(*part.shape[:-2], m, 6, m, 6)[..., blocks, :, blocks, :]
-    own = np.moveaxis(own, 0, -3)
+    m, own = len(equations.residual) // 6, _own(part)
     for sign, root in ((-1, shown), (1, fitted)):
         columns = np.moveaxis(root.reshape(*root.shape[:-1], m, 6), -2, -3)
         own = own + sign * np.swapaxes(columns, -1, -2) @ columns
     expected = expected.reshape(*expected.shape[:-2], m, 6)
     return region.spread(own + expected[..., :, None] * expected[..., None, :])
+
+
+def _own(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
+    """The block of each pose by itself."""
+    m = covariance.shape[-1] // 6
+    each = np.arange(m)
+    return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
 
 
 def _widening(
@@ -495,7 +506,10 @@ def _between(one: Float[ndarray, "p p"], other: Float[ndarray, "p p"]) -> Float[
 
 
 def _budget(
-    equations: Equations, log_sizes: LogSizes, region: Region | None, covariance: Float[ndarray, "p p"]
+    equations: Equations,
+    log_sizes: LogSizes,
+    elsewhere: Float[ndarray, "p p"],
+    covariance: Float[ndarray, "p p"],
 ) -> Budget:
     """The covariance of X and scale by its causes, which share what the averaging over sizes added.
 
@@ -519,7 +533,7 @@ def _budget(
         images = images + gain @ exact.known @ gain.T
     free = solve(equations, log_sizes)
     intrinsics = free.covariance[:POSES, :POSES] - solution.covariance
-    systematic = systematic + _elsewhere(equations, free, log_sizes, region)[:POSES, :POSES]
+    systematic = systematic + elsewhere[:POSES, :POSES]
     parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)

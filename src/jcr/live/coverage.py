@@ -6,15 +6,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
-    Assumptions,
     Expectation,
+    assumed,
     expected,
-    scene_distance,
     typical_camera,
-    typical_noise,
 )
 from jcr.calibration.robot_errors import RobotErrors, errors_of, of_poses
 from jcr.capture.lens_json import read_lens
@@ -63,7 +62,7 @@ def coverage(
     if len(live.poses) < 2:
         return Coverage(len(live.poses), (), (), None, None, None, words)
     poses, joints = np.stack(live.poses), live.all_joints()
-    assumptions, robot = _assumptions(live, poses), _errors(poses, words, joints)
+    assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
     row, next_joints = _reachable(proposed.added, Path(poses, joints), words)
     chosen = replace(proposed, added=proposed.added[row : row + 1])
@@ -82,15 +81,9 @@ def coverage(
     )
 
 
-def _assumptions(live: LiveFolder, poses: Float[ndarray, "n 4 4"]) -> Assumptions:
-    """Of a camera at the gripper that looks along its z axis, before any image is matched."""
+def _camera(live: LiveFolder) -> ForeseenCamera:
     assert live.size is not None
-    return Assumptions(
-        gripper_from_camera=np.eye(4),
-        distance_m=scene_distance(poses),
-        noise=typical_noise(),
-        camera=typical_camera(read_lens(live.lens, live.size, live.folder), live.size),
-    )
+    return typical_camera(read_lens(live.lens, live.size, live.folder), live.size)
 
 
 def _errors(
