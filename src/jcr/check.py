@@ -218,7 +218,7 @@ def _looked_at(
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
-    """Of so many images those that are looked at first."""
+    """Of `count` images the rows of those that are looked at first."""
     return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)
 
 

@@ -179,7 +179,7 @@ def worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:
 def typical_camera(
     intrinsics: Intrinsics | None, size: tuple[int, int], std: Float[ndarray, " q"] | None = None
 ) -> ForeseenCamera:
-    """A camera of which no image is matched; `size` is width and height (px), `std` as prior_about takes it."""
+    """A camera whose images are not matched yet; `size` is width and height (px), `std` as prior_about takes it."""
     width, height = size
     focal, centre = USUAL_FOCAL * width, ((width - 1) / 2, (height - 1) / 2)
     camera = intrinsics or Intrinsics(focal, focal, *centre, width, height)

@@ -128,7 +128,7 @@ def _as_read(capture: "Capture | PosePairs") -> str:
 
 
 def _expected(expected: "Expectation", images: int, is_measured: bool) -> list[str]:
-    """What the calibration of so many images would report, in the words of that report."""
+    """What the calibration of this many images would report, in the words of that report."""
     from jcr.rounding import significant
 
     seen, std = expected.seen, expected.std

@@ -109,7 +109,7 @@ class Equations:
         return variances
 
     def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, " c"]:
-        """The sizes that a robot's noise is made of; of what is counted anyway they are a hundredth at least."""
+        """The sizes that this noise is made of; of what is counted anyway they are a hundredth at least."""
         sizes = np.array([noise.translation, noise.rotation, noise.systematic])[: self.count]
         beside = np.sqrt(np.maximum(sizes[:2] ** 2 - self.least**2, (LEAST_BESIDE * self.least) ** 2))
         return np.log(np.r_[beside, np.maximum(sizes[2:], LEAST_BESIDE * self.least[1])])
