@@ -69,9 +69,9 @@ def page(real: Sequence[Row], made: Sequence[Row]) -> str:
     lines = [
         *(_claim(name, rows) for name, rows in (("real captures", real), ("simulated ones", made)) if rows),
         "",
-        "Expected by `jcr check` over what the calibration reports, 95 % of errors each: a point seen at the centre "
-        "of the image and the distance of the scene, the camera on the gripper, its rotation. Live: the same of the live "
-        "page, which knows neither robot nor images and takes both for usual. A simulated capture has observations "
+        "Expected by `jcr check` over what the calibration reports, 95 % of errors: a point seen at the centre "
+        "of the image and the distance of the scene, the camera on the gripper, its rotation. Live: the same of the "
+        "live page, which knows neither robot nor images and takes both for usual. A simulated capture has observations "
         f"instead of images; of more than {QUICK} images, {QUICK} are looked at.",
         "",
         "| capture | | images | seen point: expected mm | reported | ratio | camera: expected mm | reported | ratio | "

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
@@ -118,63 +119,101 @@ def check(
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture)
-    gripper = capture.base_from_gripper
-    motion = inverse(gripper)[:, None] @ gripper[None]
-    move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
-    turn = float(rotation_angle(motion[..., :3, :3]).max())
-    robot, looks = errors_of(gripper), None
-    remarks, faults = [*capture.notes], list[str]()
-    if isinstance(capture, Capture):
-        robot, looks = robot_errors(capture, CalibrateOptions()), _looks(capture)
-        remarks += _remarks(capture, looks, move, turn, robot.unused)
-        if looks.are_one_view and (move > STILL[0] or turn > STILL[1]):
-            still = Finding(
-                kind=Kind.STATIC_IMAGES,
-                severity="rejects",
-                mend="images",
-                value=move,
-                details={"rotation": turn},
-            )
-            faults.append(sentence(still))
-    held = _Held()
+    alone, held = _by_itself(capture), _Held()
     if isinstance(capture, PosePairs):
         held = _pairs_held(capture, robot_noise)
-    elif look and not faults:
-        held = _looked_at(capture, robot, robot_noise, seed, progress, thorough)
-    hand_eye, ratio = held.hand_eye, held.ratio
-    angles = None if ratio is None else angle_finding(*ratio)
-    remarks += [*held.remarks, *([] if angles is None else [sentence(angles)])]
-    faults += held.faults
-    counted = held.registered
-    if counted is None:
-        counted = np.arange(len(gripper)) if looks is None else np.flatnonzero(looks.are_clear)
-    assumptions = held.assumptions
+    elif look and not alone.faults:
+        held = _looked_at(capture, alone.robot, robot_noise, seed, progress, thorough)
+    angles = None if held.ratio is None else angle_finding(*held.ratio)
+    counted = alone.clear if held.registered is None else held.registered
+    rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
+    gripper, assumptions = capture.base_from_gripper[rows], held.assumptions
     if assumptions is None:
-        camera = None
-        if isinstance(capture, Capture):
-            camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
-        assumptions = assumed(gripper[counted], camera, robot_noise)
+        assumptions = assumed(gripper, _camera(capture), robot_noise)
     seen = held.observability
     if seen is None:
-        x = None if held.assumptions is None else assumptions.gripper_from_camera
-        seen = observability(gripper[counted], x)
-    if hand_eye is None:
-        faults += [f"{unobservable(one)}; {remedy(one)}" for one in seen.findings]
-    ahead = Ahead.of(assumptions, gripper[counted], robot.of(counted), suggest, reach, seed)
+        seen = observability(gripper, None if held.assumptions is None else assumptions.gripper_from_camera)
+    unseen = seen.findings if held.hand_eye is None else ()
+    ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
     suggestions = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, suggest + 1)]
     return Examination(
-        sharpness=np.zeros(0) if looks is None else looks.sharpness,
-        largest_move_m=move,
-        largest_turn_rad=turn,
+        sharpness=alone.sharpness,
+        largest_move_m=alone.move_m,
+        largest_turn_rad=alone.turn_rad,
         observability=seen,
         expected=ahead.expected(0) if len(counted) >= FEWEST else None,
         counted=counted,
-        suggestions=tuple(replace(one, like=int(counted[one.like])) for one in suggestions),
-        hand_eye=hand_eye,
-        angle_ratio=ratio,
-        faults=tuple(faults),
-        remarks=tuple(remarks),
+        suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
+        hand_eye=held.hand_eye,
+        angle_ratio=held.ratio,
+        faults=(*alone.faults, *held.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)),
+        remarks=(*alone.remarks, *held.remarks, *([] if angles is None else [sentence(angles)])),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Alone:
+    """What files, poses and images show by themselves."""
+
+    robot: RobotErrors
+    move_m: float
+    turn_rad: float
+    """The largest between two gripper poses."""
+    clear: Int[ndarray, " c"]
+    """Rows of the images that are sharp and well exposed."""
+    sharpness: Float[ndarray, " n"]
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def _by_itself(capture: Capture | PosePairs) -> _Alone:
+    gripper = capture.base_from_gripper
+    motion = inverse(gripper)[:, None] @ gripper[None]
+    alone = _Alone(
+        robot=errors_of(gripper),
+        move_m=float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()),
+        turn_rad=float(rotation_angle(motion[..., :3, :3]).max()),
+        clear=np.arange(len(gripper)),
+        sharpness=np.zeros(0),
+        faults=(),
+        remarks=tuple(capture.notes),
+    )
+    if alone.move_m < 5e-3 and alone.turn_rad > np.radians(5):
+        divided = (
+            f"the gripper moves by at most {1e3 * alone.move_m:.2g} mm while it rotates by "
+            f"{np.degrees(alone.turn_rad):.0f}°: the positions may have been divided by 1000"
+        )
+        alone = replace(alone, remarks=(*alone.remarks, divided))
+    return _with_images(alone, capture) if isinstance(capture, Capture) else alone
+
+
+def _with_images(alone: _Alone, capture: Capture) -> _Alone:
+    robot, looks = robot_errors(capture, CalibrateOptions()), _looks(capture)
+    faults, unused = (), () if robot.unused is None else (sentence(robot.unused),)
+    if looks.are_one_view and (alone.move_m > STILL[0] or alone.turn_rad > STILL[1]):
+        still = Finding(
+            kind=Kind.STATIC_IMAGES,
+            severity="rejects",
+            mend="images",
+            value=alone.move_m,
+            details={"rotation": alone.turn_rad},
+        )
+        faults = (sentence(still),)
+    return replace(
+        alone,
+        robot=robot,
+        clear=np.flatnonzero(looks.are_clear),
+        sharpness=looks.sharpness,
+        faults=faults,
+        remarks=(*alone.remarks, *_remarks(capture, looks), *unused),
+    )
+
+
+def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
+    """The camera before its images are matched."""
+    if isinstance(capture, PosePairs):
+        return None
+    return typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,10 +378,8 @@ def _looks(capture: Capture) -> _Looks:
     return _Looks(brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still)
 
 
-def _remarks(
-    capture: Capture, looks: _Looks, move: float, turn: float, unused: Finding | None
-) -> Iterator[str]:
-    """What stands out in images, intrinsics and poses by themselves."""
+def _remarks(capture: Capture, looks: _Looks) -> Iterator[str]:
+    """What stands out in images and intrinsics."""
     for name, grey, sharp in zip(capture.images, looks.brightness, looks.sharpness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
             yield f"{name} is {fault}; expose it again"
@@ -350,10 +387,3 @@ def _remarks(
             yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"
     if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
         yield f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
-    if move < 5e-3 and turn > np.radians(5):
-        yield (
-            f"the gripper moves by at most {1e3 * move:.2g} mm while it rotates by {np.degrees(turn):.0f}°: "
-            "the positions may have been divided by 1000"
-        )
-    if unused is not None:
-        yield sentence(unused)
