@@ -17,7 +17,7 @@ from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.pixel_noise import PixelNoise
 from jcr.adjust.robots import Adjusted, ArmPoses, Given, Placed, equations_of
 from jcr.adjust.scene import Freedom, Observations, Scene
-from jcr.camera import project, unproject
+from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.geometry import apply, inverse
 from jcr.handeye.components import expected_posterior
 from jcr.handeye.equation import Poses
@@ -29,12 +29,12 @@ MOST_POINTS = 1000
 """Of a scene; of many images every few rays end in one."""
 RELIEF = 0.1
 """Of the working distance, to either side of the surface: what stands on a table."""
-TYPICAL_OBSERVATIONS, TYPICAL_SIGMA_PX, TYPICAL_INFLATION, TYPICAL_MODEL_ERROR = 200.0, 0.08, 2.0, 1.5e-4
+TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
 """Of images that are not matched yet: about the geometric mean over eleven real captures."""
 LEAST_MODEL_ERROR = 1e-9
 """Widths of the image; an exact model's."""
-ROUNDING = 1e-9
-"""Of the information on each unknown: what an image that shares hardly a point with others says of its place is lost in
+LOST = 1e-2
+"""1/m², 1/rad²: of the place of an image that shares hardly a point with others, whose information is otherwise lost in
 the rounding of the points' elimination."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Rotation of the line of sight, and ratio of distances, up to which a matcher finds a feature again."""
@@ -46,12 +46,8 @@ class ForeseenCamera:
 
     intrinsics: Intrinsics
     prior: IntrinsicsPrior
-    observations: float = TYPICAL_OBSERVATIONS
-    """An image, on average."""
-    sigma_px: float = TYPICAL_SIGMA_PX
-    """Of one coordinate of an observation."""
-    inflation: float = TYPICAL_INFLATION
-    """As PixelNoise has it."""
+    information_per_px2: float = TYPICAL_INFORMATION
+    """Of an image, on average: the inverse variances of its observations' x, or y, added up."""
     model_error: float = TYPICAL_MODEL_ERROR
     """Size of each displacement that the camera's model leaves, in widths of the image."""
 
@@ -59,13 +55,12 @@ class ForeseenCamera:
     def of(adjusted: Adjusted) -> "ForeseenCamera":
         """The first camera of an adjustment, its next images being as those were."""
         images = adjusted.given.evidence
-        problem, left = images.problem, images.problem.freedom.model_error_std
+        problem, view, left = images.problem, images.view, images.problem.freedom.model_error_std
+        weight = images.noise.weights(view.residual_px, view.depth, problem.layout.camera)
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
-            observations=len(problem.observations.point) / len(problem.seen.rows),
-            sigma_px=float(images.noise.sigma_px[0]),
-            inflation=images.noise.inflation,
+            information_per_px2=float(weight.sum()) / len(problem.seen.rows),
             model_error=float(left[0]) if len(left) else 0.0,
         )
 
@@ -76,22 +71,26 @@ def foreseen(arm: ArmPoses, camera: ForeseenCamera, noise: RobotNoise, distance_
     The arm's start is its X and the identity; the scene is `distance_m` from the cameras, in metres.
     """
     x, z = arm.start
-    points, observations = _seen_points(arm.base_from_gripper @ x, camera.intrinsics, distance_m)
+    # Far outside the image a distortion may fold; how large it is hardly matters to how well it becomes known.
+    straight = parameters(camera.intrinsics)
+    straight[4:] = 0.0
+    intrinsics = with_parameters(camera.intrinsics, straight)
+    points, observations = _seen_points(arm.base_from_gripper @ x, intrinsics, distance_m)
     scene = Scene(
         world_from_rig=arm.base_from_gripper @ x,
         rig_from_camera=np.eye(4)[None],
-        cameras=(camera.intrinsics,),
+        cameras=(intrinsics,),
         points_in_world=points,
     )
-    freedom = Freedom.of((camera.intrinsics,), (camera.prior,), len(arm.rigs))
+    freedom = Freedom.of((intrinsics,), (camera.prior,), len(arm.rigs))
     scene, problem = posed(scene, observations, freedom)
     sizes = np.full(len(problem.freedom.model_error_std), max(camera.model_error, LEAST_MODEL_ERROR))
     problem = problem.with_model_error(sizes)
-    # As much information as the images' own observations have is shared by these.
-    share = len(problem.observations.point) / len(arm.rigs) / camera.observations
-    pixels = PixelNoise(np.array([camera.sigma_px]), camera.inflation * share)
+    # The images' own information is shared by these observations.
+    an_image = len(problem.observations.point) / len(arm.rigs)
+    pixels = PixelNoise(np.array([np.sqrt(an_image / camera.information_per_px2)]))
     images = evidence(scene, problem, pixels)
-    images.information[np.diag_indices(len(images.information))] *= 1 + ROUNDING
+    images.information[np.diag_indices(len(images.information))] += LOST
     given = Given(evidence=images, arms=(arm,), noise=noise.given)
     placed = Placed(x=x[None], scale=1.0, z=z[None], scene=scene)
     equations, region = equations_of(placed, given)
