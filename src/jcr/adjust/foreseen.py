@@ -21,7 +21,7 @@ from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.geometry import apply, inverse
 from jcr.handeye.components import expected_posterior
 from jcr.handeye.equation import Poses
-from jcr.records import Intrinsics, RobotNoise
+from jcr.records import Intrinsics, RobotNoise, Tracks
 
 COLUMNS = 9
 """Across the width of an image, of the grid whose rays end in points of the scene."""
@@ -56,7 +56,7 @@ class ForeseenCamera:
         """The first camera of an adjustment, its next images being as those were."""
         images = adjusted.given.evidence
         problem, view, left = images.problem, images.view, images.problem.freedom.model_error_std
-        weight = images.noise.weights(view.residual_px, view.depth, problem.layout.camera)
+        weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
@@ -75,15 +75,15 @@ def foreseen(arm: ArmPoses, camera: ForeseenCamera, noise: RobotNoise, distance_
     straight = parameters(camera.intrinsics)
     straight[4:] = 0.0
     intrinsics = with_parameters(camera.intrinsics, straight)
-    points, observations = _seen_points(arm.base_from_gripper @ x, intrinsics, distance_m)
+    tracks = _seen_points(arm.base_from_gripper @ x, intrinsics, distance_m)
     scene = Scene(
         world_from_rig=arm.base_from_gripper @ x,
         rig_from_camera=np.eye(4)[None],
         cameras=(intrinsics,),
-        points_in_world=points,
+        points_in_world=tracks.points_in_recon,
     )
     freedom = Freedom.of((intrinsics,), (camera.prior,), len(arm.rigs))
-    scene, problem = posed(scene, observations, freedom)
+    scene, problem = posed(scene, Observations.of_one_camera(tracks, len(arm.rigs)), freedom)
     sizes = np.full(len(problem.freedom.model_error_std), max(camera.model_error, LEAST_MODEL_ERROR))
     problem = problem.with_model_error(sizes)
     # The images' own information is shared by these observations.
@@ -106,10 +106,8 @@ def foreseen(arm: ArmPoses, camera: ForeseenCamera, noise: RobotNoise, distance_
     )
 
 
-def _seen_points(
-    cameras: Poses, intrinsics: Intrinsics, distance_m: float
-) -> tuple[Float[ndarray, "p 3"], Observations]:
-    """Points where the rays of a grid in each image meet the scene, and the images that show each."""
+def _seen_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:
+    """Points where the rays of a grid in each image meet the scene, in the cameras' frame, and the images of each."""
     rows = max(2, round(COLUMNS * intrinsics.height / intrinsics.width))
     u, v = np.meshgrid(
         (np.arange(COLUMNS) + 0.5) / COLUMNS * intrinsics.width,
@@ -125,8 +123,7 @@ def _seen_points(
     for i, pose in enumerate(cameras):
         mine = image == i
         x_px[mine] = project(intrinsics, apply(inverse(pose), points[point[mine]]))
-    each = np.arange(len(cameras))
-    return points, Observations(rig=each, camera=np.zeros_like(each), image=image, x_px=x_px, point=point)
+    return Tracks(image, x_px, point, points)
 
 
 def _on_surface(
