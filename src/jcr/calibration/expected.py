@@ -17,16 +17,19 @@ from jcr.adjust.intrinsics_prior import prior_about
 from jcr.adjust.robots import ArmPoses
 from jcr.calibration.adjust import estimate_in
 from jcr.calibration.case import Case
-from jcr.calibration.robot_errors import RobotErrors
+from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.components import GIVEN_SHARE, TYPICAL
-from jcr.handeye.equation import Poses
+from jcr.handeye.equation import Poses, point_ahead, uncertainty
 from jcr.handeye.fit import Cues, expected_fit
-from jcr.handeye.next_poses import assumed_camera, looked_at, nearest, next_poses
+from jcr.handeye.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
 from jcr.least_squares import one_blas_thread
 from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where
 
+COMPARED, TOO_MANY = 20, 40
+"""Poses that are compared, beside those that are most informative of random errors, by what systematic errors of the
+robot leave; and poses of a capture from which on the most informative ones are proposed as they are."""
 FEWEST = 3
 """Poses, from which on something is expected."""
 USUAL_FOCAL = 0.8
@@ -47,6 +50,11 @@ class Assumptions:
     """How well the scale is known beforehand (relative); None: not at all."""
     faults: Float[ndarray, "7 7"] | None = None
     """What findings add to the covariance; None: nothing."""
+
+    @property
+    def cues(self) -> Cues | None:
+        """What the scale is known from."""
+        return None if self.scale_std is None else Cues(scale=(1.0, self.scale_std))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,16 +99,32 @@ class Ahead:
     ) -> "Ahead":
         """The `count` poses that help most; `robot` is of the others, `reach` and `seed` as next_poses takes them."""
         x, noise = assumptions.gripper_from_camera, assumptions.noise
-        added = next_poses(
-            base_from_gripper,
-            count,
-            x,
-            (noise.translation, noise.rotation),
-            reach,
-            seed,
-            assumptions.distance_m,
-        )
-        return Ahead(assumptions=assumptions, base_from_gripper=base_from_gripper, robot=robot, added=added)
+        of_random, distance = (noise.translation, noise.rotation), assumptions.distance_m
+        added = next_poses(base_from_gripper, count, x, of_random, reach, seed, distance)
+        ahead = Ahead(assumptions=assumptions, base_from_gripper=base_from_gripper, robot=robot, added=added)
+        if count == 0 or len(base_from_gripper) > TOO_MANY:
+            return ahead
+        others = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))[:COMPARED]
+        return replace(ahead, added=np.concatenate([added, others]))._best(count)
+
+    def _best(self, count: int) -> "Ahead":
+        """The `count` of them that leave the least, systematic errors of the robot included, chosen one by one."""
+        now, x = self.base_from_gripper, self.assumptions.gripper_from_camera
+        systematic, noise = self.robot.with_poses(now, self.added), self.assumptions.noise
+        point, cues = point_ahead(x, self.assumptions.distance_m), self.assumptions.cues
+        chosen, left = list[int](), list(range(len(self.added)))
+
+        def remaining(row: int) -> float:
+            rows = np.r_[np.arange(len(now)), len(now) + np.array([*chosen, row])]
+            poses = np.concatenate([now, self.added])[rows]
+            of_rows = of_poses(systematic, rows)
+            return float(uncertainty(expected_fit(poses, x, noise, of_rows, cues, averaged=False), point))
+
+        for _ in range(count):
+            best = min(left, key=remaining)
+            chosen.append(best)
+            left.remove(best)
+        return replace(self, added=self.added[chosen])
 
     def expected(self, count: int) -> Expectation:
         """With the first `count` of them."""
@@ -201,11 +225,8 @@ def expected(
     """
     x, camera, identity = assumptions.gripper_from_camera, assumptions.camera, np.eye(4)
     if camera is None:
-        cues = None if assumptions.scale_std is None else Cues(scale=(1.0, assumptions.scale_std))
-        found = expected_fit(base_from_gripper, x, assumptions.noise, systematic, cues)
-        estimate = Estimate(
-            gripper_from_camera=x, scale=1.0, base_from_recon=identity, covariance=found.covariance[:7, :7]
-        )
+        covariance = expected_fit(base_from_gripper, x, assumptions.noise, systematic, assumptions.cues)
+        estimate = Estimate(gripper_from_camera=x, scale=1.0, base_from_recon=identity, covariance=covariance)
     else:
         arm = ArmPoses(
             rigs=np.arange(len(base_from_gripper)),

@@ -309,22 +309,35 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
         fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ root)
         return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
 
-    def of_region(sizes: LogSizes) -> Float[ndarray, "*k p p"]:
-        # What residuals will show of the systematic part is, on average, as large as it is before.
-        if region is None or equations.systematic is None:
-            return np.zeros((*sizes.shape[:-1], *equations.prior_information.shape))
-        return region.spread(
-            equations.variances(sizes)[..., 2, None, None, None] * _own(equations.systematic)
-        )
-
     found = over_sizes(equations, mode, _score(equations, mode)[2], density)
     weight = np.concatenate([share for share, _, _ in found])
-    each = np.concatenate([solution.covariance + of_region(sizes) for _, sizes, solution in found])
+    each = np.concatenate(
+        [solution.covariance + _expected_elsewhere(equations, sizes, region) for _, sizes, solution in found]
+    )
     covariance = np.einsum("k,kij->ij", weight, each)
     off = np.zeros((len(weight), len(covariance[:POSES])))
     covariance *= _widening(weight, off, each[:, :POSES, :POSES], covariance[:POSES, :POSES])
-    budget = _budget(equations, mode, of_region(mode), covariance)
+    budget = _budget(equations, mode, _expected_elsewhere(equations, mode, region), covariance)
     return Posterior(np.zeros(len(covariance)), covariance, budget, mode)
+
+
+def expected_covariance_at(
+    equations: Equations, noise: RobotNoise, region: Region | None
+) -> Float[ndarray, "p p"]:
+    """The covariance of the same at the sizes themselves, as if the residuals told them exactly: for comparisons."""
+    mode = equations.log_sizes_of(noise)
+    return solve(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
+
+
+def _expected_elsewhere(
+    equations: Equations, log_sizes: LogSizes, region: Region | None
+) -> Float[ndarray, "*k p p"]:
+    """`_elsewhere` before there are residuals: what they will show of the systematic part is as large as it is."""
+    if region is None or equations.systematic is None:
+        return np.zeros((*log_sizes.shape[:-1], *equations.prior_information.shape))
+    return region.spread(
+        equations.variances(log_sizes)[..., 2, None, None, None] * _own(equations.systematic)
+    )
 
 
 def restricted_log_likelihood(equations: Equations, log_sizes: LogSizes) -> float:

@@ -98,6 +98,17 @@ def point_ahead(x: Float[ndarray, "4 4"], distance_m: float) -> Float[ndarray, "
     return by_similarity(distance_m * x[:3, 2])
 
 
+def uncertainty(
+    covariance: Float[ndarray, "*batch 7 7"], point: Float[ndarray, "3 7"] | None = None
+) -> Float[ndarray, "*batch"] | np.floating:
+    """One number for it: variances over what counts alike, of the camera, the rotation and the scale, or of the place
+    of a `point_ahead`, which the scale moves, and the rotation."""
+    counted = np.eye(7) / UNIT[:, None]
+    if point is not None:
+        counted = np.concatenate([point / UNIT[TRANSLATION, None], counted[ROTATION]])
+    return np.einsum("ri,...ij,rj->...", counted, covariance, counted)
+
+
 def most_informative(
     known: Float[ndarray, "13 13"],
     gain: Float[ndarray, "k 13 13"],
@@ -106,17 +117,12 @@ def most_informative(
 ) -> Int[ndarray, " c"]:
     """The rows of the `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
 
-    What counts is the position of a point (`point_ahead`; by default the camera), the rotation and the scale.
+    What counts is what `uncertainty` counts.
     """
-    counted = np.eye(7)
-    if point is not None:
-        counted[:3] = point
-    counted /= UNIT[:, None]
     rows: list[int] = []
     left = np.arange(len(gain))
     for _ in range(min(count, len(gain))):
-        covariance = expected_covariance(known + gain[left])
-        best = int(np.einsum("ri,kij,rj->k", counted, covariance, counted).argmin())
+        best = int(np.argmin(uncertainty(expected_covariance(known + gain[left]), point)))
         known = known + gain[left[best]]
         rows.append(int(left[best]))
         left = np.delete(left, best)

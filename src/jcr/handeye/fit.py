@@ -22,8 +22,8 @@ from scipy.linalg import cho_solve
 from jcr.geometry import retract
 from jcr.handeye.components import (
     Equations,
-    Posterior,
     Solution,
+    expected_covariance_at,
     expected_posterior,
     log_evidence,
     most_likely,
@@ -147,10 +147,11 @@ def expected_fit(
     noise: RobotNoise,
     systematic: Float[ndarray, "r r"],
     cues: Cues | None = None,
-) -> Posterior:
-    """What a fit to exact camera poses is expected to come to, of a robot with this noise; the scale being 1.
+    averaged: bool = True,
+) -> Float[ndarray, "7 7"]:
+    """Covariance that a fit to exact camera poses is expected to report, of a robot with this noise; the scale being 1.
 
-    `systematic` and `cues` are as `fit_poses` takes them.
+    `systematic`, `cues` and `averaged` are as `fit_poses` takes them.
     """
     problem = _Problem(
         base_from_gripper,
@@ -162,7 +163,9 @@ def expected_fit(
         systematic,
     )
     linear = _linearised(problem, (gripper_from_camera, 1.0, np.eye(4)))
-    return expected_posterior(linear.equations, noise, linear.region)
+    if averaged:
+        return expected_posterior(linear.equations, noise, linear.region).covariance[:7, :7]
+    return expected_covariance_at(linear.equations, noise, linear.region)[:7, :7]
 
 
 def _stepped(

@@ -1,8 +1,8 @@
 """Which gripper poses to add: those that tell most of a seen point, the rotation and the scale, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
-the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). Random errors of
-the gripper poses alone choose; what a calibration with the poses comes to is for calibration/expected.py to say.
+the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). That is of random
+errors of the gripper poses alone; calibration/expected.py compares a few with what systematic ones leave.
 """
 
 import numpy as np
@@ -33,12 +33,12 @@ def next_poses(
     for a point so far ahead of the camera; by default as far as the scene.
     """
     x = assumed_camera(base_from_gripper) if gripper_from_camera is None else gripper_from_camera
-    candidates = _candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
+    possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
     known = pose_information(base_from_gripper, x, noise).sum(0)
     if distance_m is None:
         distance_m = float(np.median(looked_at(base_from_gripper @ x)[1]))
-    information = pose_information(candidates, x, noise)
-    return candidates[most_informative(known, information, count, point_ahead(x, distance_m))]
+    information = pose_information(possible, x, noise)
+    return possible[most_informative(known, information, count, point_ahead(x, distance_m))]
 
 
 def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
@@ -46,7 +46,7 @@ def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c
     return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
 
 
-def _candidates(
+def candidates(
     base_from_gripper: Poses,
     x: Float[ndarray, "4 4"],
     reach: Float[ndarray, "2 3"] | None,
