@@ -181,7 +181,7 @@ def common_share(
 ) -> float:
     """The share of variance that all observations have alike under which the residuals are likeliest.
 
-    Under the density of which the loss is the negative logarithm, a Student's t, each at the likeliest size.
+    Each at its likeliest size, under the Student's t distribution whose negative logarithm is the loss.
     """
     if not layout.states_variances:
         return 1.0
