@@ -85,11 +85,11 @@ def page(real: Sequence[Row], made: Sequence[Row]) -> str:
 def _claim(name: str, rows: Sequence[Row]) -> str:
     ratios = np.array([row.ratios for row in rows if row.ratios]).T
     parts = [
-        f"{what} {np.exp(np.abs(np.log(each)).max()):.1f} at most, within {FACTOR:g} in "
-        f"{(np.abs(np.log(each)) < np.log(FACTOR)).sum()} of {len(each)}"
+        f"{what} within a factor of {FACTOR:g} in {(np.abs(np.log(each)) < np.log(FACTOR)).sum()} of {len(each)}, "
+        f"at most {np.exp(np.abs(np.log(each)).max()):.2f}"
         for what, each in zip(("seen point", "camera", "rotation"), ratios, strict=True)
     ]
-    return f"> Expected error over reported error, {len(rows)} {name}: by a factor of {'; '.join(parts)}"
+    return f"> Expected error over reported error, {len(rows)} {name}: {'; '.join(parts)}"
 
 
 def _line(row: Row) -> str:
