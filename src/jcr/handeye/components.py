@@ -324,7 +324,7 @@ def expected_posterior(equations: Equations, noise: RobotNoise, region: Region |
 def expected_covariance_at(
     equations: Equations, noise: RobotNoise, region: Region | None
 ) -> Float[ndarray, "p p"]:
-    """The covariance of the same at the sizes themselves, as if the residuals told them exactly: for comparisons."""
+    """The covariance of the same at the sizes themselves, as if these were known exactly: for comparisons."""
     mode = equations.log_sizes_of(noise)
     return solve(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
 
