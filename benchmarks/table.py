@@ -112,6 +112,20 @@ BENCHES = {
         measures=(*SOLVER, "benchmarks/simulated"),
         long="40 draws of every row instead of 10",
     ),
+    "expected": Bench(
+        "Expected before the run",
+        HONEST,
+        "what jcr check and the live page expect, against what the calibration reports: captures in DIR, and simulated",
+        of_captures=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/check.py",
+            "benchmarks/simulated",
+            "benchmarks/seen.py",
+        ),
+    ),
     "matching": Bench(
         "Learned features on real captures",
         ROBOTS,

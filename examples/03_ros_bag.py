@@ -40,5 +40,6 @@ for name, pose in zip(capture.images, capture.base_from_gripper, strict=True):
 # Before the half minute of a calibration: do these motions show everything, and how exact will it be?
 found = check(capture, look=False)
 print(f"motions show everything: {found.observability.observable}")
-print(f"to be expected: {1e3 * found.expected_std[:3].max():.1f} mm one sigma")
+if found.expected is not None:
+    print(f"to be expected: a seen point within {found.expected.seen.within_95_mm:.1f} mm (95 % of errors)")
 print(f"next: jcr run {out / 'capture'} {out / 'run'}")

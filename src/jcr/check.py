@@ -1,17 +1,32 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.adjust.foreseen import ForeseenCamera
+from jcr.calibration.adjust import adjusted
+from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
+from jcr.calibration.expected import (
+    FEWEST,
+    Ahead,
+    Assumptions,
+    Expectation,
+    assumed,
+    assumed_of,
+    assumed_of_poses,
+    typical_camera,
+)
+from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.poses import is_one
+from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.camera import fold_distance_px
 from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image, show_one_view
 from jcr.capture.names import paired_by_name
@@ -19,11 +34,9 @@ from jcr.capture.read import read_source
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_angle
 from jcr.handeye.conventions import better_reading, convention_finding
-from jcr.handeye.equation import ASSUMED_NOISE
-from jcr.handeye.next_poses import next_poses
 from jcr.handeye.observability import observability
 from jcr.handeye.residuals import angle_ratio
-from jcr.handeye.solve import solve_hand_eye
+from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
@@ -46,7 +59,7 @@ QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Examination:
     """What is known of a capture before it is calibrated."""
 
@@ -56,8 +69,10 @@ class Examination:
     largest_turn_rad: float
     """Between any two gripper poses."""
     observability: Observability
-    expected_std: Float[ndarray, "7"]
-    """records.COVARIANCE_ORDER, for the noise that was given or assumed."""
+    expected: Expectation | None
+    """What a calibration of the images that count would report; None of fewer than three."""
+    counted: Int[ndarray, " c"]
+    """Rows of the images that are expected to register: those that did; of images not tried, those that are clear."""
     suggestions: tuple[NextPose, ...]
     hand_eye: HandEye | None
     """From sparse features, where the images were looked at and registered."""
@@ -67,6 +82,11 @@ class Examination:
     faults: tuple[str, ...]
     """Why a calibration of this capture would be rejected."""
     remarks: tuple[str, ...]
+
+    @property
+    def expected_std(self) -> Float[ndarray, "7"] | None:
+        """Of that calibration, in records.COVARIANCE_ORDER."""
+        return None if self.expected is None else self.expected.std
 
     @property
     def verdict(self) -> Verdict:
@@ -99,83 +119,146 @@ def check(
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture)
-    gripper = capture.base_from_gripper
-    motion = inverse(gripper)[:, None] @ gripper[None]
-    move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
-    turn = float(rotation_angle(motion[..., :3, :3]).max())
-    sharp, remarks, is_still = np.zeros(0), [*capture.notes], False
-    if isinstance(capture, Capture):
-        brightness, sharp, is_still = _looks(capture)
-        remarks += _picture_remarks(capture, brightness, sharp)
-        if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
-            remarks.append(
-                f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
-            )
-    if move < 5e-3 and turn > np.radians(5):
-        remarks.append(
-            f"the gripper moves by at most {1e3 * move:.2g} mm while it rotates by {np.degrees(turn):.0f}°: "
-            "the positions may have been divided by 1000"
-        )
-    if isinstance(capture, Capture):
-        unused = robot_errors(capture, CalibrateOptions()).unused
-        remarks += [] if unused is None else [sentence(unused)]
-    faults: list[str] = []
-    if is_still and (move > STILL[0] or turn > STILL[1]):
-        still = Finding(
-            kind=Kind.STATIC_IMAGES, severity="rejects", mend="images", value=move, details={"rotation": turn}
-        )
-        faults.append(sentence(still))
-    held, quick = None, False
+    alone, held = _by_itself(capture), _Held()
     if isinstance(capture, PosePairs):
-        held = _held_against(gripper, capture, robot_noise)
-    elif look and not faults:
-        held, quick = _looked_at(capture, robot_noise, seed, progress, thorough)
-    hand_eye, ratio = (None, None) if held is None else (held.hand_eye, held.ratio)
-    if held is not None:
-        faults += held.faults
-        remarks += held.remarks
-    if ratio is not None:
-        angles = angle_finding(*ratio)
-        remarks += [] if angles is None else [sentence(angles)]
-    trusted = hand_eye is not None and hand_eye.converged
-    x = hand_eye.gripper_from_camera if hand_eye is not None and trusted else None
-    seen = observability(gripper, x) if hand_eye is None or quick else hand_eye.observability
-    if hand_eye is None:
-        faults += [f"{unobservable(one)}; {remedy(one)}" for one in seen.findings]
-    noise = robot_noise or ASSUMED_NOISE
-    if hand_eye is not None and trusted and robot_noise is None:
-        noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    expected, suggestions = next_poses(gripper, suggest, x, noise, reach, seed)
+        held = _pairs_held(capture, robot_noise)
+    elif look and not alone.faults:
+        held = _looked_at(capture, alone.robot, robot_noise, seed, progress, thorough)
+    angles = None if held.ratio is None else angle_finding(*held.ratio)
+    counted = alone.clear if held.registered is None else held.registered
+    rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
+    gripper, assumptions = capture.base_from_gripper[rows], held.assumptions
+    if assumptions is None:
+        assumptions = assumed(gripper, _camera(capture), robot_noise)
+    seen = held.observability
+    if seen is None:
+        seen = observability(gripper, None if held.assumptions is None else assumptions.gripper_from_camera)
+    unseen = seen.findings if held.hand_eye is None else ()
+    ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
+    suggestions = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, suggest + 1)]
     return Examination(
-        sharp, move, turn, seen, expected, tuple(suggestions), hand_eye, ratio, tuple(faults), tuple(remarks)
+        sharpness=alone.sharpness,
+        largest_move_m=alone.move_m,
+        largest_turn_rad=alone.turn_rad,
+        observability=seen,
+        expected=ahead.expected(0) if len(counted) >= FEWEST else None,
+        counted=counted,
+        suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
+        hand_eye=held.hand_eye,
+        angle_ratio=held.ratio,
+        faults=(*alone.faults, *held.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)),
+        remarks=(*alone.remarks, *held.remarks, *([] if angles is None else [sentence(angles)])),
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class _Alone:
+    """What files, poses and images show by themselves."""
+
+    robot: RobotErrors
+    move_m: float
+    turn_rad: float
+    """The largest between two gripper poses."""
+    clear: Int[ndarray, " c"]
+    """Rows of the images that are sharp and well exposed."""
+    sharpness: Float[ndarray, " n"]
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def _by_itself(capture: Capture | PosePairs) -> _Alone:
+    gripper = capture.base_from_gripper
+    motion = inverse(gripper)[:, None] @ gripper[None]
+    alone = _Alone(
+        robot=errors_of(gripper),
+        move_m=float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()),
+        turn_rad=float(rotation_angle(motion[..., :3, :3]).max()),
+        clear=np.arange(len(gripper)),
+        sharpness=np.zeros(0),
+        faults=(),
+        remarks=tuple(capture.notes),
+    )
+    if alone.move_m < 5e-3 and alone.turn_rad > np.radians(5):
+        divided = (
+            f"the gripper moves by at most {1e3 * alone.move_m:.2g} mm while it rotates by "
+            f"{np.degrees(alone.turn_rad):.0f}°: the positions may have been divided by 1000"
+        )
+        alone = replace(alone, remarks=(*alone.remarks, divided))
+    return _with_images(alone, capture) if isinstance(capture, Capture) else alone
+
+
+def _with_images(alone: _Alone, capture: Capture) -> _Alone:
+    robot, looks = robot_errors(capture, CalibrateOptions()), _looks(capture)
+    faults, unused = (), () if robot.unused is None else (sentence(robot.unused),)
+    if looks.are_one_view and (alone.move_m > STILL[0] or alone.turn_rad > STILL[1]):
+        still = Finding(
+            kind=Kind.STATIC_IMAGES,
+            severity="rejects",
+            mend="images",
+            value=alone.move_m,
+            details={"rotation": alone.turn_rad},
+        )
+        faults = (sentence(still),)
+    return replace(
+        alone,
+        robot=robot,
+        clear=np.flatnonzero(looks.are_clear),
+        sharpness=looks.sharpness,
+        faults=faults,
+        remarks=(*alone.remarks, *_remarks(capture, looks), *unused),
+    )
+
+
+def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
+    """The camera before its images are matched."""
+    if isinstance(capture, PosePairs):
+        return None
+    return typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Held:
     """Gripper poses held against cameras."""
 
-    hand_eye: HandEye | None
+    hand_eye: HandEye | None = None
     """None where no cameras were found."""
-    ratio: tuple[float, float] | None
-    faults: tuple[str, ...]
+    ratio: tuple[float, float] | None = None
+    faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    registered: Int[ndarray, " c"] | None = None
+    """Rows of the images that a calibration would use; None where not all were looked at."""
+    assumptions: Assumptions | None = None
+    """What is found of camera and robot; None where nothing was, or it would be rejected."""
+
+    @property
+    def observability(self) -> Observability | None:
+        """Of the poses that were held; None where they are not all."""
+        if self.hand_eye is None or self.registered is None:
+            return None
+        return self.hand_eye.observability
 
 
 def _looked_at(
     capture: Capture,
+    robot: RobotErrors,
     robot_noise: tuple[float, float] | None,
     seed: int,
     progress: Progress | None,
     thorough: bool,
-) -> "tuple[_Held, bool]":
-    """The gripper poses held against the images, and whether few small ones were enough."""
+) -> _Held:
+    """The gripper poses held against few small images, and where that is not enough, against all."""
     if not thorough and len(capture) > QUICK:
-        rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
-        held = _registered(_of_rows(capture, rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        if not held.faults and held.hand_eye is not None and held.hand_eye.inliers.sum() == QUICK:
-            return held, True
-    return _registered(capture, robot_noise, seed, progress), False
+        rows = spread_rows(len(capture))
+        few = _of_rows(capture, rows)
+        held = _registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
+        if not held.faults and held.registered is not None and len(held.registered) == QUICK:
+            return replace(held, registered=None)
+    return _registered(capture, robot, robot_noise, seed, progress)
+
+
+def spread_rows(count: int) -> Int[ndarray, " k"]:
+    """Of `count` images the rows of those that are looked at first."""
+    return np.linspace(0, count - 1, min(count, QUICK)).round().astype(int)
 
 
 def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
@@ -188,6 +271,7 @@ def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
 
 def _registered(
     capture: Capture,
+    robot: RobotErrors,
     robot_noise: tuple[float, float] | None,
     seed: int,
     progress: Progress | None,
@@ -203,17 +287,19 @@ def _registered(
         board = None
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return _Held(None, None, (str(error),), () if board is None else (sentence(board),))
+        return _Held(faults=(str(error),), remarks=() if board is None else (sentence(board),))
+    rows = found.image_index
+    case = calibrated(capture, found, robot.of(rows), robot_noise)
     by_name = paired_by_name(capture.images, capture.base_from_gripper)
     held = _held_against(
-        capture.base_from_gripper[found.image_index],
+        capture.base_from_gripper[rows],
         found,
-        robot_noise,
-        {by_number: poses[found.image_index] for by_number, poses in by_name.items()},
+        case.hand_eye,
+        {by_number: poses[rows] for by_number, poses in by_name.items()},
     )
     wrong: tuple[Finding, ...] = ()
-    if size_px is None and held.hand_eye is not None and held.hand_eye.converged:
-        wrong = left_out_poses(capture, found, held.hand_eye)
+    if size_px is None and case.hand_eye.converged:
+        wrong = left_out_poses(capture, found, case.hand_eye)
     named = {
         severity: [sentence(one) for one in wrong if one.severity == severity]
         for severity in ("rejects", "warns")
@@ -222,28 +308,66 @@ def _registered(
         held,
         faults=(*held.faults, *named["rejects"]),
         remarks=(*held.remarks, *named["warns"], *found.warnings, *found.notes),
+        registered=rows[case.hand_eye.inliers],
+        assumptions=assumed_of(case) if case.hand_eye.converged else None,
     )
+
+
+def calibrated(
+    capture: Capture, found: Reconstruction, robot: RobotErrors, noise: tuple[float, float] | None
+) -> Case:
+    """The first steps of a calibration: the fit, and where that is accepted the adjustment of images and robot."""
+    mm_deg = None if noise is None else (1e3 * noise[0], float(np.degrees(noise[1])))
+    case = fitted(capture, found, CalibrateOptions(robot_noise=mm_deg), robot)
+    return adjusted(case) if case.hand_eye.converged else case
+
+
+def _pairs_held(pairs: PosePairs, noise: tuple[float, float] | None) -> _Held:
+    """Gripper poses held against camera poses that somebody else found."""
+    gripper, camera = pairs.base_from_gripper, pairs.recon_from_camera
+    hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise)
+    assumptions = None
+    if hand_eye.converged:
+        scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
+        assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], scale_std)
+    held = _held_against(gripper, pairs, hand_eye)
+    return replace(held, registered=np.flatnonzero(hand_eye.inliers), assumptions=assumptions)
 
 
 def _held_against(
     used: Float[ndarray, "m 4 4"],
     found: Reconstruction | PosePairs,
-    robot_noise: tuple[float, float] | None,
+    hand_eye: HandEye,
     by_name: Mapping[bool, Float[ndarray, "m 4 4"]] | None = None,
 ) -> _Held:
-    camera = found.recon_from_camera
-    hand_eye, ratio = solve_hand_eye(used, camera, robot_noise=robot_noise), None
+    camera, ratio = found.recon_from_camera, None
     reading = better_reading(used, camera, by_name)
     faults = [] if reading is None else [sentence(convention_finding(reading))]
     faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
     remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
     if hand_eye.converged and hand_eye.inliers.sum() >= 3:
         ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])
-    return _Held(hand_eye, ratio, tuple(faults), tuple(remarks))
+    return _Held(hand_eye=hand_eye, ratio=ratio, faults=tuple(faults), remarks=tuple(remarks))
 
 
-def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"], bool]:
-    """Mean grey level and relative sharpness of every image, and whether all show one view."""
+@dataclass(frozen=True)
+class _Looks:
+    """What each image looks like by itself."""
+
+    brightness: Float[ndarray, " n"]
+    """Mean grey level."""
+    sharpness: Float[ndarray, " n"]
+    """Relative to the median image's."""
+    are_one_view: bool
+
+    @property
+    def are_clear(self) -> Bool[ndarray, " n"]:
+        """Images that are sharp and well exposed."""
+        exposed = [exposure_fault(grey) is None for grey in self.brightness]
+        return np.array(exposed, bool) & (self.sharpness >= BLURRED)
+
+
+def _looks(capture: Capture) -> _Looks:
     first = read_image(capture.folder / capture.images[0])
     looks, is_still = [], len(capture) > 1
     for name in capture.images:
@@ -251,12 +375,15 @@ def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]
         looks.append(brightness_and_sharpness(image))
         is_still = is_still and show_one_view(first, image)
     brightness, sharpness = np.array(looks).T
-    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still
+    return _Looks(brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still)
 
 
-def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):
-    for name, grey, sharp in zip(capture.images, brightness, sharpness, strict=True):
+def _remarks(capture: Capture, looks: _Looks) -> Iterator[str]:
+    """What stands out in images and intrinsics."""
+    for name, grey, sharp in zip(capture.images, looks.brightness, looks.sharpness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
             yield f"{name} is {fault}; expose it again"
         elif sharp < BLURRED:
             yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"
+    if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
+        yield f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"

@@ -8,9 +8,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.simulated.problem import HandEyeProblem, disturbed, hand_eye_problem
 from jcr import pipeline, stages
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, write_calibration
+from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import calibrate_poses
 from jcr.calibration.requirement import GRASPING, advised
+from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.seen import within_95
 from jcr.calibration.words import summary
 from jcr.capture.read import read_capture
@@ -119,9 +121,11 @@ def test_a_scale_that_was_known_is_not_promised_again():
     cameras[:, :3, 3] *= problem.scale
     given = PosePairs(Path("a.yaml"), tuple("abcdefgh"), problem.base_from_gripper, cameras, True)
     known = calibrate_poses(given)
-    free = advised(known, given.base_from_gripper, CalibrateOptions())
+    gripper = given.base_from_gripper
+    assumptions = assumed_of_poses(known, gripper)
+    free = advised(known, gripper, CalibrateOptions(), errors_of(gripper), assumptions)
     first, other = (found.next_poses[0].expected_std for found in (known, free))
-    assert (first[:3] > other[:3]).any() and np.linalg.norm(first[:3]) > np.linalg.norm(other[:3])
+    assert 1.02 * other[6] < first[6] and first[6] > 0.95 * np.sqrt(known.covariance[6, 6])
 
 
 def test_what_no_number_of_images_reaches_is_not_promised():

@@ -8,13 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated.problem import hand_eye_problem
-from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.poses import calibrate_poses
 from jcr.capture.names import paired_by_name
 from jcr.geometry import inverse, transform
 from jcr.handeye.conventions import BY_NUMBER, BY_TEXT, MIRRORED, better_reading, convention_finding
-from jcr.handeye.next_poses import next_poses
-from jcr.records import PosePairs
 from jcr.records.words import sentence
 
 
@@ -107,43 +103,3 @@ def test_sound_poses_are_left_alone(noise):
     for seed in range(2):
         problem = hand_eye_problem(np.random.default_rng(seed), 10, robot_noise=noise)
         assert better_reading(problem.base_from_gripper, problem.recon_from_camera) is None
-
-
-def test_proposed_poses_keep_their_promise_and_stay_in_reach():
-    rng = np.random.default_rng(2)
-    problem = hand_eye_problem(rng, 5)
-    reach = np.array([[0.2, -0.4, 0.2], [0.8, 0.4, 0.8]])
-    now, proposed = next_poses(
-        problem.base_from_gripper, 3, problem.gripper_from_camera, (5e-4, np.radians(0.1)), reach
-    )
-    assert len(proposed) == 3
-    last = now
-    for pose in proposed:
-        assert (pose.expected_std < last + 1e-12).all()
-        last = pose.expected_std
-        position = pose.base_from_gripper[:3, 3]
-        assert (position >= reach[0] - 0.01).all() and (position <= reach[1] + 0.01).all()
-    assert last[:3].max() < 0.75 * now[:3].max()
-
-
-def test_a_planar_capture_is_told_to_tilt():
-    problem = hand_eye_problem(np.random.default_rng(3), 8, "planar")
-    now, proposed = next_poses(problem.base_from_gripper, 2, problem.gripper_from_camera)
-    down = problem.base_from_gripper[0, 2, :3]
-    tilt = [np.degrees(np.arccos(pose.base_from_gripper[2, :3] @ down)) for pose in proposed]
-    assert max(tilt) > 10.0
-    assert proposed[-1].expected_std[:3].max() < 0.02 * now[:3].max()
-
-
-@pytest.mark.slow
-def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
-    noise = (0.03, np.radians(4.0))
-    problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
-    names = tuple(f"{k}.png" for k in range(12))
-    pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
-    found = calibrate_poses(pairs)
-    assert not found.converged
-    promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
-    used = problem.base_from_gripper[found.inliers]
-    _, proposed = next_poses(used, 2, problem.gripper_from_camera, noise)
-    assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)

@@ -88,7 +88,11 @@ def focal_of_each(case: Case) -> Float[ndarray, "e p"]:
 
 def estimate_of(found: Adjusted, tracks: Tracks) -> Estimate:
     """What an adjustment came to, in the reconstruction whose tracks were adjusted."""
-    scale, base_from_recon = recon_frame(found, tracks)
+    return estimate_in(found, *recon_frame(found, tracks))
+
+
+def estimate_in(found: Adjusted, scale: float, base_from_recon: Float[ndarray, "4 4"]) -> Estimate:
+    """The same in a reconstruction that is scaled and placed like this."""
     return Estimate(
         gripper_from_camera=found.placed.x[0],
         scale=scale,

@@ -129,6 +129,9 @@ class Proposal(Part):
     like: str
     expected_std: Numbers7
     """In the order of `uncertainty`."""
+    within_95_mm: Spread | None = None
+    """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
+    rotation_95_deg: Spread | None = None
 
 
 class CalibrationFile(Part):
@@ -265,6 +268,8 @@ def calibration_file(
                 base_from_gripper=pose.base_from_gripper.tolist(),
                 like=names[pose.like],
                 expected_std=pose.expected_std.tolist(),
+                within_95_mm=pose.within_95_mm,
+                rotation_95_deg=pose.rotation_95_deg,
             )
             for pose in hand_eye.next_poses
         ],

@@ -85,11 +85,17 @@ class Case:
         return replace(self, chosen_tracks=tracks)
 
     @property
-    def scene_in_base(self) -> Scene | None:
-        """What the camera sees, and how well its points are known; None where the images were not adjusted."""
+    def scene_distance_m(self) -> float | None:
+        """Median distance from the camera to what it sees; None where the calibration is not made of images."""
         if self.adjusted is None or self.hand_eye.before is None:
             return None
-        distance = float(np.median(self.adjusted.given.evidence.view.depth)) * self.adjusted.placed.scale
+        return float(np.median(self.adjusted.given.evidence.view.depth)) * self.adjusted.placed.scale
+
+    @property
+    def scene_in_base(self) -> Scene | None:
+        """What the camera sees, and how well its points are known; None where the images were not adjusted."""
+        if self.adjusted is None or (distance := self.scene_distance_m) is None:
+            return None
         return Scene(distance, scene_uncertainty(points_in_base(self.adjusted)))
 
     @property

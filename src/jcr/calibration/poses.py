@@ -3,14 +3,15 @@
 import numpy as np
 
 from jcr.calibration.cues import height_cue
+from jcr.calibration.expected import assumed_of_poses
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
+from jcr.calibration.robot_errors import RobotErrors, errors_of
 from jcr.errors import InputError
 from jcr.handeye.arms import arm_named
 from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.fit import Cues
 from jcr.handeye.solve import SCALE_STD, solve_hand_eye
-from jcr.handeye.systematic import systematic_errors
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
 METRIC_STD = 0.005
@@ -24,17 +25,20 @@ def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -
     that do not show a scale are helped by taking it as 1.
     """
     check_options(options := options or CalibrateOptions())
-    hand_eye = _calibrated_poses(pairs, options)
+    robot = errors_of(pairs.base_from_gripper, None if options.robot is None else arm_named(options.robot))
+    hand_eye = _calibrated_poses(pairs, options, robot)
     is_known = options.scale is not None or (pairs.is_metric and is_one(hand_eye))
-    return advised(hand_eye, pairs.base_from_gripper, options, SCALE_STD if is_known else None)
+    gripper = pairs.base_from_gripper
+    assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], SCALE_STD if is_known else None)
+    return advised(hand_eye, gripper, options, robot, assumptions)
 
 
-def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions) -> HandEye:
+def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotErrors) -> HandEye:
     gripper, camera, noise = pairs.base_from_gripper, pairs.recon_from_camera, options.robot_noise_m_rad
     if options.known_length is not None:
         raise InputError("--known-length: there are no images in which it could be seen; leave it out")
     offset = None if options.known_height is None else height_cue(gripper, options.known_height / 1e3)
-    systematic = systematic_errors(gripper, None if options.robot is None else arm_named(options.robot))
+    systematic = robot.systematic
     cues = Cues(offset=offset)
     free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale

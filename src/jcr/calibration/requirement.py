@@ -1,17 +1,24 @@
 """What a calibration is needed for: how exact it must be, how exact it is, and how many more images reach that."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.expected import (
+    Ahead,
+    Assumptions,
+    typical_noise,
+    worse_of,
+)
 from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
-from jcr.handeye.equation import ASSUMED_NOISE, expected_covariance, point_ahead, pose_information
-from jcr.handeye.next_poses import looked_at, next_poses
+from jcr.handeye.next_poses import assumed_camera
 from jcr.handeye.observability import excitation
-from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement
+from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -26,29 +33,28 @@ def advised(
     hand_eye: HandEye,
     gripper: Float[ndarray, "m 4 4"],
     options: CalibrateOptions,
-    scale_std: float | None = None,
+    robot: RobotErrors,
+    assumptions: Assumptions,
     scene: Scene | None = None,
 ) -> HandEye:
     """With what the motions show of each direction, how exact it is in use, the requirement, and the poses to add.
 
-    `gripper` are the poses that the solver was given, in its order; `scale_std` is how well the scale was known
-    beforehand (relative); `scene` is what the camera sees, where images were adjusted.
+    `gripper` are the poses that the solver was given, in its order, `robot` is of these; `assumptions` are those of the
+    calibration, `scene` is what the camera sees, where images were adjusted.
     """
-    used = gripper[hand_eye.inliers]
-    if scene is None:
-        scene = Scene(float(np.median(looked_at(used @ hand_eye.gripper_from_camera)[1])))
-    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene))
+    used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
+    hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
     required = _required(hand_eye, options)
+    assumptions = replace(assumptions, faults=_by_intrinsics(hand_eye))
     if hand_eye.converged:
-        reach, proposed = _worthwhile(hand_eye, used, required, scale_std)
+        reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
     else:
-        # An X that is not trusted is not used, nor a robot that is worse than assumed promised away.
-        metres, radians = hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation
-        at_least = max(metres, ASSUMED_NOISE[0]), max(radians, ASSUMED_NOISE[1])
-        _, proposed = next_poses(used, PROPOSED, noise=at_least, distance_m=1e-3 * required.distance_mm)
-        by_lens = np.sqrt(np.diag(_by_intrinsics(hand_eye)))
-        proposed = [replace(pose, expected_std=np.hypot(pose.expected_std, by_lens)) for pose in proposed]
+        # An X that is not trusted is not used, nor a robot that is worse than usual promised away.
+        noise = worse_of(hand_eye.robot_noise, typical_noise())
+        assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
+        ahead = Ahead.of(assumptions, used, robot, PROPOSED)
+        proposed = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, PROPOSED + 1)]
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
@@ -105,51 +111,46 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
 
 
 def _worthwhile(
-    hand_eye: HandEye, used: Float[ndarray, "k 4 4"], required: Requirement, scale_std: float | None
+    hand_eye: HandEye,
+    used: Float[ndarray, "k 4 4"],
+    required: Requirement,
+    assumptions: Assumptions,
+    robot: RobotErrors,
 ) -> tuple[int | None, list[NextPose]]:
     """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
 
-    Errors shrink by the share by which the expected ones of the poses alone do: images, intrinsics and correlated errors
-    make the two differ. No views make up for given intrinsics that are wrong, nor for systematic errors of the robot
-    where they are most of it; a smaller part may be that their size is hardly known, and more views tell it.
+    What is reported shrinks by the share by which what is expected does, for the very images and robot may do better or
+    worse than expected.
     """
-    x, noise = hand_eye.gripper_from_camera, (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    stays = _by_intrinsics(hand_eye)
-    systematic = None if hand_eye.budget is None else hand_eye.budget.robot_systematic
-    if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
-        stays = stays + systematic
-    distance = 1e-3 * required.distance_mm
-    _, proposed = next_poses(used, PROPOSED if required.met else MOST, x, noise, distance_m=distance)
-    added = np.stack([pose.base_from_gripper for pose in proposed])
-    information = np.cumsum(
-        np.concatenate([pose_information(used, x, noise).sum(0)[None], pose_information(added, x, noise)]), 0
-    )
-    if scale_std is not None:
-        information[:, 6, 6] += scale_std**-2.0
-    expected = expected_covariance(information)
-    shrinks = np.sqrt(np.maximum(np.diag(hand_eye.covariance - stays), 0.0))
-    share = shrinks / np.sqrt(np.diag(expected[0]))
-    left = expected[1:] * np.outer(share, share) + stays
-    proposed = [
-        replace(pose, expected_std=np.sqrt(np.diag(then))) for pose, then in zip(proposed, left, strict=True)
-    ]
-    if required.met:
-        return 0, proposed
-    point = point_ahead(x, distance)
-    mm = _shrunk(required.reached_mm, 1e3 * within_95(point @ stays @ point.T), point @ expected @ point.T)
-    deg_stays = np.degrees(within_95(stays[3:6, 3:6]))
-    deg = _shrunk(required.reached_deg, float(deg_stays), expected[:, 3:6, 3:6])
-    for count, (millimetres, degrees) in enumerate(zip(mm, deg, strict=True), start=1):
-        if replace(required, reached_mm=float(millimetres), reached_deg=float(degrees)).met:
-            return count, proposed[: max(PROPOSED, count)]
-    return None, proposed[:PROPOSED]
+    ahead = Ahead.of(assumptions, used, robot, PROPOSED if required.met else MOST)
+    now, expected = ahead.expected(0), cache(ahead.expected)
 
+    def shrunk(count: int, at: Where, mm: float, deg: float) -> tuple[float, float]:
+        (now_mm, now_deg), (then_mm, then_deg) = now.reached(at), expected(count).reached(at)
+        return mm * then_mm / now_mm, deg * then_deg / now_deg
 
-def _shrunk(now: float, stays: float, expected: Float[ndarray, "k n n"]) -> Float[ndarray, " j"]:
-    """An error with each number of further poses, j = k - 1: of its square what does not stay shrinks as expected."""
-    variance = np.trace(expected, axis1=1, axis2=2)
-    stays = min(stays, now)
-    return np.sqrt(stays**2 + (now**2 - stays**2) * variance[1:] / variance[0])
+    def is_met(count: int) -> bool:
+        mm, deg = shrunk(count, required.at, required.reached_mm, required.reached_deg)
+        return replace(required, reached_mm=mm, reached_deg=deg).met
+
+    reach = 0 if required.met else None
+    if not required.met and is_met(MOST):
+        reach = next(count for count in range(1, MOST + 1) if is_met(count))
+    found, std = hand_eye.in_use, np.sqrt(np.diag(hand_eye.covariance))
+    assert found is not None
+    proposed = []
+    for count in range(1, max(PROPOSED, reach or 0) + 1):
+        then = expected(count)
+        mm, deg = shrunk(count, "seen", found.seen.within_95_mm, found.seen.rotation_95_deg)
+        proposed.append(
+            replace(
+                ahead.next_pose(count, then),
+                expected_std=std * then.std / now.std,
+                within_95_mm=mm,
+                rotation_95_deg=deg,
+            )
+        )
+    return reach, proposed
 
 
 def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:

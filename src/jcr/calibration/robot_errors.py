@@ -10,9 +10,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.urdf_chain import read_chain
 from jcr.errors import InputError
 from jcr.handeye.arms import arm_named
+from jcr.handeye.equation import Poses
+from jcr.handeye.inverse_kinematics import reach_toward
 from jcr.handeye.mounting import LengthError
+from jcr.handeye.next_poses import nearest
 from jcr.handeye.robots import Arm, Joints
-from jcr.handeye.systematic import arm_errors, posed, systematic_errors
+from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.records import Capture, Finding, Kind
 
 
@@ -34,6 +37,16 @@ class RobotErrors:
         joints = None if self.joints is None else self.joints[poses]
         return replace(self, systematic=of_poses(self.systematic, poses), joints=joints)
 
+    def with_poses(self, base_from_gripper: Poses, added: Float[ndarray, "c 4 4"]) -> Float[ndarray, "s s"]:
+        """Covariance at 1 rad of the errors of these poses and then of others that the robot may go to, in the posture
+        that it has at the nearest of these."""
+        if len(added) == 0:
+            return self.systematic
+        if self.arm is None or self.joints is None:
+            return smooth_errors(np.concatenate([base_from_gripper, added]))
+        start = self.joints[nearest(added, base_from_gripper)]
+        return arm_errors(self.arm, np.concatenate([self.joints, reach_toward(self.arm, added, start)]))
+
 
 def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | None = None) -> RobotErrors:
     """What is known of the errors of the capture's gripper poses and of `later` ones of the same robot.
@@ -46,18 +59,25 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
         gripper = np.concatenate([gripper, later.base_from_gripper])
         joints = None if joints is None or later.joints is None else np.concatenate([joints, later.joints])
     try:
-        arm = _arm(capture, options)
-        if arm is None:
-            return RobotErrors(systematic_errors(gripper))
-        arm, joints = posed(arm, joints, gripper)
-        return RobotErrors(arm_errors(arm, joints), arm, joints)
+        return errors_of(gripper, _arm(capture, options), joints)
     except LengthError:
         raise
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None
         unused = Finding(kind=Kind.ROBOT_UNUSED, severity="warns", mend="robot", details={"text": str(error)})
-        return RobotErrors(systematic_errors(gripper), unused=unused)
+        return replace(errors_of(gripper), unused=unused)
+
+
+def errors_of(gripper: Poses, arm: Arm | None = None, joints: Joints | None = None) -> RobotErrors:
+    """Of these poses of an arm at these joint angles (rad), or of any robot; unknown angles are found from the poses.
+
+    InputError where poses, joints and arm do not fit.
+    """
+    if arm is None:
+        return RobotErrors(smooth_errors(gripper))
+    arm, joints = posed(arm, joints, gripper)
+    return RobotErrors(arm_errors(arm, joints), arm, joints)
 
 
 def _arm(capture: Capture, options: CalibrateOptions) -> Arm | None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from jcr.calibration.adjust import adjusted
 from jcr.calibration.checks.table import CHECKS
+from jcr.calibration.expected import assumed_of
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
@@ -39,7 +40,7 @@ def calibrate(
                 if case.hand_eye.converged:
                     raise
     scene = case.scene_in_base
-    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, reconstruction.metric_std, scene)
+    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, robot, assumed_of(case), scene)
     if capture.intrinsics is None or scene is None:
         return hand_eye
     pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)

@@ -24,7 +24,12 @@ def summary(content: "CalibrationFile") -> str:
     lines = found(content)
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
     if content.next_poses:
-        then = " ".join(significant(1e3 * std) for std in content.next_poses[-1].expected_std[:3])
+        last = content.next_poses[-1]
+        # Files of earlier versions expect of the camera alone.
+        then = f"the camera ± {' '.join(significant(1e3 * std) for std in last.expected_std[:3])} mm"
+        if last.within_95_mm is not None and last.rotation_95_deg is not None:
+            seen = f"{significant(last.within_95_mm)} mm and {significant(last.rotation_95_deg)}°"
+            then = f"a seen point within {seen} (95 % of errors), {then}"
         near = ", ".join(pose.like for pose in content.next_poses)
         if (
             content.uncertainty is not None
@@ -39,7 +44,7 @@ def summary(content: "CalibrationFile") -> str:
         reach = required is not None and bool(required.more_images)
         lines.append(
             f"{len(content.next_poses)} more views, like {near} but rotated (next_poses in calibration.json), "
-            f"would give ± {then} mm{', within what is needed' if reach else ''}"
+            f"would give {then}{', within what is needed' if reach else ''}"
         )
     return "\n".join(lines) + "\n"
 

@@ -56,9 +56,9 @@ def best_frames(
         )
     information = pose_information(base_from_gripper[views], np.eye(4), ASSUMED_NOISE)
     at_rest = speed[views] < STILL
-    chosen, _ = most_informative(np.zeros((13, 13)), information[at_rest], count)
+    chosen = most_informative(np.zeros((13, 13)), information[at_rest], count)
     known = information[at_rest].sum(0) if at_rest.any() else np.zeros((13, 13))
-    more, _ = most_informative(known, information[~at_rest], count - len(chosen))
+    more = most_informative(known, information[~at_rest], count - len(chosen))
     frames = np.sort(np.concatenate([views[at_rest][chosen], views[~at_rest][more]]))
     return frames, tuple(_remarks(frames, speed, len(sharpest) - len(sharp), int(at_rest.sum()), count))
 

@@ -12,6 +12,7 @@ from jcr.cli.output import Output
 from jcr.cli.source import looked_at
 
 if TYPE_CHECKING:
+    from jcr.calibration.expected import Expectation
     from jcr.check import Examination
     from jcr.records import Capture, PosePairs
 
@@ -84,13 +85,15 @@ def main(arguments: Arguments) -> int:
 
 def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     from jcr.check import QUICK
+    from jcr.rounding import significant
 
     turn = np.degrees(found.largest_turn_rad)
     lines = [
         _as_read(capture),
         f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {turn:.0f}°",
-        f"expected uncertainty: {_std(found.expected_std)}",
     ]
+    if found.expected is not None:
+        lines += _expected(found.expected, len(found.counted), found.hand_eye is not None)
     if found.hand_eye is not None:
         noise = found.hand_eye.robot_noise
         looked = len(found.hand_eye.inliers)
@@ -103,9 +106,10 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     lines += [f"remark: {remark}" for remark in found.remarks]
     for k, pose in enumerate(found.suggestions, start=1):
         matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True)
+        then = f"{significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
         lines += [
             f"add pose {k}: {1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.turned_rad):.0f}° from that of "
-            f"{capture.images[pose.like]}; then {_std(pose.expected_std)}; base_from_gripper:",
+            f"{capture.images[pose.like]}; then within {then}; base_from_gripper:",
             *(f"  {row}" for row in matrix.splitlines()),
         ]
     if not found.faults:
@@ -123,10 +127,20 @@ def _as_read(capture: "Capture | PosePairs") -> str:
     return f"{len(capture)} images of {width}x{height}, intrinsics {lens}"
 
 
-def _std(std: np.ndarray) -> str:
-    offset = " ".join(f"{1e3 * value:.2g}" for value in std[:3])
-    turn = " ".join(f"{np.degrees(value):.2g}" for value in std[3:6])
-    return f"± {offset} mm, {turn} °, scale {100 * std[6]:.2g} %"
+def _expected(expected: "Expectation", images: int, is_measured: bool) -> list[str]:
+    """What the calibration of this many images would report, in the words of that report."""
+    from jcr.rounding import significant
+
+    seen, std = expected.seen, expected.std
+    of = "found in the images" if is_measured else "usual"
+    offset = " ".join(significant(1e3 * value) for value in std[:3])
+    turn = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
+    return [
+        f"expected of {images} images: a point seen at {significant(1e-3 * seen.distance_mm)} m is placed within "
+        f"{significant(seen.within_95_mm)} mm and {significant(seen.rotation_95_deg)}° (95 % of errors)",
+        f"  the camera on the gripper ± {offset} mm, {turn} °, scale {significant(100 * std[6])} % (1 σ); robot errors "
+        f"and image noise as {of}",
+    ]
 
 
 def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, Any]:
@@ -144,7 +158,9 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             "unobservable": list(found.observability.unobservable),
             "advice": list(found.observability.advice),
         },
-        "expected_std": found.expected_std.tolist(),
+        "expected_std": None if found.expected_std is None else found.expected_std.tolist(),
+        "expected_seen": None if found.expected is None else vars(found.expected.seen),
+        "expected_images": [capture.images[row] for row in found.counted],
         "robot_noise": None
         if noise is None
         else {
@@ -158,6 +174,8 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             {
                 "base_from_gripper": pose.base_from_gripper.tolist(),
                 "expected_std": pose.expected_std.tolist(),
+                "within_95_mm": pose.within_95_mm,
+                "rotation_95_deg": pose.rotation_95_deg,
                 "like": capture.images[pose.like],
             }
             for pose in found.suggestions

@@ -10,6 +10,7 @@ distribution of its covariance: the covariance is scaled until its 99 % ellipsoi
 that is many standard deviations off is the worst fault.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -22,7 +23,7 @@ from scipy.optimize import root_scalar
 
 from jcr.distributions import chi2
 from jcr.handeye.systematic import REACH, Region
-from jcr.records import Budget
+from jcr.records import Budget, RobotNoise
 
 NOISE_FLOOR = (2e-5, np.radians(0.002))
 """m, rad; so that a perfect fit does not claim a perfect robot."""
@@ -33,6 +34,8 @@ FACTOR_STD = np.log([10.0, 10.0, 3.0])
 servo arms 1 to 2°."""
 GIVEN_SHARE = 0.3
 """Of a given noise, that a robot has beside it: the middle of the prior."""
+LEAST_BESIDE = 0.01
+"""Of what is counted anyway, that errors beside it are at least: the logarithm of no error is not finite."""
 RATIO_STD = np.log(4.0)
 """Of log(σ_t / (REACH · σ_r)) over robots. Tied more closely, by a factor of 2, three images of a robot whose rotations
 are six times better than its positions cover 80 to 90 %."""
@@ -104,6 +107,12 @@ class Equations:
         variances = np.exp(2 * log_sizes)
         variances[..., :2] += self.least**2
         return variances
+
+    def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, " c"]:
+        """The sizes that this noise is made of; of what is counted anyway they are a hundredth at least."""
+        sizes = np.array([noise.translation, noise.rotation, noise.systematic])[: self.count]
+        beside = np.sqrt(np.maximum(sizes[:2] ** 2 - self.least**2, (LEAST_BESIDE * self.least) ** 2))
+        return np.log(np.r_[beside, np.maximum(sizes[2:], LEAST_BESIDE * self.least[1])])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
         """Variance of each residual's random part."""
@@ -282,7 +291,53 @@ def posterior(
     off = steps - step
     covariance = np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off)
     covariance *= _widening(weight, off[:, :POSES], each[:, :POSES, :POSES], covariance[:POSES, :POSES])
-    return Posterior(step, covariance, _budget(equations, log_sizes, region, covariance), log_sizes)
+    elsewhere = _elsewhere(equations, solve(equations, log_sizes), log_sizes, region)
+    return Posterior(step, covariance, _budget(equations, log_sizes, elsewhere, covariance), log_sizes)
+
+
+def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
+    """The posterior to expect of a robot with this noise, before there are any residuals: those of `equations` are 0.
+
+    In the density of the sizes the squares of residuals are replaced by their expectations, tr(P V) for the covariance V
+    that the noise gives them.
+    """
+    mode = equations.log_sizes_of(noise)
+    root = _cholesky(equations.covariance(mode))
+
+    def density(solution: Solution) -> Each:
+        whitened = lower(solution.root, root)
+        fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ root)
+        return solution.log_posterior - ((whitened**2).sum((-1, -2)) - (fitted**2).sum((-1, -2))) / 2
+
+    found = over_sizes(equations, mode, _score(equations, mode)[2], density)
+    weight = np.concatenate([share for share, _, _ in found])
+    each = np.concatenate(
+        [solution.covariance + _expected_elsewhere(equations, sizes, region) for _, sizes, solution in found]
+    )
+    covariance = np.einsum("k,kij->ij", weight, each)
+    off = np.zeros((len(weight), len(covariance[:POSES])))
+    covariance *= _widening(weight, off, each[:, :POSES, :POSES], covariance[:POSES, :POSES])
+    budget = _budget(equations, mode, _expected_elsewhere(equations, mode, region), covariance)
+    return Posterior(np.zeros(len(covariance)), covariance, budget, mode)
+
+
+def expected_covariance_at(
+    equations: Equations, noise: RobotNoise, region: Region | None
+) -> Float[ndarray, "p p"]:
+    """The covariance of the same at the sizes themselves, as if these were known exactly: for comparisons."""
+    mode = equations.log_sizes_of(noise)
+    return solve(equations, mode).covariance + _expected_elsewhere(equations, mode, region)
+
+
+def _expected_elsewhere(
+    equations: Equations, log_sizes: LogSizes, region: Region | None
+) -> Float[ndarray, "*k p p"]:
+    """`_elsewhere` before there are residuals: what they will show of the systematic part is as large as it is."""
+    if region is None or equations.systematic is None:
+        return np.zeros((*log_sizes.shape[:-1], *equations.prior_information.shape))
+    return region.spread(
+        equations.variances(log_sizes)[..., 2, None, None, None] * _own(equations.systematic)
+    )
 
 
 def restricted_log_likelihood(equations: Equations, log_sizes: LogSizes) -> float:
@@ -304,14 +359,20 @@ def log_evidence(equations: Equations, solution: Solution, information: Float[nd
 
 
 def over_sizes(
-    equations: Equations, log_sizes: LogSizes, information: Float[ndarray, "c c"]
+    equations: Equations,
+    log_sizes: LogSizes,
+    information: Float[ndarray, "c c"],
+    density: Callable[[Solution], Each] = lambda solution: solution.log_posterior,
 ) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]:
-    """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
-    sizes, log_volumes = _grid(equations, log_sizes, information)
+    """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups.
+
+    `density` is the logarithm of the sizes' posterior, up to a constant.
+    """
+    sizes, log_volumes = _grid(equations, log_sizes, information, lambda at: density(solve(equations, at)))
     together = max(1, int(AT_ONCE / len(equations.residual) ** 2))
     groups = [sizes[at : at + together] for at in range(0, len(sizes), together)]
     solutions = [solve(equations, group) for group in groups]
-    log_weight = np.concatenate([solution.log_posterior for solution in solutions]) + log_volumes
+    log_weight = np.concatenate([density(each) for each in solutions]) + log_volumes
     weight = np.exp(log_weight - log_weight.max())
     shares = np.split(weight / weight.sum(), np.cumsum([len(group) for group in groups])[:-1])
     return list(zip(shares, groups, solutions, strict=True))
@@ -361,7 +422,10 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
 
 
 def _grid(
-    equations: Equations, mode: LogSizes, information: Float[ndarray, "c c"]
+    equations: Equations,
+    mode: LogSizes,
+    information: Float[ndarray, "c c"],
+    log_density: Callable[[LogSizes], Each],
 ) -> tuple[Float[ndarray, "k c"], Float[ndarray, " k"]]:
     """Log sizes about their mode, and the log of the volume that each stands for.
 
@@ -373,9 +437,9 @@ def _grid(
         return mode[None], np.zeros(1)
     values, vectors = np.linalg.eigh(information)
     axes = vectors / np.sqrt(values)
-    top, probe = solve(equations, mode).log_posterior, 1.5
+    top, probe = log_density(mode), 1.5
     beside = mode + probe * np.concatenate([-axes.T, axes.T])
-    drop = top - np.array([solve(equations, at).log_posterior for at in beside])
+    drop = top - np.array([log_density(at) for at in beside])
     shorter, longer = np.clip(probe / np.sqrt(np.maximum(2 * drop, 1e-3)), 0.3, 3.0).reshape(2, -1)
     z = np.array(list(product(LEVELS, repeat=len(mode))))
     z = z[(z**2).sum(1) < (FARTHEST if poses < MANY else LESS_FAR)]
@@ -394,15 +458,19 @@ def _elsewhere(
     expected = part @ over(solution.root, left)
     shown = lower(solution.root, part)
     fitted = lower(solution.information_root, np.swapaxes(solution.weighed, -1, -2) @ part)
-    m = len(equations.residual) // 6
-    blocks = np.arange(m)
-    own = part.reshape(*part.shape[:-2], m, 6, m, 6)[..., blocks, :, blocks, :]
-    own = np.moveaxis(own, 0, -3)
+    m, own = len(equations.residual) // 6, _own(part)
     for sign, root in ((-1, shown), (1, fitted)):
         columns = np.moveaxis(root.reshape(*root.shape[:-1], m, 6), -2, -3)
         own = own + sign * np.swapaxes(columns, -1, -2) @ columns
     expected = expected.reshape(*expected.shape[:-2], m, 6)
     return region.spread(own + expected[..., :, None] * expected[..., None, :])
+
+
+def _own(covariance: Float[ndarray, "*k s s"]) -> Float[ndarray, "*k m 6 6"]:
+    """The block of each pose by itself."""
+    m = covariance.shape[-1] // 6
+    each = np.arange(m)
+    return np.moveaxis(covariance.reshape(*covariance.shape[:-2], m, 6, m, 6)[..., each, :, each, :], 0, -3)
 
 
 def _widening(
@@ -451,7 +519,10 @@ def _between(one: Float[ndarray, "p p"], other: Float[ndarray, "p p"]) -> Float[
 
 
 def _budget(
-    equations: Equations, log_sizes: LogSizes, region: Region | None, covariance: Float[ndarray, "p p"]
+    equations: Equations,
+    log_sizes: LogSizes,
+    elsewhere: Float[ndarray, "p p"],
+    covariance: Float[ndarray, "p p"],
 ) -> Budget:
     """The covariance of X and scale by its causes, which share what the averaging over sizes added.
 
@@ -475,7 +546,7 @@ def _budget(
         images = images + gain @ exact.known @ gain.T
     free = solve(equations, log_sizes)
     intrinsics = free.covariance[:POSES, :POSES] - solution.covariance
-    systematic = systematic + _elsewhere(equations, free, log_sizes, region)[:POSES, :POSES]
+    systematic = systematic + elsewhere[:POSES, :POSES]
     parts = [part[:7, :7] for part in (random, systematic, intrinsics, images)]
     to_whole = _between(sum(parts[1:], parts[0]), covariance[:7, :7])
     random, systematic, intrinsics, _ = (to_whole @ part @ to_whole.T for part in parts)

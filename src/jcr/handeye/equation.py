@@ -93,14 +93,20 @@ def expected_covariance(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarra
     return np.linalg.inv(with_prior)[..., :7, :7]
 
 
-def expected_std(hessian: Float[ndarray, "*batch 13 13"]) -> Float[ndarray, "*batch 7"]:
-    """Its standard deviations."""
-    return np.sqrt(np.diagonal(expected_covariance(hessian), axis1=-2, axis2=-1))
-
-
 def point_ahead(x: Float[ndarray, "4 4"], distance_m: float) -> Float[ndarray, "3 7"]:
     """By how much a point on the optical axis moves on the gripper, in gripper axes, with X and scale."""
     return by_similarity(distance_m * x[:3, 2])
+
+
+def uncertainty(
+    covariance: Float[ndarray, "*batch 7 7"], point: Float[ndarray, "3 7"] | None = None
+) -> Float[ndarray, "*batch"] | np.floating:
+    """One number for it: variances over what counts alike, of the camera, the rotation and the scale, or of the place
+    of a `point_ahead`, which the scale moves, and the rotation."""
+    counted = np.eye(7) / UNIT[:, None]
+    if point is not None:
+        counted = np.concatenate([point / UNIT[TRANSLATION, None], counted[ROTATION]])
+    return np.einsum("ri,...ij,rj->...", counted, covariance, counted)
 
 
 def most_informative(
@@ -108,24 +114,16 @@ def most_informative(
     gain: Float[ndarray, "k 13 13"],
     count: int,
     point: Float[ndarray, "3 7"] | None = None,
-) -> tuple[Int[ndarray, " c"], Float[ndarray, "c 7"]]:
-    """The `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
+) -> Int[ndarray, " c"]:
+    """The rows of the `count` candidates that leave the least uncertainty, chosen one by one (A-optimal design).
 
-    What counts is the position of a point (`point_ahead`; by default the camera), the rotation and the scale. Returns
-    the candidates' rows, and the standard deviations expected with each and those before it.
+    What counts is what `uncertainty` counts.
     """
-    counted = np.eye(7)
-    if point is not None:
-        counted[:3] = point
-    counted /= UNIT[:, None]
     rows: list[int] = []
     left = np.arange(len(gain))
-    stds = np.zeros((min(count, len(gain)), 7))
-    for k in range(len(stds)):
-        covariance = expected_covariance(known + gain[left])
-        best = int(np.einsum("ri,kij,rj->k", counted, covariance, counted).argmin())
-        stds[k] = np.sqrt(np.diag(covariance[best]))
+    for _ in range(min(count, len(gain))):
+        best = int(np.argmin(uncertainty(expected_covariance(known + gain[left]), point)))
         known = known + gain[left[best]]
         rows.append(int(left[best]))
         left = np.delete(left, best)
-    return np.array(rows, dtype=int), stds
+    return np.array(rows, dtype=int)

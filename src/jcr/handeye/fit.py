@@ -20,10 +20,19 @@ from numpy import ndarray
 from scipy.linalg import cho_solve
 
 from jcr.geometry import retract
-from jcr.handeye.components import Equations, Solution, log_evidence, most_likely, posterior, solve
+from jcr.handeye.components import (
+    Equations,
+    Solution,
+    expected_covariance_at,
+    expected_posterior,
+    log_evidence,
+    most_likely,
+    posterior,
+    solve,
+)
 from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals, residuals_by_camera
 from jcr.handeye.systematic import Region, smooth_errors
-from jcr.records import Budget
+from jcr.records import Budget, RobotNoise
 
 SHOWN = 1.1
 """Times the noise that was given: so much more is the residuals' doing."""
@@ -130,6 +139,33 @@ def fit_poses(
         missed,
         missed_covariance,
     )
+
+
+def expected_fit(
+    base_from_gripper: Poses,
+    gripper_from_camera: Float[ndarray, "4 4"],
+    noise: RobotNoise,
+    systematic: Float[ndarray, "r r"],
+    cues: Cues | None = None,
+    averaged: bool = True,
+) -> Float[ndarray, "7 7"]:
+    """Covariance that a fit to exact camera poses is expected to report, of a robot with this noise; the scale being 1.
+
+    `systematic`, `cues` and `averaged` are as `fit_poses` takes them.
+    """
+    problem = _Problem(
+        base_from_gripper,
+        base_from_gripper @ gripper_from_camera,
+        np.ones(len(base_from_gripper), bool),
+        noise.given,
+        cues or Cues(),
+        None,
+        systematic,
+    )
+    linear = _linearised(problem, (gripper_from_camera, 1.0, np.eye(4)))
+    if averaged:
+        return expected_posterior(linear.equations, noise, linear.region).covariance[:7, :7]
+    return expected_covariance_at(linear.equations, noise, linear.region)[:7, :7]
 
 
 def _stepped(

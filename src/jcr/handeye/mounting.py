@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.geometry import ARM, inverse, rotation_exp, transform
 from jcr.handeye.closed_form import closed_form
-from jcr.handeye.equation import Poses, expected_std, residuals
+from jcr.handeye.equation import Poses, expected_covariance, residuals
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, with_tool
 
@@ -71,7 +71,7 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
     left = max(6 * len(nominal) - j.shape[2], 1)
     noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).sum((0, 2)) * 2 / left), NOISE)
     j /= np.repeat(noise, 3)[:, None]
-    std = factor * float(expected_std(np.einsum("nij,nik->jk", j, j))[6])
+    std = factor * float(np.sqrt(expected_covariance(np.einsum("nij,nik->jk", j, j))[6, 6]))
     if abs(factor - 1) > max(ALIKE, SURE * std):
         raise LengthError(
             f"the gripper positions are {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % too "

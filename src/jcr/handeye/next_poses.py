@@ -1,25 +1,20 @@
-"""Which gripper poses to add: those that shrink the reported standard deviations most, before any image.
+"""Which gripper poses to add: those that tell most of a seen point, the rotation and the scale, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
-the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design).
+the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). That is of random
+errors of the gripper poses alone; calibration/expected.py compares a few with what systematic ones leave.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_angle, rotation_exp, transform
-from jcr.handeye.equation import (
-    ASSUMED_NOISE,
-    Poses,
-    expected_std,
-    most_informative,
-    point_ahead,
-    pose_information,
-)
-from jcr.records import NextPose
+from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_exp, transform
+from jcr.handeye.equation import ASSUMED_NOISE, Poses, most_informative, point_ahead, pose_information
 
 CANDIDATES = 600
+SCENE_AHEAD = (0.1, 2.0)
+"""m: nearest and farthest that a scene is taken to be."""
 
 
 def next_poses(
@@ -30,25 +25,28 @@ def next_poses(
     reach: Float[ndarray, "2 3"] | None = None,
     seed: int = 0,
     distance_m: float | None = None,
-) -> tuple[Float[ndarray, "7"], list[NextPose]]:
-    """Standard deviations expected now, and `count` poses to add, best first.
+) -> Float[ndarray, "c 4 4"]:
+    """`count` gripper poses to add, best first.
 
     `reach` is the box (m, base) that gripper positions stay in; by default that of the capture and a quarter
-    more. Without a hand-eye transform the camera is taken to sit at the gripper and look along its z axis. They are best
+    more. Without a hand-eye transform that of `assumed_camera` is taken. They are best
     for a point so far ahead of the camera; by default as far as the scene.
     """
-    x = np.eye(4) if gripper_from_camera is None else gripper_from_camera
-    candidates = _candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
+    x = assumed_camera(base_from_gripper) if gripper_from_camera is None else gripper_from_camera
+    possible = candidates(base_from_gripper, x, reach, np.random.default_rng(seed))
     known = pose_information(base_from_gripper, x, noise).sum(0)
     if distance_m is None:
         distance_m = float(np.median(looked_at(base_from_gripper @ x)[1]))
-    point = point_ahead(x, distance_m)
-    rows, stds = most_informative(known, pose_information(candidates, x, noise), count, point)
-    described = zip(candidates[rows], stds, strict=True)
-    return expected_std(known), [_described(pose, std, base_from_gripper) for pose, std in described]
+    information = pose_information(possible, x, noise)
+    return possible[most_informative(known, information, count, point_ahead(x, distance_m))]
 
 
-def _candidates(
+def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c"]:
+    """The existing pose that each pose is nearest to."""
+    return motion_length(inverse(existing) @ poses[:, None]).argmin(1)
+
+
+def candidates(
     base_from_gripper: Poses,
     x: Float[ndarray, "4 4"],
     reach: Float[ndarray, "2 3"] | None,
@@ -89,10 +87,31 @@ def looked_at(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]
     scene = nearest_to_lines(center, axis)
     distance = np.linalg.norm(center - scene, axis=1)
     # Parallel axes meet nowhere; the scene is then taken half a metre ahead.
-    if not 0.1 < np.median(distance) < 2.0:
+    if not SCENE_AHEAD[0] < np.median(distance) < SCENE_AHEAD[1]:
         scene = (center + 0.5 * axis).mean(0)
         distance = np.linalg.norm(center - scene, axis=1)
     return scene, distance
+
+
+def assumed_camera(base_from_gripper: Poses) -> Float[ndarray, "4 4"]:
+    """gripper_from_camera before anything is known of it: a camera at the gripper that looks along one of its axes.
+
+    Along the one whose lines pass nearest to one point ahead, by their distance from it over the way to it: views of a
+    scene do.
+    """
+    center, best, least = base_from_gripper[:, :3, 3], np.array([0.0, 0.0, 1.0]), np.inf
+    for axis in np.concatenate([np.eye(3)[::-1], -np.eye(3)[::-1]]):
+        along = base_from_gripper[:, :3, :3] @ axis
+        to_scene = nearest_to_lines(center, along) - center
+        ahead = (to_scene * along).sum(1)
+        off = np.linalg.norm(to_scene - ahead[:, None] * along, axis=1)
+        if (
+            SCENE_AHEAD[0] < np.median(ahead) < SCENE_AHEAD[1]
+            and (miss := float(np.median(off / ahead.clip(1e-3)))) < least
+        ):
+            best, least = axis, miss
+    across = np.roll(best, 1)
+    return transform(np.stack([across, np.cross(best, across), best], axis=1), np.zeros(3))
 
 
 def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
@@ -102,10 +121,3 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
     turn = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
     return rotation_exp(cross / np.maximum(sine, 1e-12) * turn) @ rotation
-
-
-def _described(pose: Float[ndarray, "4 4"], std: Float[ndarray, "7"], existing: Poses) -> NextPose:
-    motion = inverse(existing) @ pose
-    like = int(np.argmin(motion_length(motion)))
-    moved, turned = np.linalg.norm(motion[like, :3, 3]), rotation_angle(motion[like, :3, :3])
-    return NextPose(pose, std, like, float(moved), float(turned))

@@ -35,7 +35,7 @@ class CollectOptions:
     ] = None
     """Box that contains all proposed gripper positions (m, base frame)."""
     wanted: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG")] = ENOUGH
-    """Target uncertainty (1 sigma) of the camera on the gripper, for the live page."""
+    """Target accuracy for the live page: 95 % of errors of a point seen at the distance of the scene."""
 
 
 def collect(
@@ -70,7 +70,7 @@ def collect(
             else:
                 name = live.add(taken.image, ask.base_from_gripper, ask.joints, taken.depth_mm)
                 kept.append(taken)
-                found = coverage(live, reach, words)
+                found = coverage(live, reach, words, found)
                 answer = {"accepted": True, "image": name, "done": len(live.names) >= options.images}
                 answer |= as_answer(found)
                 headline = f"{len(live.names)} images of {options.images}"

@@ -1,18 +1,29 @@
 """What the images taken so far will tell, and the pose that adds most; as text and as an answer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.handeye.equation import ASSUMED_NOISE, expected_std, pose_information
-from jcr.handeye.next_poses import next_poses
+from jcr.adjust.foreseen import ForeseenCamera
+from jcr.calibration.expected import (
+    FEWEST,
+    Ahead,
+    Expectation,
+    assumed,
+    expected,
+    typical_camera,
+)
+from jcr.calibration.robot_errors import RobotErrors, errors_of, of_poses
+from jcr.capture.lens_json import read_lens
+from jcr.errors import InputError
 from jcr.handeye.observability import observability
 from jcr.live.arm_words import ArmWords, Path, joints_at, pose_lines
 from jcr.live.asks import Answer
 from jcr.live.folder import LiveFolder
 from jcr.records import NextPose
+from jcr.rounding import significant
 
 ALTERNATIVES = 6
 """Proposals; the first that the arm reaches is taken."""
@@ -25,8 +36,8 @@ class Coverage:
     pictures: int
     unseen: tuple[str, ...]
     """What the motions do not show yet, in words."""
-    expected_std: Float[ndarray, "k 7"]
-    """records.COVARIANCE_ORDER, one sigma expected with the first 3, 4, … images."""
+    expected: tuple[Expectation, ...]
+    """With the first 3, 4, … images, if all register; of a usual robot and usual images."""
     next_pose: NextPose | None
     next_joints: Float[ndarray, " dof"] | None
     """rad; None where the arm is not known."""
@@ -35,43 +46,65 @@ class Coverage:
     words: ArmWords
 
     @property
-    def now(self) -> Float[ndarray, "7"] | None:
-        """One sigma expected with all images; None below three."""
-        return self.expected_std[-1] if len(self.expected_std) else None
+    def now(self) -> Expectation | None:
+        """With all images; None below three."""
+        return self.expected[-1] if self.expected else None
 
 
 def coverage(
-    live: LiveFolder, reach: Float[ndarray, "2 3"] | None = None, words: ArmWords | None = None
+    live: LiveFolder,
+    reach: Float[ndarray, "2 3"] | None = None,
+    words: ArmWords | None = None,
+    before: Coverage | None = None,
 ) -> Coverage:
-    """What the gripper poses in the folder will show, whatever is in the images."""
+    """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
     if len(live.poses) < 2:
-        return Coverage(len(live.poses), (), np.zeros((0, 7)), None, None, None, words)
-    poses = np.stack(live.poses)
-    known = pose_information(poses, np.eye(4), ASSUMED_NOISE).cumsum(0)
-    _, proposed = next_poses(poses, ALTERNATIVES if words.arm else 1, reach=reach)
-    chosen, joints = _reachable(proposed, Path(poses, live.all_joints()), words)
+        return Coverage(len(live.poses), (), (), None, None, None, words)
+    poses, joints = np.stack(live.poses), live.all_joints()
+    assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
+    proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
+    row, next_joints = _reachable(proposed.added, Path(poses, joints), words)
+    chosen = replace(proposed, added=proposed.added[row : row + 1])
+    known = () if before is None else before.expected
+    rows = [np.arange(count) for count in range(FEWEST + len(known), len(poses) + 1)]
+    more = [expected(assumptions, poses[some], of_poses(robot.systematic, some)) for some in rows]
+    next_pose = chosen.next_pose(1, chosen.expected(1))
     return Coverage(
         len(poses),
         observability(poses).unobservable,
-        expected_std(known[2:]),
-        chosen,
-        joints,
-        live.names[chosen.like],
+        (*known, *more),
+        next_pose,
+        next_joints,
+        live.names[next_pose.like],
         words,
     )
 
 
+def _camera(live: LiveFolder) -> ForeseenCamera:
+    assert live.size is not None
+    return typical_camera(read_lens(live.lens, live.size, live.folder), live.size)
+
+
+def _errors(
+    poses: Float[ndarray, "n 4 4"], words: ArmWords, joints: Float[ndarray, "n dof"] | None
+) -> RobotErrors:
+    """Of the arm that is named, where the poses are its own."""
+    try:
+        return errors_of(poses, words.arm, joints)
+    except InputError:
+        return errors_of(poses)
+
+
 def _reachable(
-    proposed: list[NextPose], path: Path, words: ArmWords
-) -> tuple[NextPose, Float[ndarray, " dof"] | None]:
+    proposed: Float[ndarray, "c 4 4"], path: Path, words: ArmWords
+) -> tuple[int, Float[ndarray, " dof"] | None]:
     """The first proposal that the arm reaches within its joint limits, and the angles; else the first, without."""
-    if words.arm is None:
-        return proposed[0], None
-    for pose in proposed:
-        if (joints := joints_at(words.arm, path, pose.base_from_gripper)) is not None:
-            return pose, joints
-    return proposed[0], None
+    if words.arm is not None:
+        for row, pose in enumerate(proposed):
+            if (joints := joints_at(words.arm, path, pose)) is not None:
+                return row, joints
+    return 0, None
 
 
 def in_words(found: Coverage) -> list[str]:
@@ -82,10 +115,14 @@ def in_words(found: Coverage) -> list[str]:
     pose = found.next_pose
     lines = [f"{found.pictures} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
     if (now := found.now) is not None and not found.unseen:
-        offset = ", ".join(f"{1e3 * value:.2g}" for value in now[:3])
-        lines[0] += f"; expected ± {offset} mm, scale {100 * now[6]:.2g} %"
+        mm, deg = (significant(value) for value in now.reached("seen"))
+        far = significant(1e-3 * now.seen.distance_mm)
+        lines[0] += (
+            f"; a point seen at {far} m is expected within {mm} mm and {deg}° (95 % of errors, usual robot)"
+        )
     moved, turned = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
-    lines.append(f"best next: {moved:.0f} mm and {turned:.0f}° from {found.like}")
+    then = f", then {significant(pose.within_95_mm)} mm" if now is not None else ""
+    lines.append(f"best next: {moved:.0f} mm and {turned:.0f}° from {found.like}{then}")
     return lines + [f"  {line}" for line in next_lines(found)]
 
 
@@ -105,7 +142,8 @@ def as_answer(found: Coverage) -> Answer:
     return {
         "pictures": found.pictures,
         "unobservable": list(found.unseen),
-        "expected_std": None if now is None else now.tolist(),
+        "expected_std": None if now is None else now.std.tolist(),
+        "expected_seen": None if now is None else vars(now.seen),
         "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
         "next_joints": None if found.next_joints is None else found.next_joints.tolist(),
     }

@@ -60,16 +60,21 @@ class Excitation:
     """Root mean square distance (m) of the camera centres from their mean."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """A gripper pose worth adding, and what is known with it and those before it."""
+    """A gripper pose worth adding, and how exact a calibration with it and those before it is expected to be."""
 
     base_from_gripper: Float[ndarray, "4 4"]
     expected_std: Float[ndarray, "7"]
     """In COVARIANCE_ORDER."""
+    within_95_mm: float
+    """Distance that 95 % of the errors of a seen point stay below, as Seen has it."""
+    rotation_95_deg: float
+    """The same of the directions of things seen there."""
     like: int
     """Row of the existing pose that it is nearest to."""
     moved_m: float
+    """From there."""
     turned_rad: float
 
 

@@ -88,10 +88,10 @@ def _next_poses(result: RunResult | PosesResult) -> str:
     )
     green = " The 3D view shows them in green." if isinstance(result, RunResult) else ""
     return (
-        '<h3>Poses to add</h3><p class="soft">Gripper poses that would shrink these most, one after the other, in '
-        f"reach of those of the capture; look that the arm is free to go there.{green}</p>"
-        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>by</th><th>then offset, '
-        f"orientation, scale</th></tr></thead><tbody>{rows}</tbody></table></div>"
+        '<h3>Poses to add</h3><p class="soft">Gripper poses that would make a seen point most exact, one after the '
+        f"other, in reach of those of the capture; look that the arm is free to go there.{green}</p>"
+        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>by</th><th>then a seen point, 95\u00a0%</th>'
+        f"<th>the camera, 1\u00a0σ</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )
 
 
@@ -101,6 +101,7 @@ def _next_pose(number: int, pose: NextPose, near: str) -> str:
     cells = (
         f"{escape(near)} {copy}",
         f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.turned_rad):.0f}°",
+        f"{significant(pose.within_95_mm)}\u00a0mm, {significant(pose.rotation_95_deg)}°",
         f"±{significant(1e3 * float(std[:3].max()))}\u00a0mm, "
         f"±{significant(float(np.degrees(std[3:6].max())))}°, ±{significant(100 * float(std[6]))}\u00a0%",
     )

@@ -1,0 +1,153 @@
+"""What is expected of a calibration before it is made, against what it then reports; and the poses to add."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.expected import FACTOR, simulated
+from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
+from jcr.calibration.calibration_json import CalibrationFile, calibration_file
+from jcr.calibration.expected import Ahead, assumed, expected, typical_camera
+from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.robot_errors import errors_of
+from jcr.check import check
+from jcr.geometry import transform
+from jcr.handeye.next_poses import assumed_camera
+from jcr.live.coverage import as_answer, coverage, in_words
+from jcr.live.folder import LiveFolder
+from jcr.records import Intrinsics, NextPose, PosePairs
+from jcr.rounding import significant
+
+WITHIN = np.log(FACTOR)
+
+
+@pytest.mark.slow
+def test_what_is_expected_is_what_is_reported():
+    """Arms of several kinds, six to twenty images, intrinsics given, wrong and unknown."""
+    rows = simulated(8)
+    ratios = np.log([row.ratios for row in rows])
+    assert len(rows) == 8 and (np.abs(ratios) < WITHIN).all(), np.exp(ratios)
+    assert (np.abs(np.median(ratios, axis=0)) < np.log(1.25)).all()
+
+
+@pytest.mark.slow
+def test_check_expects_of_the_bundled_capture_what_its_run_reports(tabletop: Path, done: Path):
+    uncertainty = CalibrationFile.model_validate_json((done / "calibration.json").read_text()).uncertainty
+    found = check(tabletop).expected
+    assert uncertainty is not None and uncertainty.seen is not None and found is not None
+    assert abs(np.log(found.seen.within_95_mm / uncertainty.seen.within_95_mm)) < WITHIN
+    assert abs(np.log(found.seen.rotation_95_deg / uncertainty.seen.rotation_95_deg)) < WITHIN
+    assert (np.abs(np.log(found.std[:3] / (1e-3 * np.array(uncertainty.translation_std_mm)))) < WITHIN).all()
+    assert (np.abs(np.log(np.degrees(found.std[3:6]) / uncertainty.rotation_std_deg)) < WITHIN).all()
+
+
+def views(tabletop: Path, folder: Path, rows: list[int], blurred: list[int]) -> Path:
+    """Some images of the bundled capture, some of them blurred."""
+    content = json.loads((tabletop / "capture.json").read_text())
+    content["frames"] = [content["frames"][row] for row in rows]
+    (folder / "images").mkdir(parents=True)
+    for row, frame in zip(rows, content["frames"], strict=True):
+        shutil.copy(tabletop / frame["image"], folder / frame["image"])
+        if row in blurred:
+            image = cv2.imread(str(folder / frame["image"]))
+            cv2.imwrite(str(folder / frame["image"]), cv2.GaussianBlur(image, (0, 0), 8))
+    (folder / "capture.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_blurred_images_better_nothing(tabletop: Path, tmp_path: Path):
+    sharp = check(views(tabletop, tmp_path / "sharp", [0, 2, 4, 6], []), look=False)
+    more = check(views(tabletop, tmp_path / "more", [0, 2, 4, 6, 8, 10], [8, 10]), suggest=1, look=False)
+    assert more.counted.tolist() == [0, 1, 2, 3] and sharp.expected is not None and more.expected is not None
+    assert np.allclose(more.expected.std, sharp.expected.std)
+    assert more.suggestions[0].like in (0, 1, 2, 3)
+    taken_again = check(views(tabletop, tmp_path / "again", [0, 2, 4, 6, 8, 10], []), look=False).expected
+    assert taken_again is not None
+    assert taken_again.seen.within_95_mm < 0.9 * sharp.expected.seen.within_95_mm
+
+
+def test_the_live_page_expects_what_check_does(tabletop: Path, tmp_path: Path):
+    folder = views(tabletop, tmp_path / "c", [0, 2, 5, 8, 10], [])
+    live = coverage(LiveFolder(folder))
+    found = check(folder, suggest=1, look=False)
+    assert live.now is not None and found.expected is not None and live.next_pose is not None
+    assert np.allclose(live.now.std, found.expected.std) and live.now.seen == found.expected.seen
+    assert as_answer(live)["expected_seen"]["within_95_mm"] == found.expected.seen.within_95_mm
+    assert len(live.expected) == 3 and live.next_pose.within_95_mm == found.suggestions[0].within_95_mm
+    assert f"within {significant(found.expected.seen.within_95_mm)} mm" in in_words(live)[0]
+
+
+def test_what_is_not_known_of_the_camera_is_in_the_expectation():
+    gripper = hand_eye_problem(np.random.default_rng(1), 8).base_from_gripper
+    given = Intrinsics(512.0, 512.0, 319.5, 239.5, 640, 480)
+    exact = typical_camera(given, (640, 480), np.zeros(9))
+    systematic = errors_of(gripper).systematic
+    known, measured, unknown = (
+        expected(assumed(gripper, camera), gripper, systematic)
+        for camera in (exact, typical_camera(given, (640, 480)), typical_camera(None, (640, 480)))
+    )
+    assert 1.5 * known.std[3] < measured.std[3] < unknown.std[3]
+
+
+def expected_with(
+    problem: HandEyeProblem, noise: tuple[float, float] | None, count: int, reach: np.ndarray | None = None
+) -> tuple[np.ndarray, list[NextPose]]:
+    """Standard deviations expected of a problem's poses, and the poses to add to them."""
+    gripper, x = problem.base_from_gripper, problem.gripper_from_camera
+    assumptions = replace(assumed(gripper, None, noise), gripper_from_camera=x)
+    ahead = Ahead.of(assumptions, gripper, errors_of(gripper), count, reach)
+    added = [ahead.next_pose(k, ahead.expected(k)) for k in range(1, count + 1)]
+    return ahead.expected(0).std, added
+
+
+def test_proposed_poses_keep_their_promise_and_stay_in_reach():
+    problem = hand_eye_problem(np.random.default_rng(2), 5)
+    reach = np.array([[0.2, -0.4, 0.2], [0.8, 0.4, 0.8]])
+    now, proposed = expected_with(problem, (5e-4, np.radians(0.1)), 3, reach)
+    assert len(proposed) == 3
+    last = now
+    for pose in proposed:
+        assert (pose.expected_std < last + 1e-12).all()
+        last = pose.expected_std
+        position = pose.base_from_gripper[:3, 3]
+        assert (position >= reach[0] - 0.01).all() and (position <= reach[1] + 0.01).all()
+    assert last[:3].max() < 0.75 * now[:3].max()
+    assert proposed[2].within_95_mm < proposed[0].within_95_mm
+
+
+def test_a_planar_capture_is_told_to_tilt():
+    problem = hand_eye_problem(np.random.default_rng(3), 8, "planar")
+    now, proposed = expected_with(problem, None, 2)
+    down = problem.base_from_gripper[0, 2, :3]
+    tilt = [np.degrees(np.arccos(pose.base_from_gripper[2, :3] @ down)) for pose in proposed]
+    assert max(tilt) > 10.0
+    assert proposed[-1].expected_std[:3].max() < 0.02 * now[:3].max()
+
+
+@pytest.mark.parametrize("rotation", [(180, 0, 0), (90, 0, 0), (-90, 0, 0), (0, 90, 0), (0, -90, 0)])
+def test_a_camera_of_which_nothing_is_known_looks_along_the_axis_that_meets_the_scene(rotation: tuple):
+    problem = hand_eye_problem(np.random.default_rng(5), 8)
+    looks = assumed_camera(problem.base_from_camera)
+    assert np.allclose(looks, np.eye(4))
+    # The same views by a gripper whose frame has other axes.
+    other = transform(Rotation.from_rotvec(rotation, degrees=True).as_matrix(), np.zeros(3))
+    assert np.allclose(assumed_camera(problem.base_from_camera @ other)[:3, 2], other[2, :3], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_robot_that_is_found_worse_than_assumed_is_not_promised_away():
+    noise = (0.03, np.radians(4.0))
+    problem = hand_eye_problem(np.random.default_rng(4), 12, robot_noise=noise)
+    names = tuple(f"{k}.png" for k in range(12))
+    pairs = PosePairs(Path("."), names, problem.base_from_gripper, problem.recon_from_camera, False)
+    found = calibrate_poses(pairs)
+    assert not found.converged
+    promised = calibration_file(pairs, pairs, found, {}, "").next_poses[-1].expected_std
+    _, proposed = expected_with(problem, noise, 2)
+    assert np.allclose(promised, proposed[-1].expected_std, rtol=0.5)
