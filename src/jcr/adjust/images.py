@@ -244,14 +244,14 @@ def minimised(
     view = view_of(scene, problem)
     weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
     held = [one for one in (problem.prior, robots) if one is not None]
-    cost = _cost(scene, view, problem, weight, held)
+    least = cost(scene, view, problem, weight, held)
     for _ in range(STEPS):
         moved = _moved(scene, problem, _equations(scene, view, problem, weight, held, damping))
         moved_view = view_of(moved, problem)
-        new_cost = _cost(moved, moved_view, problem, weight, held)
-        gained = cost - new_cost
+        new_cost = cost(moved, moved_view, problem, weight, held)
+        gained = least - new_cost
         if gained >= 0:
-            scene, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
+            scene, view, least, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
         else:
             damping *= 10
         if abs(gained) < ENOUGH:
@@ -263,7 +263,13 @@ def minimised(
 
 def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvidence:
     """What the images and the priors of their cameras show about a scene, whoever helped to find it."""
-    view = view_of(scene, problem)
+    return linearised(scene, view_of(scene, problem), problem, noise)[0]
+
+
+def linearised(
+    scene: Scene, view: View, problem: ImageProblem, noise: PixelNoise
+) -> tuple[ImageEvidence, Normal]:
+    """The same, and the equations that it is made of, which step the points."""
     weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
     held = [] if problem.prior is None else [problem.prior]
     normal = _equations(scene, view, problem, weight, held, 0.0)
@@ -273,7 +279,7 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
         # A unit of the world that is that of its rigs' places, all alike: what λ is counted in.
         of_rigs = information.diagonal()[problem.freedom.first_rig :]
         information += similarity_held(similarities(scene, problem.freedom), float(of_rigs.mean()))
-    return ImageEvidence(
+    found = ImageEvidence(
         scene=scene,
         problem=problem,
         information=information,
@@ -281,6 +287,7 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
         noise=noise,
         view=view,
     )
+    return found, normal
 
 
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
@@ -388,19 +395,22 @@ def _with_nuisances(
     return out
 
 
-def _cost(
+def cost(
     scene: Scene,
     view: View,
     problem: ImageProblem,
     weight: Float[ndarray, " k"],
     held: list[RigInformation],
 ) -> float:
-    cost = float(weight @ (view.residual_px**2).sum(1))
-    cost += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
+    """In squared standard deviations, with these weights of the observations.
+
+    `held` is what is known of the rigs beside."""
+    total = float(weight @ (view.residual_px**2).sum(1))
+    total += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
     for one in held:
         steps = one.steps(scene)
-        cost += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
-    return cost
+        total += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
+    return total
 
 
 def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[ndarray, " k"]) -> Derivatives:
