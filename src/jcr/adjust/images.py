@@ -327,7 +327,7 @@ def _by_rig(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "
     out = np.empty((len(camera), 2, 3))
     for c, lens in enumerate(scene.cameras):
         rows = np.flatnonzero(camera == c)
-        out[rows] = by_point(lens, view.in_camera[rows]) @ scene.rig_from_camera[c, :3, :3].T
+        out[rows] = _rotated(by_point(lens, view.in_camera[rows]), scene.rig_from_camera[c, :3, :3])
     return _nuisances_applied(out, scene, problem)
 
 
@@ -337,7 +337,7 @@ def _by_world(
     """The same, world axes."""
     out = np.empty_like(by_rig)
     for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
-        out[rows] = by_rig[rows] @ pose[:3, :3].T
+        out[rows] = _rotated(by_rig[rows], pose[:3, :3])
     return out
 
 
@@ -358,7 +358,7 @@ def _nuisances_applied(
 def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "k 2 l"]:
     """Derivative of every observation by the steps of intrinsics and nuisances."""
     freedom, camera = problem.freedom, problem.layout.camera
-    out = np.zeros((len(camera), 2, len(freedom.std)))
+    out = np.zeros((len(camera), 2, freedom.nuisance_columns.stop))
     for c, (lens, prior, columns) in enumerate(
         zip(scene.cameras, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
     ):
@@ -366,7 +366,6 @@ def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarra
         out[rows, :, columns] = by_parameters(lens, view.in_camera[rows]) @ prior.directions
     if len(freedom.nuisance.std):
         out = _with_nuisances(out, scene, view, problem)
-    out[:, :, freedom.model_error_columns] = problem.displacements
     return out
 
 
@@ -419,7 +418,8 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
     by_rig = _by_rig(scene, view, problem)
     by_rig *= root
     shared = np.zeros((len(weight), 2, freedom.first_rig))
-    shared[:, :, : len(freedom.std)] = _by_cameras(scene, view, problem) * root
+    np.multiply(_by_cameras(scene, view, problem), root, out=shared[:, :, : freedom.nuisance_columns.stop])
+    np.multiply(problem.displacements, root, out=shared[:, :, freedom.model_error_columns])
     for c, columns in enumerate(freedom.mount_columns):
         if columns is not None:
             mine = np.flatnonzero(problem.layout.camera == c)
@@ -428,10 +428,21 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
     by_world, own = np.empty_like(by_rig), np.empty((len(weight), 2, 6))
     for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
         rotation = pose[:3, :3]
-        by_world[rows] = by_rig[rows] @ rotation.T
-        own[rows, :, :3] = -by_world[rows]
-        own[rows, :, 3:] = np.cross(by_world[rows], (view.from_rig[rows] @ rotation.T)[:, None])
+        here = _rotated(by_rig[rows], rotation)
+        by_world[rows] = here
+        own[rows, :, :3] = -here
+        own[rows, :, 3:] = _crossed(here, (view.from_rig[rows] @ rotation.T)[:, None])
     return Derivatives(shared, own, by_world, view.residual_px * root[..., 0])
+
+
+def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:
+    """Derivatives by a point in other axes: one product, where NumPy would make one of every observation."""
+    return (by.reshape(-1, 3) @ rotation.T).reshape(by.shape)
+
+
+def _crossed(a: Float[ndarray, "k 2 3"], b: Float[ndarray, "k 1 3"]) -> Float[ndarray, "k 2 3"]:
+    """Cross products; NumPy's takes as long as all else about them."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 def _equations(
