@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 ROUNDS_BEFORE = 3
-"""Of which the next one makes use."""
+"""That the next one makes use of."""
 PARALLEL = 1e-2
 """Rounds whose steps differ by less than this share of what others differ by add nothing."""
 FARTHEST = 5.0
