@@ -114,13 +114,11 @@ def without_points(
         root, half = np.empty((len(group.points), 3, 3)), np.zeros((len(group.points), 3, len(columns) + 1))
         by_point = np.empty((len(group.rows), 2, 3))
         for points, observations in group.batches:
-            of_batch = group.rows[observations]
-            root[points], by_point[observations] = _whitened(
-                rows.by_point[of_batch], len(root[points]), damping
-            )
-            flat = np.swapaxes(by_point[observations].reshape(len(root[points]), -1, 3), 1, 2)
-            half[points, :, :s] = flat @ rows.shared[of_batch].reshape(len(flat), -1, s)
-            half[points, :, -1:] = flat @ rows.residual[of_batch].reshape(len(flat), -1, 1)
+            of_batch, count = group.rows[observations], points.stop - points.start
+            root[points], by_point[observations] = _whitened(rows.by_point[of_batch], count, damping)
+            flat = np.swapaxes(by_point[observations].reshape(count, -1, 3), 1, 2)
+            half[points, :, :s] = flat @ rows.shared[of_batch].reshape(count, flat.shape[2], s)
+            half[points, :, -1:] = flat @ rows.residual[of_batch].reshape(count, -1, 1)
         places = group.point[:, None, None], np.arange(3)[:, None], own_columns[group.image][:, None]
         half[places] = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ rows.own[group.rows], group.pairs)
         flat = half.reshape(3 * len(half), -1)
