@@ -76,15 +76,15 @@ def _half(found: Reconstruction, half: int) -> Reconstruction:
     rows, tracks = np.arange(half, len(found.image_index), 2), found.tracks
     own = np.isin(tracks.image, rows)
     own &= np.bincount(tracks.point[own], minlength=len(tracks.points_in_recon))[tracks.point] >= 2
-    points, point = np.unique(tracks.point[own], return_inverse=True)
+    kept = tracks.only(own)
+    points, point = np.unique(kept.point, return_inverse=True)
     return replace(
         found,
         image_index=found.image_index[rows],
         recon_from_camera=found.recon_from_camera[rows],
         tracks=replace(
-            tracks,
-            image=np.searchsorted(rows, tracks.image[own]),
-            x_px=tracks.x_px[own],
+            kept,
+            image=np.searchsorted(rows, kept.image),
             point=point,
             points_in_recon=tracks.points_in_recon[points],
         ),

@@ -56,6 +56,8 @@ class Row:
     trusted: bool = False
     seconds: float = 0.0
     says: str = ""
+    alone: bool = False
+    """From images, without a board."""
 
 
 def run(captures: Path, boards: Sequence[str] = ()) -> str:
@@ -97,22 +99,39 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
 
 
 def _claims(rows: Sequence[Row]) -> list[str]:
-    said = [
-        f"{row.capture} {row.off_mm:.1f} mm and {row.off_deg:.2f}° from its reference ({row.how})"
-        for row in rows
-        if row.trusted and row.off_mm is not None and row.off_deg is not None
+    tried = [row for row in rows if row.seconds]
+    alone = [row for row in tried if row.alone]
+    by_boards = [row for row in tried if not row.alone]
+    of = [
+        f"{len([row for row in some if row.trusted])} of {len(some)} accepted from {what}, {_off_from_references(some)}"
+        for what, some in (("images alone", alone), ("a board", by_boards))
+        if any(row.trusted for row in some)
     ]
-    refused = [f"{row.capture} ({row.how})" for row in rows if row.seconds and not row.trusted]
-    seen = [row.seen_mm for row in rows if row.trusted and row.seen_mm is not None]
+    seen = [row.seen_mm for row in tried if row.trusted and row.seen_mm is not None]
     placed = (
         f" A seen point is {np.median(seen):.1f} mm (median) from where the references put it."
         if seen
         else ""
     )
-    joint = [row.joint_sigmas for row in rows if row.trusted and row.joint_sigmas is not None]
+    joint = [row.joint_sigmas for row in tried if row.trusted and row.joint_sigmas is not None]
     beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
-    told = f" Rejected, and said so: {', '.join(refused)}." if refused else ""
-    return [f"> Real captures: {'; '.join(said) or 'none is accepted'}.{told}{beyond}{placed}"]
+    refused = [f"{row.capture} ({row.how})" for row in tried if not row.trusted]
+    rejected = f" Rejected: {', '.join(refused)}." if refused else ""
+    return [f"> Real captures: {'; '.join(of) or 'none is accepted'}.{rejected}{beyond}{placed}"]
+
+
+def _off_from_references(rows: Sequence[Row]) -> str:
+    """Median and worst distance of accepted rows."""
+    off = [
+        (row.off_mm, row.off_deg, row.capture)
+        for row in rows
+        if row.trusted and row.off_mm is not None and row.off_deg is not None
+    ]
+    if not off:
+        return "none with a reference"
+    worst_mm, _, worst = max(off)
+    mm, deg = np.median([mm for mm, _, _ in off]), np.median([deg for _, deg, _ in off])
+    return f"{mm:.1f} mm and {deg:.2f}° from the references (median; worst {worst_mm:.1f} mm, {worst})"
 
 
 def _rows(folder: Path, board: str | None) -> list[Row]:
@@ -127,7 +146,16 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
             result = calibrate(capture, out, options)
     except NotTrustedError as refusal:
         seconds = time.perf_counter() - begun
-        return [Row(folder.name, how, f"0 of {len(capture)}", seconds=seconds, says=str(refusal))]
+        return [
+            Row(
+                folder.name,
+                how,
+                f"0 of {len(capture)}",
+                seconds=seconds,
+                says=str(refusal),
+                alone=board is None,
+            )
+        ]
     seconds = time.perf_counter() - begun
     x, uncertainty = result.hand_eye.gripper_from_camera, result.calibration.uncertainty
     assert uncertainty is not None
@@ -150,6 +178,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
         result.converged,
         seconds,
         "" if result.converged else result.calibration.warnings[0],
+        board is None,
     )
     if board is None:
         return [row]

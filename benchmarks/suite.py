@@ -4,14 +4,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 import jcr
-from benchmarks.freshness import COMMIT, says_it_is_old
+from benchmarks.freshness import says_it_is_old
+from benchmarks.table import BENCHES, LONG, PARTS, title_of
 from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.reconstruct.backends import BACKENDS
@@ -137,9 +138,9 @@ def absent_networks() -> list[str]:
 
 
 def with_claims(index: str, out: Path, without: Collection[str] = ()) -> str:
-    """An index with a table of the claims of the pages in `out` between its marks: claim, number, command, commit.
+    """An index with a table of each part's pages in `out` between its marks, and what came out.
 
-    Raises InputError where the text has no marks.
+    Of a bench with a long page the short one is named beside it. Raises InputError where the text has no marks.
     """
     before, begin, rest = index.partition(MARKS[0])
     _, end, after = rest.partition(MARKS[1])
@@ -147,38 +148,26 @@ def with_claims(index: str, out: Path, without: Collection[str] = ()) -> str:
         raise InputError(
             f"the index of results has no lines {MARKS[0]} and {MARKS[1]} to put the claims between"
         )
-    rows = [
-        f"| {_cell(claim)} | {_cell(number)} | [`{_command(page)}`]({page.name}) | {_commit(page)} |"
-        for page in sorted(out.glob("*.md"))
-        if page.name != "README.md" and page.stem not in without
-        for claim, number in (_parts(claim, page) for claim in claims(page))
-    ]
-    head = ["", "| claim | number | command | commit |", "|---|---|---|---|"]
-    return "\n".join([before + begin, *head, *rows, "", end]) + after
+    pages = {page.stem: page for page in out.glob("*.md") if page.name != "README.md"}
+    shown = {stem: page for stem, page in pages.items() if stem not in without}
+    parts = []
+    for part in PARTS:
+        rows = [_row(name, shown) for name, bench in BENCHES.items() if bench.part == part]
+        if any(rows):
+            parts += ["", f"## {part}", "", "| bench | what came out |", "|---|---|", *filter(None, rows)]
+    return "\n".join([before + begin, *parts, "", end]) + after
 
 
-def _parts(claim: str, page: Path) -> tuple[str, str]:
-    """What was measured, and what came out: parted by a colon, or what the bench is for and the whole."""
-    about, colon, number = claim.partition(": ")
-    if colon:
-        return about, number
-    lines = [line for line in page.read_text().splitlines() if line]
-    return lines[1] if len(lines) > 1 else page.stem, claim
+def _row(name: str, pages: Mapping[str, Path]) -> str:
+    """Of a bench: its page, the short one beside the long one, and what came out; empty where it has none."""
+    stems = [stem for stem in (name + LONG, name) if stem in pages]
+    if not stems:
+        return ""
+    page = pages[stems[0]]
+    links = [f"[{title_of(name)}]({page.name})", *(f"([short]({pages[stem].name}))" for stem in stems[1:])]
+    old = " *Older than the code.*" if says_it_is_old(page.read_text()) else ""
+    return f"| {' '.join(links)} | {_cell(' '.join(claims(page)))}{old} |"
 
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
-
-
-def _command(page: Path) -> str:
-    lines = (
-        line.strip() for line in page.read_text().splitlines() if line.startswith("    python -m benchmarks")
-    )
-    words = next(lines, f"python -m benchmarks {page.stem}").split()
-    return " ".join([*words[:4], *(word for word in words[4:] if word == "--long")])
-
-
-def _commit(page: Path) -> str:
-    text = page.read_text()
-    named = COMMIT.search(text)
-    return (f"`{named[1]}`" if named else "") + (", older than the code" if says_it_is_old(text) else "")

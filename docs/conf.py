@@ -27,6 +27,7 @@ extensions = ["myst_parser", "sphinx_copybutton"]
 exclude_patterns = ["_site"]
 source_suffix = {".md": "markdown"}
 myst_heading_anchors = 3
+smartquotes = False  # a pair of dashes begins an option
 myst_enable_extensions = ["dollarmath"]
 suppress_warnings = ["myst.strikethrough"]
 nitpicky = True

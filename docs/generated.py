@@ -1,6 +1,7 @@
 """Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas.
 
-`docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. None of them is committed.
+`docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. The pages are committed, for
+those who read them in the repository or by `jcr docs`; a test holds them to the source.
 """
 
 import ast
@@ -66,10 +67,9 @@ FORMATS = {
 def write_pages() -> None:
     """Write all of them."""
     REFERENCE.mkdir(exist_ok=True)
-    (REFERENCE / "cli.md").write_text(cli_page(), encoding="utf-8")
-    (REFERENCE / "api.md").write_text(api_page(), encoding="utf-8")
     SCHEMAS.mkdir(exist_ok=True)
-    (REFERENCE / "formats.md").write_text(formats_page(), encoding="utf-8")
+    for name, page in PAGES.items():
+        (REFERENCE / name).write_text(page(), encoding="utf-8")
 
 
 def cli_page() -> str:
@@ -107,10 +107,11 @@ def _argument(action: Any) -> str:
     flag = action.option_strings[-1] if action.option_strings else ""
     value = "" if action.nargs == 0 else action.metavar
     value = " ".join(value) if isinstance(value, tuple) else value or ""
-    if action.choices:
+    if action.choices and not value.startswith("{"):
         value = "" if len(value) > 24 else value
         value += f" `{' | '.join(map(str, action.choices))}`" if not value else ""
-    said = NO_DEFAULT.sub("", str(action.help).replace("\n", " "))
+    # The parser of arguments has its own use for a single percent sign.
+    said = NO_DEFAULT.sub("", str(action.help).replace("\n", " ").replace("%%", "%"))
     named = f"`{flag} {value}`".replace(" `", "`") if not value.startswith(" `") else f"`{flag}`{value}"
     return f"| {_cell(named if flag else f'`{value}`')} | {_cell(_escaped(said))} |"
 
@@ -335,6 +336,9 @@ def _type(value: dict[str, Any]) -> str:
         return "list"
     return str(value.get("type", "any"))
 
+
+PAGES = {"cli.md": cli_page, "api.md": api_page, "formats.md": formats_page}
+"""What writes each page."""
 
 if __name__ == "__main__":
     write_pages()

@@ -254,6 +254,7 @@ def _seen(
             image=np.concatenate(picture),
             x_px=np.concatenate(x_px),
             point=np.concatenate(point),
+            std_px=np.ones(sum(map(len, point))),
         ),
         in_world(rigs),
         np.stack([transform(mount[:3, :3], mount[:3, 3] / scale) for mount in mounts]),

@@ -1,7 +1,5 @@
 """The adjustment of a wrist camera on simulated observations with a known answer."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -78,7 +76,7 @@ def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
         own = order[tracks.point[order] == point]
         rank[own] = np.arange(len(own))
     few = rank < views
-    tracks = replace(tracks, image=tracks.image[few], x_px=tracks.x_px[few], point=tracks.point[few])
+    tracks = tracks.only(few)
     assert solved(problem, tracks).given.evidence.noise.sigma_px[0] == pytest.approx(0.3, rel=0.1)
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import BENCHES, LONG, paths_of
 from benchmarks.freshness import (
     COMMIT,
     changed_since_measured,
@@ -23,6 +22,7 @@ from benchmarks.freshness import (
 from benchmarks.peers import grid_search
 from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.suite import CLAIM, MARKS, Outcome, claims, run, with_claims, write_index
+from benchmarks.table import BENCHES, LONG, paths_of
 from jcr.cli import call
 from jcr.errors import InputError
 from jcr.geometry import rotation_between_deg, scale_translation
@@ -117,7 +117,7 @@ def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     write_index(outcomes, tmp_path, "python -m benchmarks all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
     assert "2 of 3 benches were run this time, in 1.5 minutes" in index
-    assert "| map | the map is good | [`python -m benchmarks map`](map.md) |" in index
+    assert "| [The map](map.md) | the map is good |" in index
     assert "- a network: no weights" in index and "- **nonsense** ended with status 2" in index
 
 
@@ -131,11 +131,14 @@ def test_a_page_older_than_the_sources_is_measured_again(tmp_path: Path):
 
 
 def test_claims_go_between_the_marks_as_a_table_and_an_index_without_them_is_refused(tmp_path: Path):
-    about = "# map\n\nof things\n\n    python -m benchmarks map\n\n2026-11-22, commit `abcdef0`.\n"
+    about = "# The map\n\nof things\n\n    python -m benchmarks map\n\n2026-11-22, commit `abcdef0`.\n"
     (tmp_path / "map.md").write_text(f"{about}{CLAIM}the map: 1 mm off\n{CLAIM}2 s long\n")
+    (tmp_path / "seen.md").write_text(f"{CLAIM}10 draws\n")
+    (tmp_path / "seen_long.md").write_text(f"{CLAIM}40 draws\n")
     written = with_claims(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n", tmp_path)
-    command = "[`python -m benchmarks map`](map.md) | `abcdef0` |"
-    assert f"| the map | 1 mm off | {command}\n| of things | 2 s long | {command}\n" in written
+    assert "| [The map](map.md) | the map: 1 mm off 2 s long |\n" in written
+    assert "| [Points that the camera sees](seen_long.md) ([short](seen.md)) | 40 draws |\n" in written
+    assert written.index("accuracy true") < written.index("camera sees") < written.index("## Depth")
     assert written.startswith("before\n") and written.endswith("after\n") and "old" not in written
     with pytest.raises(InputError, match="marks|lines"):
         with_claims("no marks", tmp_path)

@@ -14,7 +14,14 @@ from numpy import ndarray
 
 from jcr.adjust.elimination import Derivatives, Normal, Sightings, with_points_held, without_points
 from jcr.adjust.model_error import TYPICAL, displacements, size_of
-from jcr.adjust.pixel_noise import Layout, PixelNoise, pixel_noise, variance_ratios
+from jcr.adjust.pixel_noise import (
+    Layout,
+    PixelNoise,
+    common_share,
+    left_of_points,
+    pixel_noise,
+    variance_ratios,
+)
 from jcr.adjust.scene import (
     Freedom,
     Observations,
@@ -82,7 +89,11 @@ class ImageProblem:
         order = order[count[observations.point[order]] >= 2]
         kept, point = np.unique(observations.point[order], return_inverse=True)
         used = replace(
-            observations, image=observations.image[order], x_px=observations.x_px[order], point=point
+            observations,
+            image=observations.image[order],
+            x_px=observations.x_px[order],
+            point=point,
+            std_px=observations.std_px[order],
         )
         widths = np.array([camera.width for camera in freedom.start])
         layout = Layout.of(used, widths)
@@ -223,14 +234,15 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
 
 
 def noise_of(scene: Scene, view: View, problem: ImageProblem, before: PixelNoise | None = None) -> PixelNoise:
-    """Of the observations at a scene; several cameras are distinguished where an estimate was made before."""
-    ratio = np.ones(len(scene.cameras))
-    if before is not None:
-        by_world = _by_world(_by_rig(scene, view, problem), scene, problem)
-        ratio = variance_ratios(
-            problem.layout, before, view.residual_px, view.depth, by_world, problem.seen.starts
-        )
-    return pixel_noise(problem.layout, view.residual_px, view.depth, ratio)
+    """Of the observations at a scene; several cameras are distinguished where an estimate was made before, and so
+    are observations by what their matches state."""
+    layout, residual_px, depth = problem.layout, view.residual_px, view.depth
+    if before is None:
+        return pixel_noise(layout, residual_px, depth, np.ones(len(scene.cameras)))
+    by_world = _by_world(_by_rig(scene, view, problem), scene, problem)
+    left = left_of_points(layout, before, residual_px, depth, by_world, problem.seen.starts)
+    ratio = variance_ratios(layout, before, residual_px, depth, left)
+    return pixel_noise(layout, residual_px, depth, ratio, common_share(layout, residual_px, left, ratio))
 
 
 def minimised(
@@ -242,7 +254,7 @@ def minimised(
 ) -> tuple[Scene, View, float]:
     """Levenberg-Marquardt with the weights that observations have at the start; also the damping at the end."""
     view = view_of(scene, problem)
-    weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
+    weight = noise.weights(view.residual_px, view.depth, problem.layout)
     held = [one for one in (problem.prior, robots) if one is not None]
     least = cost(scene, view, problem, weight, held)
     for _ in range(STEPS):
@@ -270,7 +282,7 @@ def linearised(
     scene: Scene, view: View, problem: ImageProblem, noise: PixelNoise
 ) -> tuple[ImageEvidence, Normal]:
     """The same, and the equations that it is made of, which step the points."""
-    weight = noise.weights(view.residual_px, view.depth, problem.layout.camera)
+    weight = noise.weights(view.residual_px, view.depth, problem.layout)
     held = [] if problem.prior is None else [problem.prior]
     normal = _equations(scene, view, problem, weight, held, 0.0)
     information = normal.hessian

@@ -64,7 +64,7 @@ def _of_points(
     observations = problem.observations
     rows = np.flatnonzero(np.isin(observations.point, some))
     point = np.searchsorted(some, observations.point[rows])
-    weight = images.noise.weights(images.view.residual_px, images.view.depth, problem.layout.camera)
+    weight = images.noise.weights(images.view.residual_px, images.view.depth, problem.layout)
     by = derivatives(images.scene, images.view, problem, weight)
     by_point = by.by_point[rows]
     starts = np.flatnonzero(np.diff(point, prepend=-1))

@@ -347,7 +347,7 @@ class _Together:
         """Of a place, with weights and sizes of errors as they are at the start of the step."""
         images = self.given.evidence
         problem, view = images.problem, images.view
-        weight = images.noise.weights(view.residual_px, view.depth, problem.layout.camera)
+        weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
         held = [] if problem.prior is None else [problem.prior]
         residual = of_poses(placed, self.given.arms)[0]
         of_robots = float((solve_triangular(self.factor, residual, lower=True) ** 2).sum())

@@ -14,7 +14,7 @@ from numpy import ndarray
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import retract, skew
-from jcr.records import Intrinsics
+from jcr.records import Intrinsics, Tracks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,21 @@ class Observations:
     x_px: Float[ndarray, "k 2"]
     """In the original image, distorted."""
     point: Int[ndarray, " k"]
+    std_px: Float[ndarray, " k"]
+    """Of one coordinate, as matching states it, up to a factor; all 1 where it states nothing."""
+
+    @staticmethod
+    def of_one_camera(tracks: Tracks, images: int) -> "Observations":
+        """Of the images of one camera, a rig an image."""
+        each = np.arange(images)
+        return Observations(
+            rig=each,
+            camera=np.zeros_like(each),
+            image=tracks.image,
+            x_px=tracks.x_px,
+            point=tracks.point,
+            std_px=np.ones(len(tracks.image)) if tracks.std_px is None else tracks.std_px,
+        )
 
 
 @dataclass(frozen=True)

@@ -56,9 +56,7 @@ def adjust_wrist(
             cameras=(intrinsics,),
             points_in_world=scale * tracks.points_in_recon.astype(float),
         ),
-        Observations(
-            rig=each, camera=np.zeros_like(each), image=tracks.image, x_px=tracks.x_px, point=tracks.point
-        ),
+        Observations.of_one_camera(tracks, len(each)),
         freedom,
         [arm],
         noise,

@@ -119,9 +119,9 @@ class Case:
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     """The observations of the used images, whose rows are counted again."""
-    kept = used[tracks.image]
+    kept = tracks.only(used[tracks.image])
     row = np.cumsum(used) - 1
-    return replace(tracks, image=row[tracks.image[kept]], x_px=tracks.x_px[kept], point=tracks.point[kept])
+    return replace(kept, image=row[kept.image])
 
 
 def some_of_many(tracks: Tracks) -> Tracks:
@@ -137,5 +137,4 @@ def some_of_many(tracks: Tracks) -> Tracks:
 
 def of_points(tracks: Tracks, chosen: Bool[ndarray, " p"]) -> Tracks:
     """The observations of some of the points, which keep their rows."""
-    rows = chosen[tracks.point]
-    return replace(tracks, image=tracks.image[rows], x_px=tracks.x_px[rows], point=tracks.point[rows])
+    return tracks.only(chosen[tracks.point])

@@ -37,6 +37,7 @@ from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
+from jcr.reconstruct.least_squares_matching import KEYPOINT_STD_PX
 from jcr.records import (
     Capture,
     CellCamera,
@@ -64,6 +65,7 @@ NOTHING: dict[str, ndarray] = {
     "x_px": np.zeros((0, 2)),
     "point": np.zeros(0, int),
     "points_in_recon": np.zeros((0, 3)),
+    "std_px": np.ones(0),
 }
 """Fields of tracks without an observation."""
 LEAST_POSES = 3
@@ -375,6 +377,7 @@ def _adjusted(
         prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
     rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
     image, x_px, point = [own.image], [own.x_px], [own.point]
+    std_px = [np.full(len(own.image), KEYPOINT_STD_PX) if own.std_px is None else own.std_px]
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
     count = len(own.points_in_recon)
     for c, member in enumerate(members, start=1):
@@ -386,6 +389,7 @@ def _adjusted(
             image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
             point += [count + np.arange(n), count + one.row_point]
+            std_px.append(np.full(n + len(one.row), KEYPOINT_STD_PX))
             points.append(one.points_in_recon)
             count += n
             rig.append(int(member.rig[k]))
@@ -405,6 +409,7 @@ def _adjusted(
             image=np.concatenate(image),
             x_px=np.concatenate(x_px),
             point=np.concatenate(point),
+            std_px=np.concatenate(std_px),
         ),
         _freedom(capture, members, cameras, len(rig)),
         rigs.arm_poses(options),

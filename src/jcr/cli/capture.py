@@ -10,7 +10,7 @@ import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output
-from jcr.handeye.arms import ROBOT_NAMES, RobotName
+from jcr.handeye.arms import CHOICES, ROBOT_NAMES, RobotName
 from jcr.live.camera import CameraOptions
 from jcr.live.collect import CollectOptions
 
@@ -50,7 +50,7 @@ class Arguments:
     """Notation of typed poses and of the printed next pose; auto: the arm's own."""
     pose_units: UnitsName = "auto"
     """Units of typed and printed poses; auto: those of the convention."""
-    robot: RobotName | None = None
+    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
     """The arm: the next pose is then also printed as joint angles, within the arm's limits."""
     listen: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = "127.0.0.1:7464"
     """With tcp: address and port to listen on; any but a loopback address needs a token."""

@@ -215,6 +215,8 @@ _ARMS: dict[RobotName, Callable[[], Arm]] = {
     "so101": _so101,
 }
 ROBOT_NAMES: tuple[RobotName, ...] = get_args(RobotName)
+CHOICES = f"{{{','.join(ROBOT_NAMES)}}}"
+"""Of an option that may be left out, as help shows it: the parser would list them in any order, and None."""
 
 
 def arm_named(name: str) -> Arm:

@@ -25,8 +25,8 @@ from jcr.records import Intrinsics, Tracks
 MOST_PX = 4.0
 """An observation farther from its keypoint is another feature; COLMAP, too, keeps none that is farther off."""
 LEAST_CORRELATION = 0.9
-LARGEST_STD_PX = 0.3
-"""Of an aligned observation; keypoints are no worse."""
+KEYPOINT_STD_PX = 0.3
+"""Of a keypoint, and of an aligned observation at most."""
 _REDUCED = (4, 2, 1)
 """Sizes of the patch: of the images reduced so much. Each starts where the one before it ended."""
 _RADIUS, _WINDOW = 7, 4.5
@@ -48,7 +48,7 @@ def align_tracks(
     recon_from_camera: Float[ndarray, "m 4 4"],
     lens: Intrinsics,
 ) -> Tracks:
-    """The tracks with the observations moved that could be aligned to their track's reference.
+    """The tracks with the observations moved that could be aligned to their track's reference, and how surely.
 
     The images are of the size of `lens`, to which the tracks belong; rows of cameras and images are those of the tracks.
     The reference is the observation that shows the surface at the median scale. It stays where it is.
@@ -66,7 +66,7 @@ def align_tracks(
         x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, lens
     )
     start_px, start_affine = x_px.copy(), warp
-    found, variance = x_px.copy(), np.full(len(point), LARGEST_STD_PX**2)
+    found, variance = x_px.copy(), np.full(len(point), KEYPOINT_STD_PX**2)
     for reduced in _REDUCED:
         level = _reduced(greys, reduced)
         level_from_image = np.array([level.shape[2] / lens.width, level.shape[1] / lens.height])
@@ -82,14 +82,27 @@ def align_tracks(
             variance_px,
             MOST_PX / reduced,
         )
-        aligned = variance_px * reduced**2 < LARGEST_STD_PX**2
+        aligned = variance_px * reduced**2 < KEYPOINT_STD_PX**2
         start_px[aligned] = _resized(aligned_px[aligned], 1 / level_from_image)
         start_affine[aligned] = affine[aligned]
         better = variance_px * reduced**2 < variance
         found[better], variance[better] = start_px[better], variance_px[better] * reduced**2
-    refined = np.empty_like(found)
-    refined[order] = found
-    return replace(tracks, x_px=refined)
+    refined, std_px = np.empty_like(found), np.empty(len(found))
+    refined[order], std_px[order] = found, np.sqrt(_with_references(variance, reference, of_reference))
+    return replace(tracks, x_px=refined, std_px=std_px)
+
+
+def _with_references(
+    variance: Float[ndarray, " k"], reference: Int[ndarray, " p"], of_reference: Int[ndarray, " k"]
+) -> Float[ndarray, " k"]:
+    """Variances with those of the references, whose patches are as good as those that were aligned to them: the mean
+    of the inverse."""
+    aligned = variance < KEYPOINT_STD_PX**2
+    count = np.bincount(of_reference, aligned, len(variance))[reference]
+    inverse_sum = np.bincount(of_reference, aligned / variance, len(variance))[reference]
+    out = variance.copy()
+    out[reference] = np.where(count > 0, count / np.maximum(inverse_sum, 1e-12), KEYPOINT_STD_PX**2)
+    return out
 
 
 def _reduced(greys: UInt8[ndarray, "m h w"], by: int) -> UInt8[ndarray, "m h2 w2"]:

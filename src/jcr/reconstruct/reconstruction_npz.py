@@ -64,6 +64,8 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
         "tracks_from_pointmaps": np.array(reconstruction.tracks.from_pointmaps),
         "tracks_from_board": np.array(reconstruction.tracks.from_board),
     }
+    if (std_px := reconstruction.tracks.std_px) is not None:
+        arrays["track_std_px"] = std_px
     if (evidence := reconstruction.evidence) is not None:
         arrays |= {
             "evidence_recon_from_camera": evidence.recon_from_camera,
@@ -144,6 +146,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 file["track_points_in_recon"],
                 bool(file["tracks_from_pointmaps"]),
                 about.backend == "marker" if about.format in OLD else bool(file["tracks_from_board"]),
+                file.get("track_std_px"),
             ),
             backend=about.backend,
             pointmaps=_pointmaps(file, about),
@@ -193,6 +196,10 @@ def _check(found: Reconstruction) -> None:
         "track_point": (tracks.point, (k,)),
         "track_points_in_recon": (tracks.points_in_recon, (p, 3)),
     }
+    if tracks.std_px is not None:
+        shapes["track_std_px"] = tracks.std_px, (k,)
+        if (tracks.std_px <= 0).any():
+            raise ValueError("track_std_px holds what is not positive")
     if evidence is not None:
         shapes["evidence_recon_from_camera"] = evidence.recon_from_camera, (m, 4, 4)
         shapes["evidence_covariance"] = evidence.covariance, (6 * m, 6 * m)

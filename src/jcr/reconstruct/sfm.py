@@ -100,7 +100,9 @@ def structure_from_motion(
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
         _adjust_robustly(model, hold_lens=known)
-        _align_observations(model, images, lenses[0] if known else _lens_of(model.camera(1), lenses[0]))
+        std_px = _align_observations(
+            model, images, lenses[0] if known else _lens_of(model.camera(1), lenses[0])
+        )
         _adjust_robustly(model, hold_lens=known)
         lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
@@ -117,7 +119,7 @@ def structure_from_motion(
         image_index=np.array(rows),
         recon_from_camera=inverse(camera_from_recon),
         intrinsics=lens,
-        tracks=tracks,
+        tracks=replace(tracks, std_px=std_px),
         backend="colmap",
         notes=tuple(notes),
         warnings=matched.warnings,
@@ -432,8 +434,11 @@ def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
 
 def _align_observations(
     model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics
-) -> None:
-    """Least-squares matching of the model's observations, in the images that features were found in."""
+) -> Float[ndarray, " k"] | None:
+    """Least-squares matching of the model's observations, in the images that features were found in.
+
+    The standard deviation of each is returned in pixels of the original images, in the order of `tracks_of`.
+    """
     camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
     size = camera.width, camera.height
     poses = poses_of(model, [image_id - 1 for image_id in image_ids])
@@ -441,6 +446,7 @@ def _align_observations(
     aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
+    return None if aligned.std_px is None else lens.width / camera.width * aligned.std_px
 
 
 def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> NotTrustedError:

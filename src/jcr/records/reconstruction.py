@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.records.capture import Intrinsics
@@ -23,6 +23,13 @@ class Tracks:
     """Matched between pointmaps, with errors that neighbours share, instead of found in the images."""
     from_board: bool = False
     """All on a board or tags: the scene rises above them."""
+    std_px: Float[ndarray, " k"] | None = None
+    """Of one coordinate of each observation, as its match states it, up to a factor; None: all are alike."""
+
+    def only(self, rows: Bool[ndarray, " k"] | Int[ndarray, " n"]) -> "Tracks":
+        """These observations; points keep their rows."""
+        std = None if self.std_px is None else self.std_px[rows]
+        return replace(self, image=self.image[rows], x_px=self.x_px[rows], point=self.point[rows], std_px=std)
 
 
 @dataclass(frozen=True)

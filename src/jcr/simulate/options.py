@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jcr.handeye.arms import RobotName
+from jcr.handeye.arms import CHOICES, RobotName
 from jcr.simulate.poses import Pattern
 from jcr.simulate.scenes import SceneName, TableName
 
@@ -23,7 +23,7 @@ class SimulateOptions:
     """Path of the wrist. All but `varied` leave part of the calibration unobservable: an orbit at one radius,
     pure translation, a turntable, xyz + yaw (SCARA), rotating about a tool point or about the camera's centre,
     two images."""
-    robot: RobotName | None = None
+    robot: Annotated[RobotName | None, tyro.conf.arg(metavar=CHOICES)] = None
     """Arm that carries the camera, the table before it. capture.json then has its joint angles, and gripper poses by
     its nominal kinematics (unset: a gripper without an arm)."""
     joint_offsets: float = 0.0

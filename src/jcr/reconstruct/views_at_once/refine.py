@@ -151,7 +151,7 @@ def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
 def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> _Adjusted:
     """Cameras and points adjusted, and the focal length unless it is held; matches far from their points left out, and
     points that fewer than two views are left to see."""
-    each, camera = np.arange(len(geometry.recon_from_camera)), geometry.pinhole
+    images, camera = len(geometry.recon_from_camera), geometry.pinhole
     prior = prior_of(camera, HELD if hold else {"f": ESTIMATED["f"]})
     shown = adjust_images(
         Scene(
@@ -160,10 +160,8 @@ def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> _Adjusted:
             cameras=(camera,),
             points_in_world=tracks.points_in_recon,
         ),
-        Observations(
-            rig=each, camera=np.zeros_like(each), image=tracks.image, x_px=tracks.x_px, point=tracks.point
-        ),
-        Freedom.of((camera,), (prior,), len(each)),
+        Observations.of_one_camera(tracks, images),
+        Freedom.of((camera,), (prior,), images),
     )
     seen, points = shown.problem.observations, shown.scene.points_in_world
     error = np.linalg.norm(shown.view.residual_px, axis=1)

@@ -1,0 +1,300 @@
+"""The benches: what each measures, where its page stands in the index, and what makes that page old."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A row of the table of benches, a module of this package each."""
+
+    title: str
+    """Of its page."""
+    part: str
+    """Of the index that its page belongs to, one of PARTS."""
+    what: str
+    """What it measures."""
+    timed: bool = False
+    """Measures time, so that nothing else may run beside it."""
+    draws: bool = False
+    """Writes images beside its page."""
+    of_captures: bool = False
+    """Asks for the folder of captures."""
+    of_boards: bool = False
+    """And takes --boards."""
+    keeps_runs: bool = False
+    """Takes --runs."""
+    measures: tuple[str, ...] = ()
+    """Files and folders whose change makes its page old, beside the bench's own."""
+    long: str = ""
+    """What `--long` measures more of, for which `all` has no time."""
+
+
+ROBOTS, HONEST, MAPPED, TIME, OTHERS = PARTS = (
+    "Real robots and captures",
+    "Is the stated accuracy true, and are faults found?",
+    "Depth, map and objects",
+    "Time and memory",
+    "Beside other methods",
+)
+SOLVER = (
+    "src/jcr/handeye",
+    "src/jcr/adjust",
+    "src/jcr/calibration",
+    "src/jcr/camera.py",
+    "src/jcr/geometry.py",
+    "src/jcr/least_squares.py",
+)
+FEATURES = (
+    "src/jcr/match",
+    "src/jcr/reconstruct/colmap.py",
+    "src/jcr/reconstruct/sfm.py",
+    "src/jcr/attempts.py",
+)
+DEPTH = ("src/jcr/depth", "src/jcr/reconstruct/pointmaps.py")
+MAP = ("src/jcr/represent", "src/jcr/mapping.py")
+READING = ("src/jcr/capture",)
+WHOLE = (*SOLVER, *FEATURES, *DEPTH, *MAP, *READING, "src/jcr/pipeline.py", "src/jcr/report")
+
+
+BENCHES = {
+    "run": Bench(
+        "The whole job",
+        TIME,
+        "the whole job on the bundled capture: error, time and memory",
+        True,
+        measures=WHOLE,
+        long="the median of three",
+    ),
+    "speed": Bench(
+        "Processor time, beside COLMAP alone",
+        TIME,
+        "processor time of every stage on the bundled capture, beside COLMAP alone",
+        True,
+        measures=WHOLE,
+        long="the median of five rounds instead of three, and 200 images",
+    ),
+    "table1": Bench(
+        "Few images, beside the paper",
+        OTHERS,
+        "hand-eye calibration from few images of three scenes, by the paper and by ours",
+        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/global_alignment", "src/jcr/simulate"),
+        long="two captures behind each line instead of one",
+    ),
+    "real": Bench(
+        "Real captures",
+        ROBOTS,
+        "real captures in DIR, against the references stored beside them",
+        of_captures=True,
+        of_boards=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/reconstruct/marker.py",
+            "src/jcr/reconstruct/board.py",
+        ),
+    ),
+    "check_points": Bench(
+        "Boards that took no part",
+        ROBOTS,
+        "corners of boards that took no part in the calibration, where it puts them in the base: captures in DIR",
+        of_captures=True,
+        of_boards=True,
+        keeps_runs=True,
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            *READING,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/reconstruct/board.py",
+            "src/jcr/reconstruct/board_in_view.py",
+            "benchmarks/corners.py",
+            "benchmarks/board_intrinsics.py",
+        ),
+    ),
+    "seen": Bench(
+        "Points that the camera sees",
+        HONEST,
+        "points that the camera sees, in simulation: are they placed as exactly as is said?",
+        measures=(*SOLVER, "benchmarks/simulated"),
+        long="40 draws of every row instead of 10",
+    ),
+    "matching": Bench(
+        "Learned features on real captures",
+        ROBOTS,
+        "SIFT, XFeat and ALIKED on real captures in DIR, with the robot's gate and without",
+        of_captures=True,
+        of_boards=True,
+        measures=(*SOLVER, *FEATURES, *READING),
+        long="all captures, SIFT with and without the gate, XFeat without it, and ALIKED, too",
+    ),
+    "cameras": Bench(
+        "Further cameras",
+        ROBOTS,
+        "fixed cameras, several on a wrist, two arms, eye-to-hand: simulated, and withheld images of captures in DIR",
+        of_captures=True,
+        measures=(*SOLVER, *FEATURES, *READING, "src/jcr/cell", "src/jcr/simulate"),
+        long="40 draws of every kind of cell instead of 10",
+    ),
+    "gate": Bench(
+        "Scenes that mislead matching",
+        HONEST,
+        "scenes that mislead matching, with the robot's gate and without",
+        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
+        long="two draws of every scene instead of one, and XFeat",
+    ),
+    "many": Bench(
+        "Many images",
+        TIME,
+        "seconds and peak memory by number of images",
+        measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/simulate"),
+        long="up to 200 images instead of 32",
+    ),
+    "calibrate": Bench(
+        "Hand-eye solvers",
+        OTHERS,
+        "hand-eye solvers on the same simulated poses, for accuracy and time",
+        draws=True,
+        measures=("src/jcr/handeye", "benchmarks/simulated/problem.py"),
+        long="15 draws instead of 4",
+    ),
+    "robots": Bench(
+        "Arms with systematic errors",
+        HONEST,
+        "arms with systematic errors: is the result within its sigma, and nearer than others'",
+        draws=True,
+        measures=("src/jcr/handeye", "src/jcr/simulate/robots.py", "benchmarks/simulated/problem.py"),
+        long="8 draws of every arm instead of 1",
+    ),
+    "limits": Bench(
+        "Where it breaks",
+        HONEST,
+        "where it breaks: one thing made worse at a time",
+        draws=True,
+        measures=(*SOLVER, *FEATURES, "src/jcr/simulate"),
+        long="all levels, not every other one",
+    ),
+    "attack": Bench(
+        "Silent faults",
+        HONEST,
+        "captures with one silent fault: reported, rejected, or wrong; and false alarms",
+        measures=(*SOLVER, "benchmarks/simulated"),
+        long="three times as many draws of everything",
+    ),
+    "table2": Bench(
+        "Heights of objects",
+        MAPPED,
+        "heights of objects in simulated scenes, from 8 and 10 images",
+        measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/segment", "src/jcr/simulate"),
+        long="five scenes instead of three",
+    ),
+    "density": Bench(
+        "How much a cloud covers",
+        MAPPED,
+        "how much of a plain table and its objects a cloud covers, beside COLMAP's points",
+        draws=True,
+        measures=(*FEATURES, *DEPTH, "src/jcr/simulate"),
+    ),
+    "depth": Bench(
+        "Dense depth",
+        MAPPED,
+        "dense depth on simulated scenes: completeness, accuracy, map, by texture and reason",
+        True,
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/simulate"),
+        long="everything plain, too",
+    ),
+    "map": Bench(
+        "The map",
+        MAPPED,
+        "the map: accuracy of both presets, training, queries, distances, spheres beside python-fcl",
+        True,
+        measures=(*MAP, *DEPTH, "src/jcr/simulate"),
+    ),
+    "predictions": Bench(
+        "The whole job from a network's pointmaps",
+        OTHERS,
+        "the whole job from pointmaps with a network's errors: error, honesty, map, time",
+        measures=(*SOLVER, "src/jcr/reconstruct/global_alignment", "src/jcr/reconstruct/from_pairs.py", *MAP),
+        long="three draws instead of one",
+    ),
+    "models": Bench(
+        "Any-view networks",
+        OTHERS,
+        "any-view models from predictions with published errors, beside COLMAP and direct alignment",
+        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/views_at_once", "src/jcr/reconstruct/direct"),
+        long="a textured table and errors as on DTU and 7-Scenes, too",
+    ),
+    "model_cost": Bench(
+        "What any-view networks cost",
+        TIME,
+        "seconds and memory of any-view networks with random weights, beside what is estimated",
+        True,
+        measures=("src/jcr/reconstruct/views_at_once",),
+    ),
+    "align": Bench(
+        "Global alignment",
+        OTHERS,
+        "global alignment: fast against adam, kinematic against free, in error, time and memory",
+        True,
+        measures=("src/jcr/reconstruct/global_alignment",),
+        long="3 draws of every number of images instead of 1, 10 of every calibration instead of 4",
+    ),
+    "pairs": Bench(
+        "Pairs of a network",
+        TIME,
+        "predicting pairs with every image encoded once, or with every pair",
+        True,
+        measures=("src/jcr/reconstruct/dust3r",),
+        long="ten images instead of six",
+    ),
+    "memory": Bench(
+        "Memory and its budget",
+        TIME,
+        "peak memory against the budget by number of images, COLMAP and small networks",
+        measures=(*FEATURES, *DEPTH, *MAP, "src/jcr/memory.py"),
+        long="20 and 40 images, too",
+    ),
+    "bag": Bench(
+        "Frames chosen from a recording",
+        TIME,
+        "frames chosen from a minute of a robot's MCAP: which, time and memory",
+        True,
+        measures=(*READING,),
+    ),
+    "samples": Bench(
+        "A marker's samples, beside OpenCV",
+        OTHERS,
+        "metric samples of a marker beside OpenCV's five methods",
+        measures=(*SOLVER, "src/jcr/capture/samples.py"),
+    ),
+    "first_day": Bench(
+        "A first day",
+        ROBOTS,
+        "what a new user types and sees, from files as robots write them to a URDF",
+        True,
+        measures=(*WHOLE, "src/jcr/cli", "src/jcr/live"),
+    ),
+    "batch": Bench(
+        "Many captures",
+        TIME,
+        "many small captures by one process and by two: time, and memory while they run",
+        True,
+        measures=(*WHOLE, "src/jcr/batch.py"),
+        long="200 captures instead of 32",
+    ),
+}
+"""In the order of the README's claims."""
+LONG = "_long"
+"""Ends the name of a page that --long wrote."""
+
+
+def paths_of(page: str) -> tuple[str, ...] | None:
+    """What the numbers of a page come from, the bench itself included; None for the index."""
+    name = page.removesuffix(LONG)
+    return (*BENCHES[name].measures, f"benchmarks/{name}.py") if name in BENCHES else None
+
+
+def title_of(page: str) -> str:
+    """The heading of a page by the name of its file."""
+    return BENCHES[page.removesuffix(LONG)].title + (", the long bench" if page.endswith(LONG) else "")
