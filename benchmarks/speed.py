@@ -28,7 +28,7 @@ ALONE, ALL_OF_IT, CALIBRATED, KEPT, STARTED = (
     "`jcr calibrate`, reconstruction kept",
     "`jcr calibrate` of a folder that is not there",
 )
-STAGES = ("reconstruct", "calibrate", "densify", "map", "report")
+STAGES: tuple[str, ...] = ("reconstruct", "calibrate", "densify", "map", "report")
 
 
 @dataclass(frozen=True)

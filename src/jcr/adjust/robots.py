@@ -14,6 +14,7 @@ base_from_world are eliminated. The evidence is then what the images show withou
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -193,6 +194,17 @@ class Adjusted:
         return j
 
 
+@dataclass(frozen=True)
+class RigsGivenCameras:
+    """What the images show of the rigs that arms move, with everything else of the scene where it is."""
+
+    follow: Float[ndarray, "s e"]
+    """By how much the rigs step back with each free column."""
+    step: Float[ndarray, " s"]
+    """To where they are likeliest, with the sign reversed."""
+    covariance: Float[ndarray, "s s"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Given:
     """What the mixed model of a scene is made of."""
@@ -202,16 +214,31 @@ class Given:
     noise: tuple[float, float] | None
     """m, rad: of the gripper poses, at least."""
 
-    @property
+    @cached_property
     def by_arm(self) -> Int[ndarray, " s"]:
         """Columns of the evidence: rigs that arms move, in the order of the residuals."""
         moving = np.concatenate([arm.rigs for arm in self.arms])
         return (self.evidence.problem.freedom.first_rig + 6 * moving[:, None] + np.arange(6)).ravel()
 
-    @property
+    @cached_property
     def free(self) -> Int[ndarray, " e"]:
         """Columns of the evidence that are unknowns here: cameras, mounts, and rigs that no arm moves."""
         return np.setdiff1d(np.arange(len(self.evidence.gradient)), self.by_arm)
+
+    @cached_property
+    def rigs(self) -> RigsGivenCameras:
+        """What the images alone show of the rigs that arms move."""
+        images, by_arm, free = self.evidence, self.by_arm, self.free
+        own = images.information[np.ix_(by_arm, by_arm)]
+        size = 1 / np.sqrt(own.diagonal())
+        factor = cho_factor(size[:, None] * own * size, lower=True)
+        coupling = images.information[np.ix_(by_arm, free)]
+        solved = size[:, None] * cho_solve(
+            factor, size[:, None] * np.column_stack([coupling, images.gradient[by_arm], np.diag(1 / size)])
+        )
+        return RigsGivenCameras(
+            solved[:, : len(free)], solved[:, len(free)], solved[:, len(free) + 1 :] * size
+        )
 
 
 @one_blas_thread
@@ -288,7 +315,7 @@ def _settled(
             placed = together.damped(placed)
             acceleration.forget()
     else:
-        given = replace(given, evidence=evidence(placed.scene, problem, pixels))
+        given = Given(evidence=evidence(placed.scene, problem, pixels), arms=arms, noise=noise)
     return tied(given, placed, log_sizes)
 
 
@@ -312,7 +339,7 @@ class _Together:
         """Where everything is now."""
         equations, _ = equations_of(placed, given)
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
-        solution, rigs = solve(equations, log_sizes), rigs_given_cameras(given)
+        solution, rigs = solve(equations, log_sizes), given.rigs
         robots, step = _of_robots(given.arms), solution.step
         # The rigs go where the images put them beside the cameras, and as far to the reported poses as these weigh.
         left = cho_solve((solution.root, True), equations.residual + equations.jacobian @ step)
@@ -461,35 +488,11 @@ def _prior(arms: Sequence[ArmPoses]) -> Float[ndarray, "u u"]:
     return prior
 
 
-@dataclass(frozen=True)
-class RigsGivenCameras:
-    """What the images show of the rigs that arms move, with everything else of the scene where it is."""
-
-    follow: Float[ndarray, "s e"]
-    """By how much the rigs step back with each free column."""
-    step: Float[ndarray, " s"]
-    """To where they are likeliest, with the sign reversed."""
-    covariance: Float[ndarray, "s s"]
-
-
-def rigs_given_cameras(given: Given) -> RigsGivenCameras:
-    """From the evidence of the images alone."""
-    images, by_arm, free = given.evidence, given.by_arm, given.free
-    own = images.information[np.ix_(by_arm, by_arm)]
-    size = 1 / np.sqrt(own.diagonal())
-    factor = cho_factor(size[:, None] * own * size, lower=True)
-    coupling = images.information[np.ix_(by_arm, free)]
-    solved = size[:, None] * cho_solve(
-        factor, size[:, None] * np.column_stack([coupling, images.gradient[by_arm], np.diag(1 / size)])
-    )
-    return RigsGivenCameras(solved[:, : len(free)], solved[:, len(free)], solved[:, len(free) + 1 :] * size)
-
-
 def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     """Residuals of the reported gripper poses, linear in all unknowns; what the images show of the rigs is in them."""
     images, free = given.evidence, given.free
     residual, jacobian, by_rig, systematic = of_poses(placed, given.arms)
-    rigs = rigs_given_cameras(given)
+    rigs = given.rigs
     follow, step = rigs.follow, rigs.step
     coupling = images.information[np.ix_(given.by_arm, free)]
     known = by_rig @ rigs.covariance @ by_rig.T
