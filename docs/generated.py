@@ -10,19 +10,17 @@ import json
 import re
 import sys
 import textwrap
-import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
-from jcr.cli import COMMANDS, NO_DEFAULT, configuration
+from jcr.cli import COMMANDS
+from jcr.cli.help import Argument, groups
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.reconstruct.reconstruction_npz import About
 from jcr.run_folder import State
@@ -83,37 +81,17 @@ def cli_page() -> str:
     ]
     for name in COMMANDS:
         command = import_module(f"jcr.cli.{name.replace('-', '_')}")
-        with warnings.catch_warnings():
-            # The only way to ask tyro for what it has parsed; it is to go with nothing in its place yet.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            parser = tyro.extras.get_parser(command.Arguments, prog=f"jcr {name}", config=configuration())
-        parts += ["", f"## jcr {name}", "", _text(parser.description or "")]
-        for group in parser._action_groups:
-            rows = [_argument(action) for action in group._group_actions if action.dest != "help"]
-            if rows:
-                title = {"positional arguments": "Arguments", "options": "Options"}.get(
-                    group.title or "", group.title
-                )
-                parts += [
-                    "",
-                    f"**{(title or '').capitalize()}**"
-                    + (f": {group.description}" if group.description else ""),
-                ]
-                parts += ["", "| | |", "|---|---|", *rows]
+        parts += ["", f"## jcr {name}", "", _text(command.Arguments.__doc__ or "")]
+        for group in groups(command.Arguments, f"jcr {name}"):
+            title = {"positional arguments": "Arguments", "options": "Options"}.get(group.title, group.title)
+            parts += ["", f"**{title.capitalize()}**" + (f": {group.about}" if group.about else "")]
+            parts += ["", "| | |", "|---|---|", *map(_argument, group.arguments)]
     return "\n".join(parts) + "\n"
 
 
-def _argument(action: Any) -> str:
-    flag = action.option_strings[-1] if action.option_strings else ""
-    value = "" if action.nargs == 0 else action.metavar
-    value = " ".join(value) if isinstance(value, tuple) else value or ""
-    if action.choices and not value.startswith("{"):
-        value = "" if len(value) > 24 else value
-        value += f" `{' | '.join(map(str, action.choices))}`" if not value else ""
-    # The parser of arguments has its own use for a single percent sign.
-    said = NO_DEFAULT.sub("", str(action.help).replace("\n", " ").replace("%%", "%"))
-    named = f"`{flag} {value}`".replace(" `", "`") if not value.startswith(" `") else f"`{flag}`{value}"
-    return f"| {_cell(named if flag else f'`{value}`')} | {_cell(_escaped(said))} |"
+def _argument(argument: Argument) -> str:
+    named = " ".join(filter(None, (argument.flag, argument.value.replace(",", ", "))))
+    return f"| {_cell(f'`{named}`')} | {_cell(_escaped(argument.text))} |"
 
 
 def _cell(text: str) -> str:
@@ -251,19 +229,22 @@ def _fields(record: type) -> Iterator[tuple[Any, ast.stmt | None]]:
 def schema(model: Any) -> dict[str, Any]:
     """The JSON Schema of a pydantic model, with what the source says of each field."""
     found = model.model_json_schema()
-    module_names = {model.__name__: model} | {
-        name: value
-        for module in list(sys.modules.values())
-        if (getattr(module, "__name__", "") or "").startswith("jcr")
-        for name, value in vars(module).items()
-        if inspect.isclass(value)
-    }
     for name, part in [(model.__name__, found), *found.get("$defs", {}).items()]:
-        said = described(module_names[name]) if name in module_names else {}
-        for field, text in said.items():
+        kind = _class_named(name, part.get("properties", {}).keys())
+        for field, text in ({} if kind is None else described(kind)).items():
             if field in part.get("properties", {}):
                 part["properties"][field].setdefault("description", text)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | found
+
+
+def _class_named(name: str, properties: Collection[str]) -> type | None:
+    """The class of a part of a schema: others may have its name, but not all of its fields."""
+    modules = sorted(name for name in sys.modules if name.startswith("jcr"))
+    found = (vars(sys.modules[module]).get(name) for module in modules)
+    return next(
+        (kind for kind in found if inspect.isclass(kind) and annotations(kind).keys() >= set(properties)),
+        None,
+    )
 
 
 def formats_page() -> str:

@@ -123,28 +123,12 @@ def verify(
     when the images share too few features with the old scene, or too few of another, to tell.
     """
     report, options = progress or silent, checked_options(options, VerifyOptions)
-    out = Path(out)
-    if not isinstance(new, Capture):
-        found = read_source(new, at_least=1)
-        if isinstance(found, PosePairs):
-            raise InputError(f"{new}: gives poses and no images, which verify needs")
-        new = found
     if not 0 < options.alpha < 0.5:
         raise InputError(f"--alpha {options.alpha}: give a false-alarm rate between 0 and 0.5")
-    folder = RunFolder(out)
+    new = _read(new)
+    folder = RunFolder(Path(out))
     calibration, reconstruction = folder.calibrated()
-    if not calibration.converged:
-        raise InputError(
-            f"{out}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
-        )
-    capture, options_then = folder.capture(), folder.options()
-    if [image.image for image in calibration.images] != list(capture.images):
-        raise InputError(f"{capture.folder}: has changed since {out} was made; run `jcr calibrate` again")
-    if new.image_size != capture.image_size:
-        raise InputError(
-            f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
-            f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
-        )
+    capture = _calibrated_on(folder, calibration, new)
     taken_then, taken_now = _images(capture.folder, capture.images), _images(new.folder, new.images)
     _require_new(taken_now, taken_then)
     report("find the old scene", 0.0)
@@ -154,34 +138,75 @@ def verify(
         [*taken_now.values()],
     )
     report("find the old scene", 1.0)
-    shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
     lost = [f"{name} shares {place} points with the calibrated scene"
             for name, place in zip(new.images, located, strict=True) if not isinstance(place, Located)]  # fmt: skip
-    if shared:
-        places = [place for place in located if isinstance(place, Located)]
-        used = reconstruction.image_index[_used(calibration, reconstruction)]
-        robot = robot_errors(capture, options_then.calibrate, new)
-        errors, unused = robot.systematic, robot.unused
-        systematic = of_poses(errors, np.r_[used, len(capture) + np.array(shared)])
-        old = of_poses(errors, used)
-        found = drift(
-            *fitted(calibration, capture, reconstruction, options_then.calibrate, old),
-            (
-                new.base_from_gripper[shared],
-                np.stack([place.recon_from_camera for place in places]),
-                np.stack([place.covariance for place in places]),
-            ),
-            systematic,
-            options.alpha,
+    options_then = folder.options()
+    if len(lost) < len(new):
+        return _in_old_scene(
+            (calibration, capture, reconstruction, options_then.calibrate), new, located, lost, options
         )
-        notes = (*lost, *([] if unused is None else [sentence(unused)]), *_same_poses(new, capture))
-        return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
     if len(new) < MIN_TO_RECALIBRATE:
         raise NotTrustedError(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
     return _by_recalibration(calibration, new, options_then.reconstruct, options, progress)
+
+
+def _read(new: Capture | str | Path) -> Capture:
+    if isinstance(new, Capture):
+        return new
+    found = read_source(new, at_least=1)
+    if isinstance(found, PosePairs):
+        raise InputError(f"{new}: gives poses and no images, which verify needs")
+    return found
+
+
+def _calibrated_on(folder: RunFolder, calibration: CalibrationFile, new: Capture) -> Capture:
+    """The capture of a run; InputError where new images cannot be held against it."""
+    if not calibration.converged:
+        raise InputError(
+            f"{folder.path}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
+        )
+    capture = folder.capture()
+    if [image.image for image in calibration.images] != list(capture.images):
+        raise InputError(
+            f"{capture.folder}: has changed since {folder.path} was made; run `jcr calibrate` again"
+        )
+    if new.image_size != capture.image_size:
+        raise InputError(
+            f"{new.folder}: images of {new.image_size[0]}x{new.image_size[1]} pixels, the calibration is for "
+            f"{capture.image_size[0]}x{capture.image_size[1]}; take them with the same camera and resolution"
+        )
+    return capture
+
+
+def _in_old_scene(
+    then: tuple[CalibrationFile, Capture, Reconstruction, CalibrateOptions],
+    new: Capture,
+    located: Sequence[Located | int],
+    lost: Sequence[str],
+    options: VerifyOptions,
+) -> Verification:
+    """By the images that show where in the calibrated scene they were taken."""
+    calibration, capture, reconstruction, calibrate_options = then
+    shared = [k for k, place in enumerate(located) if isinstance(place, Located)]
+    places = [place for place in located if isinstance(place, Located)]
+    used = reconstruction.image_index[_used(calibration, reconstruction)]
+    robot = robot_errors(capture, calibrate_options, new)
+    found = drift(
+        *fitted(*then, of_poses(robot.systematic, used)),
+        (
+            new.base_from_gripper[shared],
+            np.stack([place.recon_from_camera for place in places]),
+            np.stack([place.covariance for place in places]),
+        ),
+        of_poses(robot.systematic, np.r_[used, len(capture) + np.array(shared)]),
+        options.alpha,
+    )
+    unused = [] if robot.unused is None else [sentence(robot.unused)]
+    notes = (*lost, *unused, *_same_poses(new, capture))
+    return _judged(found, options, tuple(new.images[k] for k in shared), notes, "in the old scene")
 
 
 def verify_camera(

@@ -378,21 +378,23 @@ def test_the_command_line_judges_a_bag(mcap: Path):
 def test_images_that_are_listed_and_not_there_are_refused_in_one_line(tmp_path: Path):
     """A bag whose index is damaged: its messages come when read in turn, and not when asked for by their time."""
     from jcr.capture.options import ReadOptions
-    from jcr.capture.recording import capture_of_recording
+    from jcr.capture.recording import Recording, capture_of_recording
 
     poses = np.tile(np.eye(4), (30, 1, 1))
     poses[:, 0, 3] = 0.02 * np.arange(30)
     picture = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     with pytest.raises(jcr.InputError, match="scan.mcap: .* are not where its index says; it is damaged"):
         capture_of_recording(
-            tmp_path / "scan.mcap",
-            [str(k) for k in range(30)],
-            poses,
-            np.zeros(30),
-            np.zeros(30, int),
-            lambda rows: ((row, picture, ".png") for row in rows.tolist()[::2]),
-            lambda size: None,
-            ReadOptions(),
+            Recording(
+                source=tmp_path / "scan.mcap",
+                options=ReadOptions(),
+                names=[str(k) for k in range(30)],
+                base_from_gripper=poses,
+                speed=np.zeros(30),
+                gap_ns=np.zeros(30, int),
+                pictures=lambda rows: ((row, picture, ".png") for row in rows.tolist()[::2]),
+                lens_of_size=lambda size: None,
+            ),
             tmp_path / "out",
             lambda stage, share: None,
         )

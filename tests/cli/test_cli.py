@@ -14,6 +14,7 @@ import pytest
 
 import jcr
 from jcr.cli import COMMANDS, dispatch
+from jcr.cli.help import MANY
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.options import MapOptions
 
@@ -187,7 +188,19 @@ def test_every_command_has_help_with_examples(capsys: pytest.CaptureFixture[str]
     assert all(name in overview for name in COMMANDS)
     for name in COMMANDS:
         assert dispatch([name, "--help"]) == 0
-        assert "examples:" in capsys.readouterr().out, name
+        text = capsys.readouterr().out
+        assert "examples:" in text and not re.search(r"[│╭╰]", text), name
+        assert len(re.findall(r"^  --", text, re.MULTILINE)) <= MANY, name
+
+
+def test_help_lists_what_users_set_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]):
+    assert dispatch(["run", "--help"]) == 0
+    few = capsys.readouterr().out
+    assert dispatch(["run", "--help-all"]) == 0
+    everything = capsys.readouterr().out
+    options = [re.findall(r"^  (--[a-z-]+)", text, re.MULTILINE) for text in (few, everything)]
+    assert set(options[0]) < set(options[1]) and "--robot" in options[0] and "--seed" not in options[0]
+    assert f"{len(options[1]) - len(options[0])} more options: jcr run --help-all" in few
 
 
 def test_sizes_of_nothing_are_refused(tmp_path: Path):
@@ -253,8 +266,8 @@ def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: 
 
 
 def test_help_names_units_and_gives_defaults_only_where_they_are_values(capsys: pytest.CaptureFixture[str]):
-    assert dispatch(["calibrate", "--help"]) == 0
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split()).partition("positional arguments")[2]
+    assert dispatch(["calibrate", "--help-all"]) == 0
+    text = " ".join(capsys.readouterr().out.split()).partition("read options")[2]
     assert "--require MM DEG" in text and "--robot-noise MM DEG" in text and "(default: 8.0)" in text
     assert not re.search(r"\(default:\s+(None|True|False)\)", text)
     assert "--no-bundle-adjustment Use camera poses only" in text

@@ -1,22 +1,22 @@
 """ROS 1 bags, ROS 2 sqlite3 and MCAP: images of one topic or more, with poses from tf or from joint states."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Int, UInt16
+from jaxtyping import Float, Int, UInt16
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jcr.capture.camera_info import lens_of_ros, read_camera_info
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_fault, read_yaml
-from jcr.capture.pose_track import speed
+from jcr.capture.pose_track import PosesAt, speed
 from jcr.capture.recorded_cameras import Lens, Pictures, RecordedCamera, asked_cameras, camera_names
-from jcr.capture.recording import capture_of_recording
+from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.ros_image import depth_of, picture_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
@@ -47,106 +47,45 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     """
     asked = asked_cameras(options)
     with _opened(path) as reader:
-        topics = _camera_topics(reader, options, list(asked), path)
-        infos = {topic: info for topic in topics if (info := _info_of(reader, topic)) is not None}
-        cameras = [c for c in reader.connections if c.topic in topics]
-        pose_connections = _pose_connections(reader, options, path)
-        wanted = [*cameras, *{info.topic: info for info in infos.values()}.values(), *pose_connections]
-        _refuse_other_definitions(reader, wanted, path)
-        recorded, lenses = {topic: _Recorded() for topic in topics}, {}
-        tree, joint_states = TfTree(), []
-        span = max(reader.end_time - reader.start_time, 1)
-        for connection, at, message in _messages(reader, wanted, path):
-            if connection.msgtype in TF:
-                tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
-            elif connection.msgtype == JOINTS:
-                joint_states.append((_stamp(message, at), message.name, message.position))
-            elif connection.msgtype == INFO:
-                lenses.setdefault(connection.topic, message)
-            else:
-                recorded[connection.topic].add(_stamp(message, at), at, message.header.frame_id)
-                report("frames", 0.1 * (at - reader.start_time) / span)
-        topics = _with_images(topics, recorded, (options.camera_topic, *asked), path)
-        arm = None if options.urdf is None else _joint_track(joint_states, options, path)
-        poses_at = tree.poses_at(options.base_frame, options.gripper_frame, path) if arm is None else arm.at
-        frames = options.base_frame, options.gripper_frame
-        mounts = dict[str, Mount | None].fromkeys(topics)
-        if len(topics) > 1:
-            for name in topics:
-                mounts[name] = tree.mount_of(recorded[name].frame, *frames, recorded[name].some(), path)
-        mounts.update((name, mount) for name, mount in asked.items() if mount is not None)
-        topic, *others = _chosen(topics, options, asked, mounts, path)
-        stamps = recorded[topic].sorted()[0]
+        heard = _heard(reader, options, asked, path, report)
+        arm = None if options.urdf is None else _joint_track(heard.joint_states, options, path)
+        by_tf = options.base_frame, options.gripper_frame, path
+        poses_at = heard.tree.poses_at(*by_tf) if arm is None else arm.at
+        mounts = _mounts(heard, options, asked, path)
+        topic, *others = _chosen(heard.topics, options, asked, mounts, path)
+        stamps = heard.recorded[topic].sorted()[0]
         poses, gap_ns = poses_at(stamps)
-        joints = None if arm is None else arm.angles(stamps)
-
-        def pictures_of(topic: str) -> Pictures:
-            of_topic = [c for c in cameras if c.topic == topic]
-            all_stamps, all_logs = recorded[topic].sorted()
-
-            def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
-                nearest = _nearest(all_stamps, stamps[rows])
-                there, gaps = poses_at(all_stamps[nearest])
-                moved = motion_length(inverse(poses[rows]) @ there)
-                apart = np.abs(all_stamps[nearest] - stamps[rows])
-                same = (apart == 0) | (gaps <= 1e6 * options.max_gap_ms) & (moved < SAME_POSE)
-                for row, k, usable in zip(rows.tolist(), nearest.tolist(), same.tolist(), strict=True):
-                    if not usable and mounts[topic] != "base":
-                        continue
-                    at = int(all_logs[k])
-                    for _, _, message in _messages(reader, of_topic, path, start=at, stop=at + 1):
-                        if _stamp(message, at) == all_stamps[k]:
-                            yield row, *picture_of(message, f"{path}: {topic}")
-                            break
-
-            return pictures
-
-        aligned = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
-        _refuse_other_definitions(reader, aligned, path)
-
-        def depth_at(row: int) -> UInt16[np.ndarray, "h w"] | None:
-            """Of the exposure nearest to the frame's; None where it has none."""
-            at = int(recorded[topic].sorted()[1][row])
-            found, off = None, SAME_MOMENT_NS
-            near = {"start": at - 5 * SAME_MOMENT_NS, "stop": at + 5 * SAME_MOMENT_NS}
-            for connection, logged, message in _messages(reader, aligned, path, **near):
-                if (apart := abs(_stamp(message, logged) - int(stamps[row]))) <= off:
-                    found, off = depth_of(message, f"{path}: {connection.topic}"), apart
-            return found
-
-        def lens_of(topic: str) -> Lens:
-            def lens(size: tuple[int, int]) -> Intrinsics | None:
-                name = infos[topic].topic if topic in infos else ""
-                return _lens(lenses[name], topic, size, f"{path}: {name}") if name in lenses else None
-
-            return lens
-
-        def lens(size: tuple[int, int]) -> Intrinsics | None:
-            if options.camera_info is not None:
-                return read_camera_info(options.camera_info, size)
-            return lens_of(topic)(size)
-
+        frames = _Frames(
+            reader=reader,
+            path=path,
+            options=options,
+            heard=heard,
+            mounts=mounts,
+            poses_at=poses_at,
+            topic=topic,
+            stamps=stamps,
+            base_from_gripper=poses,
+        )
         own, *further = camera_names([topic, *others])
-        return capture_of_recording(
-            path,
-            [str(stamp) for stamp in stamps],
-            poses,
-            speed(poses_at, stamps),
-            gap_ns,
-            pictures_of(topic),
-            lens,
-            options,
-            into,
-            report,
-            joints,
-            depth_at if aligned else None,
-            own,
-            [
-                RecordedCamera(name, mount, pictures_of(other), lens_of(other))
+        recording = Recording(
+            source=path,
+            options=options,
+            names=[str(stamp) for stamp in stamps],
+            base_from_gripper=poses,
+            speed=speed(poses_at, stamps),
+            gap_ns=gap_ns,
+            pictures=frames.pictures_of(topic),
+            lens_of_size=frames.lens,
+            joints=None if arm is None else arm.angles(stamps),
+            depth_at=frames.depth_at if heard.aligned else None,
+            camera_name=own,
+            others=[
+                RecordedCamera(name, mount, frames.pictures_of(other), frames.lens_of(other))
                 for name, other in zip(further, others, strict=True)
                 if (mount := mounts[other]) is not None
             ],
         )
+        return capture_of_recording(recording, into, report)
 
 
 @dataclass
@@ -171,6 +110,138 @@ class _Recorded:
         """Stamps through the whole recording."""
         stamps, _ = self.sorted()
         return stamps[np.linspace(0, len(stamps) - 1, min(len(stamps), LOOKED_AT)).round().astype(int)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Heard:
+    """What one pass over a bag found, its images aside."""
+
+    topics: list[str]
+    """Of cameras on which something was recorded."""
+    cameras: list[Any]
+    """Connections of all camera topics."""
+    aligned: list[Any]
+    """Connections of depth that has the pixels of a colour image."""
+    recorded: dict[str, _Recorded]
+    infos: dict[str, Any]
+    """By camera topic the connection of its CameraInfo."""
+    lenses: dict[str, Any]
+    """By the topic of a CameraInfo its first message."""
+    tree: TfTree
+    joint_states: list[Any]
+
+
+def _heard(
+    reader: Any, options: ReadOptions, asked: Mapping[str, Mount | None], path: Path, report: Progress
+) -> _Heard:
+    topics = _camera_topics(reader, options, list(asked), path)
+    infos = {topic: info for topic in topics if (info := _info_of(reader, topic)) is not None}
+    cameras = [c for c in reader.connections if c.topic in topics]
+    aligned = [c for c in reader.connections if c.msgtype in IMAGES and ALIGNED in c.topic]
+    pose_connections = _pose_connections(reader, options, path)
+    wanted = [*cameras, *{info.topic: info for info in infos.values()}.values(), *pose_connections]
+    _refuse_other_definitions(reader, [*wanted, *aligned], path)
+    recorded, lenses = {topic: _Recorded() for topic in topics}, dict[str, Any]()
+    tree, joint_states = TfTree(), list[Any]()
+    span = max(reader.end_time - reader.start_time, 1)
+    for connection, at, message in _messages(reader, wanted, path):
+        if connection.msgtype in TF:
+            tree.add(message.transforms, static=connection.topic.endswith("tf_static"))
+        elif connection.msgtype == JOINTS:
+            joint_states.append((_stamp(message, at), message.name, message.position))
+        elif connection.msgtype == INFO:
+            lenses.setdefault(connection.topic, message)
+        else:
+            recorded[connection.topic].add(_stamp(message, at), at, message.header.frame_id)
+            report("frames", 0.1 * (at - reader.start_time) / span)
+    return _Heard(
+        topics=_with_images(topics, recorded, (options.camera_topic, *asked), path),
+        cameras=cameras,
+        aligned=aligned,
+        recorded=recorded,
+        infos=infos,
+        lenses=lenses,
+        tree=tree,
+        joint_states=joint_states,
+    )
+
+
+def _mounts(
+    heard: _Heard, options: ReadOptions, asked: Mapping[str, Mount | None], path: Path
+) -> dict[str, Mount | None]:
+    """What carries each camera, by what was asked, else by tf; None where neither tells or there is one camera."""
+    mounts = dict[str, Mount | None].fromkeys(heard.topics)
+    if len(heard.topics) > 1:
+        for name in heard.topics:
+            one = heard.recorded[name]
+            by_tf = one.frame, options.base_frame, options.gripper_frame, one.some(), path
+            mounts[name] = heard.tree.mount_of(*by_tf)
+    mounts.update((name, mount) for name, mount in asked.items() if mount is not None)
+    return mounts
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Frames:
+    """Images, depth and intrinsics at the stamps of the chosen camera's images, read from the bag when asked for."""
+
+    reader: Any
+    path: Path
+    options: ReadOptions
+    heard: _Heard
+    mounts: dict[str, Mount | None]
+    poses_at: PosesAt
+    topic: str
+    """Of the chosen camera."""
+    stamps: Int[np.ndarray, " n"]
+    base_from_gripper: Float[np.ndarray, "n 4 4"]
+
+    def pictures_of(self, topic: str) -> Pictures:
+        """Of a camera those that were taken where the arm was at the chosen camera's."""
+
+        def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
+            of_topic = [c for c in self.heard.cameras if c.topic == topic]
+            all_stamps, all_logs = self.heard.recorded[topic].sorted()
+            nearest = _nearest(all_stamps, self.stamps[rows])
+            there, gaps = self.poses_at(all_stamps[nearest])
+            moved = motion_length(inverse(self.base_from_gripper[rows]) @ there)
+            apart = np.abs(all_stamps[nearest] - self.stamps[rows])
+            same = (apart == 0) | (gaps <= 1e6 * self.options.max_gap_ms) & (moved < SAME_POSE)
+            for row, k, usable in zip(rows.tolist(), nearest.tolist(), same.tolist(), strict=True):
+                if not usable and self.mounts[topic] != "base":
+                    continue
+                at = int(all_logs[k])
+                for _, _, message in _messages(self.reader, of_topic, self.path, start=at, stop=at + 1):
+                    if _stamp(message, at) == all_stamps[k]:
+                        yield row, *picture_of(message, f"{self.path}: {topic}")
+                        break
+
+        return pictures
+
+    def depth_at(self, row: int) -> UInt16[np.ndarray, "h w"] | None:
+        """Of the exposure nearest to the frame's; None where it has none."""
+        at = int(self.heard.recorded[self.topic].sorted()[1][row])
+        found, off = None, SAME_MOMENT_NS
+        near = {"start": at - 5 * SAME_MOMENT_NS, "stop": at + 5 * SAME_MOMENT_NS}
+        for connection, logged, message in _messages(self.reader, self.heard.aligned, self.path, **near):
+            if (apart := abs(_stamp(message, logged) - int(self.stamps[row]))) <= off:
+                found, off = depth_of(message, f"{self.path}: {connection.topic}"), apart
+        return found
+
+    def lens_of(self, topic: str) -> Lens:
+        """By the CameraInfo that belongs to a topic."""
+
+        def lens(size: tuple[int, int]) -> Intrinsics | None:
+            name = self.heard.infos[topic].topic if topic in self.heard.infos else ""
+            messages = self.heard.lenses
+            return _lens(messages[name], topic, size, f"{self.path}: {name}") if name in messages else None
+
+        return lens
+
+    def lens(self, size: tuple[int, int]) -> Intrinsics | None:
+        """Of the chosen camera: as asked for, else by its CameraInfo."""
+        if self.options.camera_info is not None:
+            return read_camera_info(self.options.camera_info, size)
+        return self.lens_of(self.topic)(size)
 
 
 def _with_images(

@@ -14,12 +14,12 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
 from jcr.capture.recorded_cameras import Pictures, RecordedCamera, asked_cameras, camera_names
-from jcr.capture.recording import capture_of_recording
+from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.robot_poses import CONVENTIONS
 from jcr.capture.video import frames_at
 from jcr.errors import InputError
 from jcr.progress import Progress
-from jcr.records import Capture, Intrinsics
+from jcr.records import Capture
 
 CARTESIAN = "observation.state.cartesian_position"
 """DROID's: x, y, z (m), roll, pitch, yaw (rad) of the gripper in the robot's base."""
@@ -37,39 +37,15 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
     episodes = [read_episode(path, info, camera, key, index) for index in options.episode]
     state = np.concatenate([episode.state for episode in episodes])
     poses, joints = _poses(state, key, info.features[key], options, path)
-    ends = np.cumsum([len(episode.time_s) for episode in episodes])
-    parts = np.split(np.arange(len(state)), ends[:-1])
     motion = np.concatenate(
-        [_speed(episode, poses[part]) for episode, part in zip(episodes, parts, strict=True)]
+        [_speed(episode, poses[part]) for episode, part in zip(episodes, _rows(episodes), strict=True)]
     )
-
-    def pictures_of(key_of_camera: str, episodes: list[Episode]) -> Pictures:
-        def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
-            for episode, part in zip(episodes, parts, strict=True):
-                mine = rows[np.isin(rows, part)]
-                if len(mine) == 0:
-                    continue
-                if episode.video is None:
-                    files = pictures_in_table(episode, key_of_camera, mine - part[0])
-                    for row, file in zip(mine.tolist(), files, strict=True):
-                        yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
-                    continue
-                times = episode.video_start_s + episode.time_s[mine - part[0]]
-                frames = frames_at(episode.video, times, 0.5 / info.fps)
-                for row, rgb in zip(mine.tolist(), frames, strict=True):
-                    yield row, rgb, ".png"
-
-        return pictures
-
-    def lens(size: tuple[int, int]) -> Intrinsics | None:
-        return None if options.camera_info is None else read_camera_info(options.camera_info, size)
 
     names = [
         f"episode_{episode.index:06d}_frame_{k:06d}"
         for episode in episodes
         for k in range(len(episode.time_s))
     ]
-    gap_ns = np.zeros(len(state), np.int64)  # a row is one instant: nothing is interpolated
     own, *further = camera_names([camera, *asked])
     others = []
     for name, (other, mount) in zip(further, asked.items(), strict=True):
@@ -79,22 +55,50 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
                 f"fixed camera, {other}=gripper for one on the gripper"
             )
         theirs = [read_episode(path, info, other, key, index) for index in options.episode]
-        others.append(RecordedCamera(name, mount, pictures_of(other, theirs), lambda _: None))
-    return capture_of_recording(
-        path,
-        names,
-        poses,
-        motion,
-        gap_ns,
-        pictures_of(camera, episodes),
-        lens,
-        options,
-        into,
-        report,
-        joints,
+        others.append(RecordedCamera(name, mount, _pictures(theirs, other, info.fps), lambda _: None))
+    recording = Recording(
+        source=path,
+        options=options,
+        names=names,
+        base_from_gripper=poses,
+        speed=motion,
+        gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
+        pictures=_pictures(episodes, camera, info.fps),
+        lens_of_size=lambda size: (
+            None if options.camera_info is None else read_camera_info(options.camera_info, size)
+        ),
+        joints=joints,
         camera_name=own,
         others=others,
     )
+    return capture_of_recording(recording, into, report)
+
+
+def _rows(episodes: list[Episode]) -> list[Int[ndarray, " k"]]:
+    """Of each episode among the frames of all."""
+    ends = np.cumsum([len(episode.time_s) for episode in episodes])
+    return np.split(np.arange(ends[-1]), ends[:-1])
+
+
+def _pictures(episodes: list[Episode], key: str, fps: float) -> Pictures:
+    """Of the camera of a key."""
+
+    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
+        for episode, part in zip(episodes, _rows(episodes), strict=True):
+            mine = rows[np.isin(rows, part)]
+            if len(mine) == 0:
+                continue
+            if episode.video is None:
+                files = pictures_in_table(episode, key, mine - part[0])
+                for row, file in zip(mine.tolist(), files, strict=True):
+                    yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
+                continue
+            times = episode.video_start_s + episode.time_s[mine - part[0]]
+            frames = frames_at(episode.video, times, 0.5 / fps)
+            for row, rgb in zip(mine.tolist(), frames, strict=True):
+                yield row, rgb, ".png"
+
+    return pictures
 
 
 def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str], path: Path) -> str:

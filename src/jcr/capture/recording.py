@@ -1,11 +1,11 @@
 """From a recording to a capture: the best frames are chosen, and put in a folder with a capture.json."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Bool, Float, Int, UInt16
 from numpy import ndarray
 
 from jcr.capture.best_frames import best_frames
@@ -19,81 +19,117 @@ from jcr.files import write_bytes
 from jcr.progress import Progress
 from jcr.records import Capture
 
+BESIDE_ALL_POSES_NS = 1e15
+"""A gap that is none: the frame is before the first pose or after the last."""
 
-def capture_of_recording(
-    source: Path,
-    names: list[str],
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    speed: Float[ndarray, " n"],
-    gap_ns: Int[ndarray, " n"],
-    pictures: Pictures,
-    lens_of_size: Lens,
-    options: ReadOptions,
-    into: Path,
-    report: Progress,
-    joints: Float[ndarray, "n j"] | None = None,
-    depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None,
-    camera_name: str | None = None,
-    others: Sequence[RecordedCamera] = (),
-) -> Capture:
-    """The best frames of a recording in the folder `into`; `names` are those of the frames, without ending.
-    `joints` (rad) are those of the arm in `options.urdf`, where they are known; `depth_at` gives the depth (mm) aligned
-    with the frame of a row. `others` are further cameras, for whose sake this one may need a name.
 
-    Frames whose pose is interpolated over more than `options.max_gap_ms` are stale. Raises InputError when all
-    are, or when too few are still and sharp.
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """What a reader found in a recording: a frame a row, images only when asked for."""
+
+    source: Path
+    options: ReadOptions
+    names: Sequence[str]
+    """Of the frames' files, without ending."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    speed: Float[ndarray, " n"]
+    """m/s, rotation counted as jcr.geometry.motion_length does."""
+    gap_ns: Int[ndarray, " n"]
+    """Between the two poses around each frame; 0 where none is interpolated."""
+    pictures: Pictures
+    lens_of_size: Lens
+    joints: Float[ndarray, "n j"] | None = None
+    """rad, of the arm in `options.urdf`, where they are known."""
+    depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
+    """Depth (mm) aligned with the frame of a row."""
+    camera_name: str | None = None
+    others: Sequence[RecordedCamera] = ()
+    """Further cameras, for whose sake this one may need a name."""
+
+    @property
+    def fresh(self) -> Bool[ndarray, " n"]:
+        """Frames whose pose is not interpolated over more than `options.max_gap_ms`."""
+        return self.gap_ns <= 1e6 * self.options.max_gap_ms
+
+
+def capture_of_recording(recording: Recording, into: Path, report: Progress) -> Capture:
+    """The best frames of a recording in the folder `into`.
+
+    Raises InputError when the poses of all frames are stale, or when too few frames are still and sharp.
     """
-    fresh = gap_ns <= 1e6 * options.max_gap_ms
+    fresh, source = recording.fresh, str(recording.source)
+    notes = _stale(recording)
+    rows, remarks = best_frames(
+        recording.base_from_gripper,
+        recording.speed,
+        fresh,
+        lambda rows: _sharpness(recording, rows, report),
+        recording.options.frames,
+    )
+    images, depths = _written(recording, rows, into, report)
+    capture = checked_capture(into, images, recording.base_from_gripper[rows], source)
+    if recording.joints is not None:
+        capture = replace(capture, joints=recording.joints[rows], urdf=recording.options.urdf)
+    if any(depths):
+        capture = replace(capture, depths=tuple(depths))
+    if recording.others:
+        further = kept_pictures(recording.others, rows, recording.names, into, source)
+        capture = replace(capture, camera_name=recording.camera_name or capture.camera_name, others=further)
+    return replace(
+        capture,
+        intrinsics=recording.lens_of_size(capture.image_size),
+        notes=(f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks),
+    )
+
+
+def _stale(recording: Recording) -> list[str]:
+    """A note on the frames whose pose is; InputError where all are."""
+    fresh, gap_ns, limit_ms = recording.fresh, recording.gap_ns, recording.options.max_gap_ms
+    if fresh.all():
+        return []
     if not fresh.any():
         gap = gap_ns.min()
         far = (
             "no image lies between two poses"
-            if gap > 1e15
+            if gap > BESIDE_ALL_POSES_NS
             else f"those around an image are {gap / 1e6:.0f} ms apart"
         )
         raise InputError(
-            f"{source}: every pose is stale (over {options.max_gap_ms:.0f} ms): {far}; check the clocks, or raise "
+            f"{recording.source}: every pose is stale (over {limit_ms:.0f} ms): {far}; check the clocks, or raise "
             "--max-gap-ms"
         )
-    notes = []
-    if not fresh.all():
-        worst = gap_ns[gap_ns < 1e15].max(initial=0) / 1e6
-        notes.append(
-            f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {options.max_gap_ms:.0f} ms (gaps up to "
-            f"{worst:.0f} ms): left out"
+    worst = gap_ns[gap_ns < BESIDE_ALL_POSES_NS].max(initial=0) / 1e6
+    return [
+        f"{int((~fresh).sum())} of {len(fresh)} images have no pose within {limit_ms:.0f} ms (gaps up to "
+        f"{worst:.0f} ms): left out"
+    ]
+
+
+def _sharpness(recording: Recording, rows: Int[ndarray, " k"], report: Progress) -> Float[ndarray, " k"]:
+    values = []
+    for k, (_, picture, _) in enumerate(recording.pictures(rows)):
+        values.append(sharpness(picture))
+        report("frames", 0.1 + 0.7 * k / len(rows))
+    if len(values) < len(rows):
+        raise InputError(
+            f"{recording.source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its "
+            "index says; it is damaged: repair it (`mcap recover`, `ros2 bag reindex`) or record again"
         )
+    return np.array(values)
 
-    def sharpness_of(rows: Int[ndarray, " k"]) -> Float[ndarray, " k"]:
-        values = []
-        for k, (_, picture, _) in enumerate(pictures(rows)):
-            values.append(sharpness(picture))
-            report("frames", 0.1 + 0.7 * k / len(rows))
-        if len(values) < len(rows):
-            raise InputError(
-                f"{source}: {len(rows) - len(values)} of {len(rows)} images that it lists are not where its index says; "
-                "it is damaged: repair it (`mcap recover`, `ros2 bag reindex`) or record again"
-            )
-        return np.array(values)
 
-    rows, remarks = best_frames(base_from_gripper, speed, fresh, sharpness_of, options.frames)
-    images: list[str] = []
-    depths: list[str | None] = []
-    for k, (row, picture, ending) in enumerate(pictures(rows)):
-        images.append(f"images/{names[row]}{ending}")
-        data = picture if isinstance(picture, bytes) else encode_png(picture)
-        write_bytes(into / images[-1], data)
-        depth = None if depth_at is None else depth_at(row)
-        depths.append(None if depth is None else f"{DEPTH}/{names[row]}.png")
+def _written(
+    recording: Recording, rows: Int[ndarray, " k"], into: Path, report: Progress
+) -> tuple[list[str], list[str | None]]:
+    """Files of the images of these rows and of their depth, None where there is none."""
+    images, depths = list[str](), list[str | None]()
+    for k, (row, picture, ending) in enumerate(recording.pictures(rows)):
+        name = recording.names[row]
+        images.append(f"images/{name}{ending}")
+        write_bytes(into / images[-1], picture if isinstance(picture, bytes) else encode_png(picture))
+        depth = None if recording.depth_at is None else recording.depth_at(row)
+        depths.append(None if depth is None else f"{DEPTH}/{name}.png")
         if depth is not None:
-            write_bytes(into / f"{DEPTH}/{names[row]}.png", encode_png(depth))
+            write_bytes(into / f"{DEPTH}/{name}.png", encode_png(depth))
         report("frames", 0.8 + 0.2 * (k + 1) / len(rows))
-    capture = checked_capture(into, images, base_from_gripper[rows], str(source))
-    notes = (f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks)
-    if joints is not None:
-        capture = replace(capture, joints=joints[rows], urdf=options.urdf)
-    if any(depths):
-        capture = replace(capture, depths=tuple(depths))
-    if others:
-        further = kept_pictures(others, rows, names, into, str(source))
-        capture = replace(capture, camera_name=camera_name or capture.camera_name, others=further)
-    return replace(capture, intrinsics=lens_of_size(capture.image_size), notes=notes)
+    return images, depths

@@ -20,28 +20,39 @@ from typing import Any
 from jcr.errors import InputError, NotTrustedError, did_you_mean, printable
 from jcr.memory import MORE_MEMORY, require_address_space
 
-COMMANDS = {
-    "board": "draw a calibration board to print, if you want one",
-    "capture": "take a capture live, with advice on the next pose",
-    "run": "everything: reconstruct, calibrate, map, report",
-    "calibrate": "reconstruct and calibrate only: calibration.json",
-    "check": "check a capture before any heavy work",
-    "predict": "write a network's pairwise pointmaps to a file",
-    "align": "align pairwise pointmaps globally, nothing else",
-    "map": "build or rebuild the map of a run",
-    "query": "query the map at points: occupancy, distance, colour, label",
-    "add-camera": "locate a fixed camera from its images of a run's scene",
-    "export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
-    "measure": "measure the support plane and the objects on it",
-    "view": "show a run in 3D, in the browser",
-    "compare": "compare two calibrations: do their uncertainties explain the difference?",
-    "verify": "has the camera moved? test a calibration with a few new images",
-    "touch": "touch test: compare points touched with the robot's tip with the map",
-    "batch": "run many captures, on this machine or a Ray cluster",
-    "simulate": "simulate a capture, with ground truth",
-    "models": "list back ends with their licences; download weights",
-    "docs": "print the pages of the manual",
+GROUPS = {
+    "calibrate": {
+        "run": "everything: reconstruct, calibrate, map, report",
+        "calibrate": "reconstruct and calibrate only: calibration.json",
+        "add-camera": "locate a fixed camera from its images of a run's scene",
+        "batch": "run many captures, on this machine or a Ray cluster",
+    },
+    "use": {
+        "export": "export to ROS, MoveIt, OctoMap, cuRobo, COLMAP, nerfstudio, …",
+        "query": "query the map at points: occupancy, distance, colour, label",
+        "measure": "measure the support plane and the objects on it",
+        "view": "show a run in 3D, in the browser",
+        "map": "build or rebuild the map of a run",
+    },
+    "check": {
+        "check": "check a capture before any heavy work",
+        "verify": "has the camera moved? test a calibration with a few new images",
+        "compare": "compare two calibrations: do their uncertainties explain the difference?",
+        "touch": "touch test: compare points touched with the robot's tip with the map",
+    },
+    "prepare": {
+        "capture": "take a capture live, with advice on the next pose",
+        "board": "draw a calibration board to print, if you want one",
+        "simulate": "simulate a capture, with ground truth",
+    },
+    "more": {
+        "models": "list back ends with their licences; download weights",
+        "predict": "write a network's pairwise pointmaps to a file",
+        "align": "align pairwise pointmaps globally, nothing else",
+        "docs": "print the pages of the manual",
+    },
 }
+COMMANDS = {name: about for group in GROUPS.values() for name, about in group.items()}
 
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
@@ -51,7 +62,7 @@ base frame, from images of a wrist camera and the gripper pose at each.
 
 {commands}
 
-jcr COMMAND --help     arguments and examples of a command
+jcr COMMAND --help     arguments and examples of a command; --help-all: every option
 jcr --version          the version
 jcr --completion bash  a script that completes commands, options and files; also zsh, fish
 
@@ -77,8 +88,6 @@ _DISK = {
 """What the machine, not the program, has wrong, and the remedy."""
 
 
-NO_DEFAULT = re.compile(r"\(default:(?:[\s│]|\x1b\[[0-9;]*m)+(?:None|True|False)\)")
-"""In help: what is said of options that have no value, and of switches."""
 LONGEST_LINE = 2000
 """Characters of a message."""
 VALUES = {"FLOAT": "number", "INT": "whole number", "STR": "text"}
@@ -109,8 +118,7 @@ def _open_closed_streams() -> None:
 def dispatch(arguments: Sequence[str]) -> int:
     """The exit status of one command line."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        commands = "\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items())
-        sys.stdout.write(_OVERVIEW.format(commands=commands))
+        sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(map(_listed, GROUPS))))
         return 0
     name, rest = arguments[0], arguments[1:]
     if name == "--version":
@@ -132,6 +140,11 @@ def dispatch(arguments: Sequence[str]) -> int:
             2, f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
         )
     return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+
+
+def _listed(group: str) -> str:
+    """The commands of a group below its name."""
+    return "\n".join([f"{group}:", *(f"  {name:<10} {about}" for name, about in GROUPS[group].items())])
 
 
 def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
@@ -193,20 +206,19 @@ def configuration() -> tuple[Any, ...]:
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     import tyro
 
+    from jcr.cli.help import EVERYTHING, help_text
+
+    if asked := {"-h", "--help", EVERYTHING}.intersection(arguments):
+        sys.stdout.write(help_text(command, program, EVERYTHING in asked))
+        return 0
     # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
-    complaint, told = io.StringIO(), _Help(sys.stdout.encoding or "utf-8", sys.stdout.isatty())
+    complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(told):
+        with contextlib.redirect_stderr(complaint):
             parsed = tyro.cli(
-                command.Arguments,
-                prog=program,
-                args=list(arguments),
-                config=configuration(),
+                command.Arguments, prog=program, args=list(arguments), config=configuration(), add_help=False
             )
-    except SystemExit as stop:
-        if not stop.code:
-            sys.stdout.write(NO_DEFAULT.sub(_blank, told.getvalue()))
-            return 0
+    except SystemExit:
         like = _like_unknown_option(command, arguments)
         return _fail(2, f"{_flatten(complaint.getvalue())}{like} ({program} --help)")
     require_address_space()
@@ -215,25 +227,6 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
             nowhere = silence.enter_context(open(os.devnull, "w", encoding="utf-8"))
             silence.enter_context(contextlib.redirect_stderr(nowhere))
         return command.main(parsed)
-
-
-class _Help(io.StringIO):
-    """What tyro prints, in the colours and with the boxes that a stream can show."""
-
-    encoding = "utf-8"
-
-    def __init__(self, encoding: str, in_colour: bool):
-        super().__init__()
-        self.encoding, self._in_colour = encoding, in_colour
-
-    def isatty(self) -> bool:
-        """Of the stream."""
-        return self._in_colour
-
-
-def _blank(default: re.Match[str]) -> str:
-    """As many blanks, so that the box stays one; a line break in it stays too."""
-    return re.sub(r"\x1b\[[0-9;]*m|[^│\n]", lambda c: c[0] if c[0].startswith("\x1b") else " ", default[0])
 
 
 def _flatten(box: str) -> str:
@@ -269,7 +262,9 @@ def _like_unknown_option(command: ModuleType, arguments: Sequence[str]) -> str:
 
     known = {argument.flag for argument in arguments_of(command.Arguments) if argument.flag is not None}
     given = (word.partition("=")[0] for word in arguments if re.match(r"--[a-z]", word))
-    unknown = next((word for word in given if word.replace("_", "-") not in {*known, "--help"}), None)
+    unknown = next(
+        (word for word in given if word.replace("_", "-") not in {*known, "--help", "--help-all"}), None
+    )
     return "" if unknown is None else did_you_mean(unknown, known)
 
 

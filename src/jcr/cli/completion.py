@@ -87,7 +87,7 @@ def _leaves(kind: object) -> Iterator[object]:
 
 
 def _flags(arguments: tuple[Argument, ...]) -> str:
-    return " ".join([*(argument.flag for argument in arguments if argument.flag), "--help"])
+    return " ".join([*(argument.flag for argument in arguments if argument.flag), "--help", "--help-all"])
 
 
 def _bash(table: dict[str, tuple[Argument, ...]]) -> str:
@@ -135,5 +135,5 @@ def _fish(table: dict[str, tuple[Argument, ...]]) -> str:
                 lines.append(f"{where} -l {argument.flag[2:]} -r{files}{values}")
             else:
                 lines.append(f"{where} -l {argument.flag[2:]}")
-        lines.append(f"{where} -l help")
+        lines += [f"{where} -l help", f"{where} -l help-all"]
     return "\n".join(lines) + "\n"

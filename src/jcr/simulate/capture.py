@@ -26,7 +26,7 @@ from jcr.simulate.robots import (
     patterned,
     table_center,
 )
-from jcr.simulate.scenes import make_scene, moved
+from jcr.simulate.scenes import Scene, make_scene, moved
 from jcr.simulate.taken import degraded, encoded, pinhole, with_lens_error, with_robot_noise
 from jcr.simulate.truth import Truth, write_depth, write_labels, write_robot, write_truth
 
@@ -41,88 +41,126 @@ def simulate(out: Path, options: SimulateOptions | None = None, progress: Progre
     _check(out, options := options or SimulateOptions())
     if options.eye_to_hand:
         return simulate_eye_to_hand(out, options, progress)
-    # One stream of random numbers a matter: a change in one must not disturb the others.
-    motion, lens, robot = (np.random.default_rng([options.seed, stream]) for stream in (4, 5, 6))
     scene = make_scene(options.scene, options.seed, options.table)
-    if options.robot is None:
-        arm = None
-        gripper_from_camera = random_hand_eye(motion)
-        base_from_gripper = reported = gripper_poses(
-            options.pattern, options.images, scene.table_center_in_base, gripper_from_camera, motion
-        )
+    motion = _random(options, 4)
+    arm = None if options.robot is None else _arm(options, options.robot, motion)
+    if arm is None:
+        path = _without_arm(scene, options, motion)
     else:
-        arm = _arm(options, options.robot, motion)
         scene = moved(scene, table_center(arm.bent.arm))
-        gripper_from_camera = arm.physical
-        base_from_gripper, reported = arm.bent.true(arm.joints), arm.bent.reported(arm.joints)
-    suffix = "png" if options.jpeg_quality == "lossless" else "jpg"
-    truth = Truth(
+        path = _Path(arm.physical, arm.bent.true(arm.joints), arm.bent.reported(arm.joints))
+    truth = _truth(out, scene, options, path)
+    _write_images(scene, truth, options, progress)
+    write_truth(truth)
+    if arm is not None:
+        write_robot(truth, arm.bent, arm.joints)
+    further = _further(scene, truth, options, arm)
+    reference = _reference(truth, arm) | further.reference
+    write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
+    frames = _frames(truth, options, path, arm)
+    # Last: a folder with a capture.json is a complete capture.
+    content = _capture_json(truth, options, frames) | further.content
+    write_text(out / "capture.json", json.dumps(content, indent=1) + "\n")
+    return out
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Where the gripper goes."""
+
+    gripper_from_camera: Float[ndarray, "4 4"]
+    """Where the camera is bolted."""
+    base_from_gripper: Float[ndarray, "n 4 4"]
+    reported: Float[ndarray, "n 4 4"]
+    """As the robot's nominal kinematics has it."""
+
+
+def _random(options: SimulateOptions, *stream: int) -> np.random.Generator:
+    """One stream of random numbers a matter: a change in one must not disturb the others."""
+    return np.random.default_rng([options.seed, *stream])
+
+
+def _without_arm(scene: Scene, options: SimulateOptions, motion: np.random.Generator) -> _Path:
+    x = random_hand_eye(motion)
+    poses = gripper_poses(options.pattern, options.images, scene.table_center_in_base, x, motion)
+    return _Path(x, poses, poses)
+
+
+def _truth(out: Path, scene: Scene, options: SimulateOptions, path: _Path) -> Truth:
+    suffix = _suffix(options)
+    return Truth(
         folder=out,
         scene=scene.name,
         seed=options.seed,
-        images=tuple(f"images/{k:02d}.{suffix}" for k in range(len(base_from_gripper))),
-        gripper_from_camera=gripper_from_camera,
-        base_from_gripper=base_from_gripper,
-        base_from_camera=base_from_gripper @ gripper_from_camera,
-        intrinsics=pinhole(lens),
+        images=tuple(f"images/{k:02d}.{suffix}" for k in range(len(path.base_from_gripper))),
+        gripper_from_camera=path.gripper_from_camera,
+        base_from_gripper=path.base_from_gripper,
+        base_from_camera=path.base_from_gripper @ path.gripper_from_camera,
+        intrinsics=pinhole(_random(options, 5)),
         labels=scene.labels,
         table_height=scene.table_height,
         workspace_in_base=scene.workspace_in_base,
         objects=scene.true_objects,
     )
-    views = render(
-        scene,
-        truth.intrinsics,
-        truth.base_from_camera,
-        options.texture,
-        with_truth=options.truth == "full" or options.depth is not None,
-    )
+
+
+def _suffix(options: SimulateOptions) -> str:
+    return "png" if options.jpeg_quality == "lossless" else "jpg"
+
+
+def _write_images(scene: Scene, truth: Truth, options: SimulateOptions, progress: Progress) -> None:
+    """What the camera sees, and the depth that a depth camera measures; with the full truth, that of each image too."""
+    with_truth = options.truth == "full" or options.depth is not None
+    views = render(scene, truth.intrinsics, truth.base_from_camera, options.texture, with_truth=with_truth)
     for k, view in zip(steps(progress, "render", range(len(truth.images))), views, strict=True):
-        image = degraded(view.image, options, np.random.default_rng([options.seed, 7, k]))
-        write_bytes(out / truth.images[k], encoded(image, options.jpeg_quality))
+        image = degraded(view.image, options, _random(options, 7, k))
+        write_bytes(truth.folder / truth.images[k], encoded(image, options.jpeg_quality))
         if options.truth == "full" and view.depth is not None and view.label is not None:
             write_depth(truth, k, view.depth)
             write_labels(truth, k, view.label)
         if view.depth is not None and options.depth is not None:
-            measured = _measured(view.depth, options.depth, np.random.default_rng([options.seed, 8, k]))
-            write_bytes(out / _depth_name(k), encode_png(measured))
-    write_truth(truth)
-    reference: dict[str, object]
+            measured = _measured(view.depth, options.depth, _random(options, 8, k))
+            write_bytes(truth.folder / _depth_name(k), encode_png(measured))
+
+
+def _reference(truth: Truth, arm: "_Arm | None") -> dict[str, object]:
+    """What reference.json says of the hand-eye transform."""
     if arm is None:
-        reference = {"gripper_from_camera": gripper_from_camera.tolist(), "how": "simulated, exact"}
-    else:
-        write_robot(truth, arm.bent, arm.joints)
-        reference = {
-            "gripper_from_camera": arm.effective.tolist(),
-            "physical_gripper_from_camera": arm.physical.tolist(),
-            "how": f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras",
-        }
-    further = Further({}, {})
-    if options.fixed_cameras or options.wrist_cameras > 1 or options.arms > 1:
-        x_and_base = (
-            (gripper_from_camera, np.eye(4)) if arm is None else (arm.effective, arm.effective_from_true_base)
-        )
-        further = add_cameras(out, options, scene, truth, x_and_base, suffix)
-        reference |= further.reference
-    write_text(out / "reference.json", json.dumps(reference, indent=1) + "\n")
+        return {"gripper_from_camera": truth.gripper_from_camera.tolist(), "how": "simulated, exact"}
+    return {
+        "gripper_from_camera": arm.effective.tolist(),
+        "physical_gripper_from_camera": arm.physical.tolist(),
+        "how": f"simulated: best for {EFFECTIVE_POSES} or more other reported poses of these views, exact cameras",
+    }
+
+
+def _further(scene: Scene, truth: Truth, options: SimulateOptions, arm: "_Arm | None") -> Further:
+    """The cell's other cameras and arm, where it has some."""
+    if not options.fixed_cameras and options.wrist_cameras <= 1 and options.arms <= 1:
+        return Further({}, {})
+    x, base = (
+        (truth.gripper_from_camera, np.eye(4))
+        if arm is None
+        else (arm.effective, arm.effective_from_true_base)
+    )
+    return add_cameras(truth.folder, options, scene, truth, (x, base), _suffix(options))
+
+
+def _frames(
+    truth: Truth, options: SimulateOptions, path: _Path, arm: "_Arm | None"
+) -> list[dict[str, object]]:
+    """What capture.json says of each image."""
+    reported = with_robot_noise(path.reported, *options.robot_noise, _random(options, 6))
     frames: list[dict[str, object]] = [
         {"image": image, "base_from_gripper": matrix.tolist()}
-        for image, matrix in zip(
-            truth.images, with_robot_noise(reported, *options.robot_noise, robot), strict=True
-        )
+        for image, matrix in zip(truth.images, reported, strict=True)
     ]
-    if options.depth is not None:
-        for k, frame in enumerate(frames):
+    for k, frame in enumerate(frames):
+        if options.depth is not None:
             frame["depth"] = _depth_name(k)
-    if arm is not None:
-        for frame, row in zip(frames, arm.joints.tolist(), strict=True):
-            frame["joints"] = row
-    # Last: a folder with a capture.json is a complete capture.
-    write_text(
-        out / "capture.json",
-        json.dumps(_capture_json(truth, options, frames) | further.content, indent=1) + "\n",
-    )
-    return out
+        if arm is not None:
+            frame["joints"] = arm.joints[k].tolist()
+    return frames
 
 
 def _depth_name(image: int) -> str:
