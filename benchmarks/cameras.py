@@ -111,7 +111,7 @@ def answered(problem: CellProblem, seed: int) -> Adjusted:
     )
     images = len(problem.observations.rig)
     freedom = Freedom.of(cameras, [prior_of(camera) for camera in cameras], images, mounts)
-    return adjust(scene, problem.observations, freedom, problem.arms, scale=problem.scale)
+    return adjust(scene, problem.observations, freedom, problem.arms)
 
 
 def _drawn(kind: Kind, preset: PresetName, draws: int) -> dict[str, list[Draw]]:

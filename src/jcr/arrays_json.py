@@ -11,7 +11,7 @@ from jcr.geometry import require_rigid
 class Part(BaseModel):
     """A part of a file: what it names and nothing else, numbers that are finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 def _rigid(rows: list[list[float]]) -> list[list[float]]:

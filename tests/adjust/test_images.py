@@ -71,7 +71,7 @@ def test_what_robots_report_is_no_part_of_the_evidence_of_images():
     problem, scene, freedom = two_cameras()
     freedom = replace(freedom, nuisance=NuisancePrior(freedom.nuisance.directions[:, :0], np.zeros(0)))
     exact, coarse = (
-        adjust(scene, problem.observations, freedom, problem.arms, noise, scale=problem.scale)
+        adjust(scene, problem.observations, freedom, problem.arms, noise)
         for noise in ((1e-4, 2e-4), (5e-3, 1e-2))
     )
     one, other = (np.diag(found.given.evidence.information) for found in (exact, coarse))

@@ -7,11 +7,13 @@ from scipy.stats import chi2
 import jcr
 from benchmarks.simulated.observations import LENS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
+from jcr.adjust import robots
 from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
+from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 
 
@@ -111,3 +113,43 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     ]
     assert sigmas[1] < 3 < sigmas[0]
     assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()
+
+
+def counted(monkeypatch) -> list[int]:
+    """One more entry for each time that images are linearised."""
+    calls, linearised = [], robots.linearised
+    monkeypatch.setattr(robots, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
+    return calls
+
+
+def test_an_adjustment_goes_on_until_it_stays(monkeypatch):
+    rng = np.random.default_rng(6)
+    problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
+    tracks = observed(problem, rng, 300, 0.4)
+    # Errors of matches have long tails, and their size and the weights then depend on each other for long.
+    tracks.x_px[:] += rng.standard_t(2, size=tracks.x_px.shape)
+    found = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
+    monkeypatch.setattr(robots, "STEP_SETTLED", 1e-5)
+    monkeypatch.setattr(robots, "SIZES_SETTLED", 1e-5)
+    monkeypatch.setattr(robots, "ROUNDS", 200)
+    settled = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
+    off = step_between(found.placed.x[0], settled.placed.x[0])
+    assert (np.abs(off) < 0.05 * np.sqrt(np.diag(settled.covariance)[:6])).all()
+
+
+def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypatch):
+    rng = np.random.default_rng(7)
+    problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
+    tracks = observed(problem, rng, 300, 0.4)
+    off = with_parameters(LENS, parameters(LENS) + np.r_[2.0, 2.0, 2.0, -2.0, np.zeros(5)])
+    near = solved(problem, tracks, off, prior=prior_of(off, MEASURED))
+    calls = counted(monkeypatch)
+    from_poses = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED))
+    of_poses = len(calls)
+    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), near=near)
+    assert len(calls) - of_poses < of_poses
+    apart = step_between(from_poses.placed.x[0], again.placed.x[0])
+    assert (np.abs(apart) < 0.05 * np.sqrt(np.diag(from_poses.covariance)[:6])).all()
+    std = np.sqrt(np.diag(from_poses.intrinsics_covariance(0)))[:4]
+    cameras = [parameters(one.placed.scene.cameras[0])[:4] for one in (from_poses, again)]
+    assert (np.abs(cameras[0] - cameras[1]) < 0.1 * std).all()

@@ -60,7 +60,7 @@ def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bo
     unmove = scale_translation(inverse(move), problem.scale)
     arms = [replace(arm, start=(arm.start[0], arm.start[1] @ unmove)) for arm in problem.arms]
     freedom = Freedom.of(cameras, priors, len(problem.observations.rig), mounts)
-    return adjust(scene, problem.observations, freedom, arms, scale=problem.scale)
+    return adjust(scene, problem.observations, freedom, arms)
 
 
 WANTED = {

@@ -34,8 +34,8 @@ class _Group:
     points: Int[ndarray, " n"]
     rows: Int[ndarray, " k"]
     """Of their observations, point by point."""
-    starts: Int[ndarray, " n"]
-    """Each point's first observation."""
+    batches: list[tuple[slice, slice]]
+    """Points seen equally often, and their observations."""
     images: Int[ndarray, " i"]
     """That see any of them."""
     pairs: Int[ndarray, " j"]
@@ -70,14 +70,16 @@ class Normal:
 
     hessian: Float[ndarray, "d d"]
     right: Float[ndarray, " d"]
-    _blocks: list[tuple[ndarray, ndarray, ndarray, ndarray, ndarray]]
-    """Per group its points, its columns, and the points' own blocks, their coupling to the columns, and gradients."""
+    _blocks: list[tuple[ndarray, ndarray, ndarray, ndarray]]
+    """Per group its points, its columns, the inverse roots of the points' own blocks, and these times their coupling to
+    the columns and their gradients."""
 
     def stepped(self, points: Float[ndarray, "p 3"], step: Float[ndarray, " d"]) -> Float[ndarray, "p 3"]:
         """The points after the Gauss-Newton step that belongs to a step of everything else."""
         points = points.copy()
-        for chosen, columns, v, w, g in self._blocks:
-            points[chosen] -= np.linalg.solve(v, (g + w @ step[columns])[..., None])[..., 0]
+        for chosen, columns, root, half in self._blocks:
+            along = half @ np.append(step[columns], 1.0)
+            points[chosen] -= (np.swapaxes(root, 1, 2) @ along[..., None])[..., 0]
         return points
 
 
@@ -109,45 +111,67 @@ def without_points(
     for group in seen.groups:
         own_columns = s + o * np.arange(len(group.images))[:, None] + np.arange(o)
         columns = np.r_[:s, (s + o * group.images[:, None] + np.arange(o)).ravel()]
-        by_point = rows.by_point[group.rows]
-        transposed = np.swapaxes(by_point, 1, 2)
-        v = point_blocks(by_point, group.starts, damping)
-        w = np.zeros((len(v), 3, len(columns)))
-        w[:, :, :s] = np.add.reduceat(transposed @ rows.shared[group.rows], group.starts)
+        root, half = np.empty((len(group.points), 3, 3)), np.zeros((len(group.points), 3, len(columns) + 1))
+        by_point = np.empty((len(group.rows), 2, 3))
+        for points, observations in group.batches:
+            of_batch, count = group.rows[observations], points.stop - points.start
+            root[points], by_point[observations] = _whitened(rows.by_point[of_batch], count, damping)
+            flat = np.swapaxes(by_point[observations].reshape(count, -1, 3), 1, 2)
+            half[points, :, :s] = flat @ rows.shared[of_batch].reshape(count, flat.shape[2], s)
+            half[points, :, -1:] = flat @ rows.residual[of_batch].reshape(count, -1, 1)
         places = group.point[:, None, None], np.arange(3)[:, None], own_columns[group.image][:, None]
-        w[places] = np.add.reduceat(transposed @ rows.own[group.rows], group.pairs)
-        g = np.add.reduceat((transposed @ rows.residual[group.rows][..., None])[..., 0], group.starts)
-        half = np.linalg.solve(np.linalg.cholesky(v), np.concatenate([w, g[..., None]], axis=2))
-        half = half.reshape(3 * len(v), -1)
-        hessian[np.ix_(columns, columns)] -= half[:, :-1].T @ half[:, :-1]
-        right[columns] += half[:, :-1].T @ half[:, -1]
-        blocks.append((group.points, columns, v, w, g))
+        half[places] = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ rows.own[group.rows], group.pairs)
+        flat = half.reshape(3 * len(half), -1)
+        hessian[np.ix_(columns, columns)] -= flat[:, :-1].T @ flat[:, :-1]
+        right[columns] += flat[:, :-1].T @ flat[:, -1]
+        blocks.append((group.points, columns, root, half))
     return Normal(hessian, right, blocks)
 
 
-def point_blocks(
-    by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"], damping: float = 0.0
-) -> Float[ndarray, "n 3 3"]:
-    """The points' own blocks of the normal equations, kept from being singular where their rays are parallel."""
-    v = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts)
+def _whitened(
+    by_point: Float[ndarray, "k 2 3"], points: int, damping: float
+) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "k 2 3"]]:
+    """The inverse roots of the own blocks of points that are seen equally often, and the derivatives by these points in
+    units of their standard deviations."""
+    of_point = by_point.reshape(points, -1, 3)
+    root = np.linalg.inv(np.linalg.cholesky(_regular(np.swapaxes(of_point, 1, 2) @ of_point, damping)))
+    return root, (of_point @ np.swapaxes(root, 1, 2)).reshape(by_point.shape)
+
+
+def point_blocks(by_point: Float[ndarray, "k 2 3"], starts: Int[ndarray, " n"]) -> Float[ndarray, "n 3 3"]:
+    """The points' own blocks of the normal equations."""
+    return _regular(np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, starts), 0.0)
+
+
+def _regular(v: Float[ndarray, "n 3 3"], damping: float) -> Float[ndarray, "n 3 3"]:
+    """Damped, and kept from being singular where the rays of a point are parallel."""
     v[:, range(3), range(3)] *= 1 + damping
     v[:, range(3), range(3)] += 1e-9 * np.trace(v, axis1=1, axis2=2)[:, None] + 1e-12
     return v
 
 
 def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Group]:
-    """Points in the order of the first image that sees them: those beside each other are seen by few others."""
+    """Points in the order of the first image that sees them: those beside each other are seen by few others. In a group
+    they are in the order of how many see them."""
     if len(starts) == 0:
         return []
     seen = np.diff(np.r_[starts, len(image)])
     by_first = np.argsort(image[starts], kind="stable")
     groups = []
     for points in np.array_split(by_first, -(-len(by_first) // POINTS_AT_ONCE)):
+        points = points[np.argsort(seen[points], kind="stable")]
         counts = seen[points]
         begins = np.cumsum(counts) - counts
         rows = np.repeat(starts[points] - begins, counts) + np.arange(counts.sum())
         images, of_image = np.unique(image[rows], return_inverse=True)
         of_point = np.repeat(np.arange(len(points)), counts)
         pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
-        groups.append(_Group(points, rows, begins, images, pairs, of_point[pairs], of_image[pairs]))
+        groups.append(_Group(points, rows, _batches(counts), images, pairs, of_point[pairs], of_image[pairs]))
     return groups
+
+
+def _batches(counts: Int[ndarray, " n"]) -> list[tuple[slice, slice]]:
+    """Points of the same count, which are beside each other, and their observations."""
+    edges = np.r_[np.flatnonzero(np.diff(counts, prepend=-1)), len(counts)].tolist()
+    ends = np.r_[0, np.cumsum(counts)].tolist()
+    return [(slice(a, b), slice(ends[a], ends[b])) for a, b in zip(edges[:-1], edges[1:], strict=True)]

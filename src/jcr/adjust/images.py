@@ -256,14 +256,14 @@ def minimised(
     view = view_of(scene, problem)
     weight = noise.weights(view.residual_px, view.depth, problem.layout)
     held = [one for one in (problem.prior, robots) if one is not None]
-    cost = _cost(scene, view, problem, weight, held)
+    least = cost(scene, view, problem, weight, held)
     for _ in range(STEPS):
         moved = _moved(scene, problem, _equations(scene, view, problem, weight, held, damping))
         moved_view = view_of(moved, problem)
-        new_cost = _cost(moved, moved_view, problem, weight, held)
-        gained = cost - new_cost
+        new_cost = cost(moved, moved_view, problem, weight, held)
+        gained = least - new_cost
         if gained >= 0:
-            scene, view, cost, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
+            scene, view, least, damping = moved, moved_view, new_cost, max(damping / 10, 1e-10)
         else:
             damping *= 10
         if abs(gained) < ENOUGH:
@@ -275,7 +275,13 @@ def minimised(
 
 def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvidence:
     """What the images and the priors of their cameras show about a scene, whoever helped to find it."""
-    view = view_of(scene, problem)
+    return linearised(scene, view_of(scene, problem), problem, noise)[0]
+
+
+def linearised(
+    scene: Scene, view: View, problem: ImageProblem, noise: PixelNoise
+) -> tuple[ImageEvidence, Normal]:
+    """The same, and the equations that it is made of, which step the points."""
     weight = noise.weights(view.residual_px, view.depth, problem.layout)
     held = [] if problem.prior is None else [problem.prior]
     normal = _equations(scene, view, problem, weight, held, 0.0)
@@ -285,7 +291,7 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
         # A unit of the world that is that of its rigs' places, all alike: what λ is counted in.
         of_rigs = information.diagonal()[problem.freedom.first_rig :]
         information += similarity_held(similarities(scene, problem.freedom), float(of_rigs.mean()))
-    return ImageEvidence(
+    found = ImageEvidence(
         scene=scene,
         problem=problem,
         information=information,
@@ -293,6 +299,7 @@ def evidence(scene: Scene, problem: ImageProblem, noise: PixelNoise) -> ImageEvi
         noise=noise,
         view=view,
     )
+    return found, normal
 
 
 def with_model_error_of(images: ImageEvidence) -> tuple[ImageEvidence, float]:
@@ -332,7 +339,7 @@ def _by_rig(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "
     out = np.empty((len(camera), 2, 3))
     for c, lens in enumerate(scene.cameras):
         rows = np.flatnonzero(camera == c)
-        out[rows] = by_point(lens, view.in_camera[rows]) @ scene.rig_from_camera[c, :3, :3].T
+        out[rows] = _rotated(by_point(lens, view.in_camera[rows]), scene.rig_from_camera[c, :3, :3])
     return _nuisances_applied(out, scene, problem)
 
 
@@ -342,7 +349,7 @@ def _by_world(
     """The same, world axes."""
     out = np.empty_like(by_rig)
     for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
-        out[rows] = by_rig[rows] @ pose[:3, :3].T
+        out[rows] = _rotated(by_rig[rows], pose[:3, :3])
     return out
 
 
@@ -363,7 +370,7 @@ def _nuisances_applied(
 def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarray, "k 2 l"]:
     """Derivative of every observation by the steps of intrinsics and nuisances."""
     freedom, camera = problem.freedom, problem.layout.camera
-    out = np.zeros((len(camera), 2, len(freedom.std)))
+    out = np.zeros((len(camera), 2, freedom.nuisance_columns.stop))
     for c, (lens, prior, columns) in enumerate(
         zip(scene.cameras, freedom.intrinsics, freedom.intrinsics_columns, strict=True)
     ):
@@ -371,7 +378,6 @@ def _by_cameras(scene: Scene, view: View, problem: ImageProblem) -> Float[ndarra
         out[rows, :, columns] = by_parameters(lens, view.in_camera[rows]) @ prior.directions
     if len(freedom.nuisance.std):
         out = _with_nuisances(out, scene, view, problem)
-    out[:, :, freedom.model_error_columns] = problem.displacements
     return out
 
 
@@ -400,19 +406,22 @@ def _with_nuisances(
     return out
 
 
-def _cost(
+def cost(
     scene: Scene,
     view: View,
     problem: ImageProblem,
     weight: Float[ndarray, " k"],
     held: list[RigInformation],
 ) -> float:
-    cost = float(weight @ (view.residual_px**2).sum(1))
-    cost += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
+    """In squared standard deviations, with these weights of the observations.
+
+    `held` is what is known of the rigs beside."""
+    total = float(weight @ (view.residual_px**2).sum(1))
+    total += float(((scene.camera_steps / problem.freedom.std) ** 2).sum())
     for one in held:
         steps = one.steps(scene)
-        cost += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
-    return cost
+        total += float(steps @ one.information @ steps + 2 * one.gradient @ steps)
+    return total
 
 
 def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[ndarray, " k"]) -> Derivatives:
@@ -421,7 +430,8 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
     by_rig = _by_rig(scene, view, problem)
     by_rig *= root
     shared = np.zeros((len(weight), 2, freedom.first_rig))
-    shared[:, :, : len(freedom.std)] = _by_cameras(scene, view, problem) * root
+    np.multiply(_by_cameras(scene, view, problem), root, out=shared[:, :, : freedom.nuisance_columns.stop])
+    np.multiply(problem.displacements, root, out=shared[:, :, freedom.model_error_columns])
     for c, columns in enumerate(freedom.mount_columns):
         if columns is not None:
             mine = np.flatnonzero(problem.layout.camera == c)
@@ -430,10 +440,21 @@ def derivatives(scene: Scene, view: View, problem: ImageProblem, weight: Float[n
     by_world, own = np.empty_like(by_rig), np.empty((len(weight), 2, 6))
     for pose, rows in zip(scene.world_from_rig, problem.seen.rows, strict=True):
         rotation = pose[:3, :3]
-        by_world[rows] = by_rig[rows] @ rotation.T
-        own[rows, :, :3] = -by_world[rows]
-        own[rows, :, 3:] = np.cross(by_world[rows], (view.from_rig[rows] @ rotation.T)[:, None])
+        here = _rotated(by_rig[rows], rotation)
+        by_world[rows] = here
+        own[rows, :, :3] = -here
+        own[rows, :, 3:] = _crossed(here, (view.from_rig[rows] @ rotation.T)[:, None])
     return Derivatives(shared, own, by_world, view.residual_px * root[..., 0])
+
+
+def _rotated(by: Float[ndarray, "k 2 3"], rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2 3"]:
+    """Derivatives by a point in other axes: one product, where NumPy would make one of every observation."""
+    return (by.reshape(-1, 3) @ rotation.T).reshape(by.shape)
+
+
+def _crossed(a: Float[ndarray, "k 2 3"], b: Float[ndarray, "k 1 3"]) -> Float[ndarray, "k 2 3"]:
+    """Cross products; NumPy's takes as long as all else about them."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 def _equations(

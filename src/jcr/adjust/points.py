@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from jcr.adjust.elimination import point_blocks
 from jcr.adjust.images import derivatives
-from jcr.adjust.robots import Adjusted, of_poses, rigs_given_cameras
+from jcr.adjust.robots import Adjusted, of_poses
 from jcr.geometry import by_similarity
 from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE
 
@@ -83,7 +83,7 @@ def _of_columns(adjusted: Adjusted) -> tuple[Float[ndarray, "d p"], Float[ndarra
     """How the columns of the images' evidence step with the unknowns of the mixed model, and their covariance where
     these stand still: of rigs, what the reported poses and the images leave."""
     given, equations = adjusted.given, adjusted.equations
-    rigs, (_, _, by_rig, _) = rigs_given_cameras(given), of_poses(adjusted.most_likely, given.arms)
+    rigs, (_, _, by_rig, _) = given.rigs, of_poses(adjusted.most_likely, given.arms)
     gain = np.linalg.solve(equations.covariance(adjusted.log_sizes), by_rig @ rigs.covariance).T
     robots, columns = adjusted.first_camera_column, len(given.evidence.gradient)
     by_unknown = np.zeros((columns, len(adjusted.covariance)))

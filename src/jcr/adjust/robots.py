@@ -14,18 +14,23 @@ base_from_world are eliminated. The evidence is then what the images show withou
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from jcr.adjust.acceleration import Acceleration
+from jcr.adjust.elimination import Normal
 from jcr.adjust.images import (
-    ROUNDS,
     SIZES_SETTLED,
     ImageEvidence,
+    ImageProblem,
     RigInformation,
+    cost,
     evidence,
+    linearised,
     minimised,
     noise_of,
     posed,
@@ -34,7 +39,8 @@ from jcr.adjust.images import (
     with_model_error_of,
 )
 from jcr.adjust.model_error import expressed, polynomials_of
-from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped
+from jcr.adjust.pixel_noise import PixelNoise
+from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped, with_freedom
 from jcr.geometry import inverse, retract, skew, step_between
 from jcr.handeye.components import POSES, Equations, most_likely, posterior, solve
 from jcr.handeye.equation import PRIOR_STD, SCALE, Poses, predict, residuals, residuals_by_camera
@@ -45,8 +51,12 @@ from jcr.records import Budget, ModelError
 
 START_NOISE = (1e-3, np.radians(0.2))
 """m, rad; of gripper poses, until it is estimated."""
-STEP_SETTLED = 1e-4
-"""Squared standard deviations that the arms' unknowns move by in a round, or a step, that ends them."""
+ROUNDS = 25
+"""Of an adjustment, with the sizes of errors estimated in each."""
+STEP_SETTLED = 0.01
+"""Standard deviations that an arm's unknown moves by in a round that ends them."""
+ROUNDING = 1e-9
+"""Of a cost."""
 STEPS = 30
 LARGEST_ROTATION = 0.5
 """rad, and of the logarithm of scale, in one step."""
@@ -184,6 +194,17 @@ class Adjusted:
         return j
 
 
+@dataclass(frozen=True)
+class RigsGivenCameras:
+    """What the images show of the rigs that arms move, with everything else of the scene where it is."""
+
+    follow: Float[ndarray, "s e"]
+    """By how much the rigs step back with each free column."""
+    step: Float[ndarray, " s"]
+    """To where they are likeliest, with the sign reversed."""
+    covariance: Float[ndarray, "s s"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Given:
     """What the mixed model of a scene is made of."""
@@ -193,16 +214,31 @@ class Given:
     noise: tuple[float, float] | None
     """m, rad: of the gripper poses, at least."""
 
-    @property
+    @cached_property
     def by_arm(self) -> Int[ndarray, " s"]:
         """Columns of the evidence: rigs that arms move, in the order of the residuals."""
         moving = np.concatenate([arm.rigs for arm in self.arms])
         return (self.evidence.problem.freedom.first_rig + 6 * moving[:, None] + np.arange(6)).ravel()
 
-    @property
+    @cached_property
     def free(self) -> Int[ndarray, " e"]:
         """Columns of the evidence that are unknowns here: cameras, mounts, and rigs that no arm moves."""
         return np.setdiff1d(np.arange(len(self.evidence.gradient)), self.by_arm)
+
+    @cached_property
+    def rigs(self) -> RigsGivenCameras:
+        """What the images alone show of the rigs that arms move."""
+        images, by_arm, free = self.evidence, self.by_arm, self.free
+        own = images.information[np.ix_(by_arm, by_arm)]
+        size = 1 / np.sqrt(own.diagonal())
+        factor = cho_factor(size[:, None] * own * size, lower=True)
+        coupling = images.information[np.ix_(by_arm, free)]
+        solved = size[:, None] * cho_solve(
+            factor, size[:, None] * np.column_stack([coupling, images.gradient[by_arm], np.diag(1 / size)])
+        )
+        return RigsGivenCameras(
+            solved[:, : len(free)], solved[:, len(free)], solved[:, len(free) + 1 :] * size
+        )
 
 
 @one_blas_thread
@@ -213,15 +249,18 @@ def adjust(
     arms: Sequence[ArmPoses],
     noise: tuple[float, float] | None = None,
     prior: RigInformation | None = None,
-    scale: float = 1.0,
+    near: Adjusted | None = None,
 ) -> Adjusted:
     """Adjust images and robots from a scene that is near.
 
     Points that fewer than two images see are left out. `noise` (m, rad) is that of the gripper poses, at least; it is
     estimated with the rest, and all arms are taken to be equally exact. `prior` is what others than the images and the
-    robots know of the first rigs. `scale` is about that of the scene (metres per unit).
+    robots know of the first rigs. `near` is an adjustment of the same rigs, points and arms in which other things were
+    free, or in which more points took part: it begins from there, and of the scene the numbers count alone.
     """
     scene, problem = posed(scene, observations, freedom, prior)
+    if near is not None:
+        return _settled(*_begun(near, problem), tuple(arms), noise, near.log_sizes)
     placed = Placed(
         x=np.stack([arm.start[0] for arm in arms]),
         scale=1.0,
@@ -229,27 +268,135 @@ def adjust(
         scene=scene,
     )
     white = np.tile(np.repeat(noise or START_NOISE, 3) ** 2.0, sum(len(arm.rigs) for arm in arms))
-    robots = _rig_information(placed, arms, np.diag(white))
-    pixels, damping, log_sizes = noise_of(scene, view_of(scene, problem), problem), 1e-4, None
-    given = Given(evidence=evidence(scene, problem, pixels), arms=tuple(arms), noise=noise)
+    pixels = noise_of(scene, view_of(scene, problem), problem)
+    scene, *_ = minimised(scene, problem, pixels, _rig_information(placed, arms, np.diag(white)))
+    return _settled(replace(placed, scene=scene), problem, pixels, tuple(arms), noise)
+
+
+def _begun(near: Adjusted, problem: ImageProblem) -> tuple[Placed, ImageProblem, PixelNoise]:
+    """Everything where an adjustment put it, as far as the freedom of another problem lets it be there."""
+    before, scene = near.given.evidence.problem, near.placed.scene
+    sizes = before.freedom.model_error_std
+    if len(sizes) == len(problem.freedom.model_error_std):
+        problem = problem.with_model_error(sizes)
+    points = scene.points_in_world[np.searchsorted(before.points, problem.points)]
+    scene = with_freedom(replace(scene, points_in_world=points), before.freedom, problem.freedom)
+    return replace(near.placed, scene=scene), problem, near.given.evidence.noise
+
+
+def _settled(
+    placed: Placed,
+    problem: ImageProblem,
+    pixels: PixelNoise,
+    arms: tuple[ArmPoses, ...],
+    noise: tuple[float, float] | None,
+    log_sizes: Float[ndarray, " c"] | None = None,
+) -> Adjusted:
+    """Everything moved at once, and the sizes of errors estimated, in turn until they stay."""
+    start, acceleration = placed, Acceleration()
     for _ in range(ROUNDS):
-        before = pixels, log_sizes
-        scene, view, damping = minimised(placed.scene, problem, pixels, robots, damping)
-        pixels = noise_of(scene, view, problem, pixels)
-        images, resized = with_model_error_of(evidence(scene, problem, pixels))
-        problem, given = images.problem, replace(given, evidence=images)
-        placed, log_sizes, moved = _most_likely(replace(placed, scene=scene), given, log_sizes, STEP_SETTLED)
-        equations, _ = equations_of(placed, given)
-        robots = _rig_information(placed, arms, replace(equations, known=None).covariance(log_sizes))
-        change = np.inf if before[1] is None else float(np.abs(log_sizes - before[1]).max())
-        if max(change, resized, pixels.change(before[0])) < SIZES_SETTLED and moved < STEP_SETTLED:
+        before, freedom, view = pixels, problem.freedom, view_of(placed.scene, problem)
+        pixels = noise_of(placed.scene, view, problem, before)
+        images, normal = linearised(placed.scene, view, problem, pixels)
+        images, resized = with_model_error_of(images)
+        problem, given = images.problem, Given(evidence=images, arms=arms, noise=noise)
+        together = _Together.of(placed, given, log_sizes)
+        change = np.inf if log_sizes is None else float(np.abs(together.log_sizes - log_sizes).max())
+        log_sizes = together.log_sizes
+        if max(change, resized, pixels.change(before)) < SIZES_SETTLED and together.size < STEP_SETTLED:
             break
+        moved = together.moved(placed, normal)
+        if together.cost(moved) <= together.cost(placed) * (1 + ROUNDING):
+            begun, ended = _from(start, placed, freedom), _from(start, moved, problem.freedom)
+            weight = np.zeros(len(begun))
+            weight[np.r_[: len(together.arms), len(together.arms) + given.free]] = 1 / together.std
+            placed, problem = _at(start, acceleration.next(begun, ended, weight), given)
+        else:
+            placed = together.damped(placed)
+            acceleration.forget()
+    else:
+        given = Given(evidence=evidence(placed.scene, problem, pixels), arms=arms, noise=noise)
     return tied(given, placed, log_sizes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Together:
+    """One Gauss-Newton step of everything: arms, cameras, rigs and points."""
+
+    given: Given
+    log_sizes: Float[ndarray, " c"]
+    """Of the robots' errors, most likely."""
+    arms: Float[ndarray, " u"]
+    columns: Float[ndarray, " d"]
+    """Of the step, in the order of the evidence."""
+    std: Float[ndarray, " p"]
+    """Of the arms' unknowns and of what is free beside them."""
+    factor: Float[ndarray, "s s"]
+    """Lower Cholesky factor of the covariance of the reported poses."""
+
+    @staticmethod
+    def of(placed: Placed, given: Given, log_sizes: Float[ndarray, " c"] | None) -> "_Together":
+        """Where everything is now."""
+        equations, _ = equations_of(placed, given)
+        log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
+        solution, rigs = solve(equations, log_sizes), given.rigs
+        robots, step = _of_robots(given.arms), solution.step
+        # The rigs go where the images put them beside the cameras, and as far to the reported poses as these weigh.
+        left = cho_solve((solution.root, True), equations.residual + equations.jacobian @ step)
+        by_rig = of_poses(placed, given.arms)[2]
+        columns = np.zeros(len(given.evidence.gradient))
+        columns[given.free] = step[robots:]
+        columns[given.by_arm] = -rigs.step - rigs.follow @ step[robots:] - rigs.covariance @ (by_rig.T @ left)
+        return _Together(
+            given=given,
+            log_sizes=log_sizes,
+            arms=step[:robots],
+            columns=columns,
+            std=np.sqrt(solution.covariance.diagonal()),
+            factor=np.linalg.cholesky(replace(equations, known=None).covariance(log_sizes)),
+        )
+
+    @property
+    def size(self) -> float:
+        """The largest step of an arm's unknown, in standard deviations."""
+        return float(np.abs(self.arms / self.std[: len(self.arms)]).max())
+
+    def moved(self, placed: Placed, normal: Normal) -> Placed:
+        """Everything after the step; `normal` steps the points."""
+        share = _share_of(self.arms)
+        problem = self.given.evidence.problem
+        scene = stepped(placed.scene, problem.freedom, share * self.columns)
+        points = normal.stepped(placed.scene.points_in_world, share * self.columns)
+        arms = np.r_[share * self.arms, np.zeros(len(self.given.free))]
+        return replace(_moved(placed, arms, self.given), scene=replace(scene, points_in_world=points))
+
+    def cost(self, placed: Placed) -> float:
+        """Of a place, with weights and sizes of errors as they are at the start of the step."""
+        images = self.given.evidence
+        problem, view = images.problem, images.view
+        weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
+        held = [] if problem.prior is None else [problem.prior]
+        residual = of_poses(placed, self.given.arms)[0]
+        of_robots = float((solve_triangular(self.factor, residual, lower=True) ** 2).sum())
+        return of_robots + cost(placed.scene, view_of(placed.scene, problem), problem, weight, held)
+
+    def damped(self, placed: Placed) -> Placed:
+        """Images beside what the reported poses know of the rigs, and then the arms, where a whole step is too long."""
+        images = self.given.evidence
+        robots = _rig_information(placed, self.given.arms, self.factor @ self.factor.T)
+        scene, *_ = minimised(placed.scene, images.problem, images.noise, robots)
+        given = replace(self.given, evidence=evidence(scene, images.problem, images.noise))
+        return _most_likely(replace(placed, scene=scene), given, self.log_sizes, STEP_SETTLED**2)[0]
+
+
+def _share_of(step: Float[ndarray, " p"]) -> float:
+    """Of a step of the arms' unknowns that rotates nothing too far."""
+    return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[_rotations(len(step))]).max()), 1e-300))
 
 
 def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = None) -> Adjusted:
     """Evidence and arms together, averaged over the sizes of the robots' errors, from a place that is near."""
-    placed, log_sizes, _ = _most_likely(placed, given, log_sizes, 1e-12)
+    placed, log_sizes = _most_likely(placed, given, log_sizes, 1e-12)
     equations, region = equations_of(placed, given)
     log_sizes, information = most_likely(equations, log_sizes)
     found = posterior(equations, log_sizes, information, region)
@@ -266,26 +413,21 @@ def tied(given: Given, placed: Placed, log_sizes: Float[ndarray, " c"] | None = 
 
 def _most_likely(
     placed: Placed, given: Given, log_sizes: Float[ndarray, " c"] | None, settled: float
-) -> tuple[Placed, Float[ndarray, " c"], float]:
-    """The arms' unknowns at the likeliest sizes of errors, and how far they moved in squared standard deviations.
-
-    It ends with a step of less than `settled` of these.
-    """
-    robots, total = _of_robots(given.arms), 0.0
-    rotations = np.r_[SCALE, *(_columns(arm)[[3, 4, 5, 9, 10, 11]] for arm in range(len(given.arms)))]
+) -> tuple[Placed, Float[ndarray, " c"]]:
+    """The arms' unknowns at the likeliest sizes of errors, to a step of less than `settled` squared standard
+    deviations."""
+    robots = _of_robots(given.arms)
     for _ in range(STEPS):
         equations, _ = equations_of(placed, given)
         log_sizes, _ = most_likely(equations, log_sizes, SIZES_SETTLED / 3)
         solution = solve(equations, log_sizes)
         step = np.r_[solution.step[:robots], np.zeros(len(given.free))]
-        step *= min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
+        step *= _share_of(step[:robots])
         placed = _moved(placed, step, given)
-        moved = float(((solution.information_root.T @ step) ** 2).sum())
-        total += moved
-        if moved < settled:
+        if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
             break
     assert log_sizes is not None
-    return placed, log_sizes, total
+    return placed, log_sizes
 
 
 def _of_robots(arms: Sequence[ArmPoses]) -> int:
@@ -296,6 +438,12 @@ def _of_robots(arms: Sequence[ArmPoses]) -> int:
 def _columns(arm: int) -> Int[ndarray, "12"]:
     """Of an arm's X and base among the unknowns."""
     return np.delete(np.arange(POSES), SCALE) if arm == 0 else np.arange(1 + 12 * arm, POSES + 12 * arm)
+
+
+def _rotations(unknowns: int) -> Int[ndarray, " r"]:
+    """Rotations among the unknowns of arms, and the scale."""
+    arms = (unknowns - 1) // 12
+    return np.r_[SCALE, *(_columns(arm)[[3, 4, 5, 9, 10, 11]] for arm in range(arms))]
 
 
 def of_poses(
@@ -340,35 +488,11 @@ def _prior(arms: Sequence[ArmPoses]) -> Float[ndarray, "u u"]:
     return prior
 
 
-@dataclass(frozen=True)
-class RigsGivenCameras:
-    """What the images show of the rigs that arms move, with everything else of the scene where it is."""
-
-    follow: Float[ndarray, "s e"]
-    """By how much the rigs step back with each free column."""
-    step: Float[ndarray, " s"]
-    """To where they are likeliest, with the sign reversed."""
-    covariance: Float[ndarray, "s s"]
-
-
-def rigs_given_cameras(given: Given) -> RigsGivenCameras:
-    """From the evidence of the images alone."""
-    images, by_arm, free = given.evidence, given.by_arm, given.free
-    own = images.information[np.ix_(by_arm, by_arm)]
-    size = 1 / np.sqrt(own.diagonal())
-    factor = cho_factor(size[:, None] * own * size, lower=True)
-    coupling = images.information[np.ix_(by_arm, free)]
-    solved = size[:, None] * cho_solve(
-        factor, size[:, None] * np.column_stack([coupling, images.gradient[by_arm], np.diag(1 / size)])
-    )
-    return RigsGivenCameras(solved[:, : len(free)], solved[:, len(free)], solved[:, len(free) + 1 :] * size)
-
-
 def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     """Residuals of the reported gripper poses, linear in all unknowns; what the images show of the rigs is in them."""
     images, free = given.evidence, given.free
     residual, jacobian, by_rig, systematic = of_poses(placed, given.arms)
-    rigs = rigs_given_cameras(given)
+    rigs = given.rigs
     follow, step = rigs.follow, rigs.step
     coupling = images.information[np.ix_(given.by_arm, free)]
     known = by_rig @ rigs.covariance @ by_rig.T
@@ -421,6 +545,37 @@ def _by_inverse(a_from_b: Poses) -> Float[ndarray, "n 6 6"]:
     out[:, :3, :3] = out[:, 3:, 3:] = -rotation_t
     out[:, :3, 3:] = -rotation_t @ skew(a_from_b[:, :3, 3])
     return out
+
+
+def _from(start: Placed, placed: Placed, freedom: Freedom) -> Float[ndarray, " n"]:
+    """How far everything is from where it started: the arms' unknowns, the columns of the evidence, points, and the
+    logarithm of the size of what cameras' models leave."""
+    own = np.concatenate([step_between(start.x, placed.x), step_between(start.z, placed.z)], axis=1)
+    arms = np.zeros(1 + own.size)
+    arms[SCALE] = np.log(placed.scale / start.scale)
+    for arm, step in enumerate(own):
+        arms[_columns(arm)] = step
+    before, scene = start.scene, placed.scene
+    columns = np.zeros(freedom.first_rig)
+    columns[: len(freedom.std)] = scene.camera_steps - before.camera_steps
+    mounts = step_between(before.rig_from_camera, scene.rig_from_camera)
+    columns[len(freedom.std) :] = mounts[freedom.mounts].ravel()
+    rigs = step_between(before.world_from_rig, scene.world_from_rig)
+    points = scene.points_in_world - before.points_in_world
+    return np.concatenate([arms, columns, rigs.ravel(), points.ravel(), np.log(freedom.model_error_std[:1])])
+
+
+def _at(start: Placed, away: Float[ndarray, " n"], given: Given) -> tuple[Placed, ImageProblem]:
+    """Everything so far from where it started, and the problem with that size of what cameras' models leave."""
+    problem = given.evidence.problem
+    freedom = problem.freedom
+    ends = np.cumsum([_of_robots(given.arms), len(given.evidence.gradient), start.scene.points_in_world.size])
+    arms, columns, points, size = np.split(away, ends)
+    scene = stepped(start.scene, freedom, columns)
+    scene = replace(scene, points_in_world=scene.points_in_world + points.reshape(-1, 3))
+    placed = _moved(start, np.r_[arms, np.zeros(len(given.free))], given)
+    resized = np.repeat(np.exp(size), len(freedom.model_error_std))
+    return replace(placed, scene=scene), problem.with_model_error(resized)
 
 
 def _moved(placed: Placed, step: Float[ndarray, " p"], given: Given) -> Placed:

@@ -155,6 +155,31 @@ def at_start(scene: Scene, freedom: Freedom) -> Scene:
     return replace(scene, cameras=freedom.start, camera_steps=np.zeros(len(freedom.std)))
 
 
+def with_freedom(scene: Scene, before: Freedom, freedom: Freedom) -> Scene:
+    """The scene with its cameras as they are, as far as another freedom about the same start can express them."""
+    along = np.zeros(len(freedom.std))
+    for camera, start, prior, columns in zip(
+        scene.cameras, freedom.start, freedom.intrinsics, freedom.intrinsics_columns, strict=True
+    ):
+        off = parameters(camera) - parameters(start)
+        along[columns] = _along(prior.directions, prior.std, off)
+    nuisance = freedom.nuisance
+    of_images = scene.nuisances(before).ravel()
+    along[freedom.nuisance_columns] = _along(nuisance.directions, nuisance.std, of_images)
+    left = scene.camera_steps[before.model_error_columns]
+    if len(left) == len(freedom.model_error_std):
+        along[freedom.model_error_columns] = left
+    nothing = np.zeros(freedom.first_rig + 6 * len(scene.world_from_rig))
+    return stepped(replace(scene, camera_steps=along), freedom, nothing)
+
+
+def _along(
+    directions: Float[ndarray, "q c"], std: Float[ndarray, " c"], off: Float[ndarray, " q"]
+) -> Float[ndarray, " c"]:
+    """The likeliest steps along directions that come nearest to a displacement."""
+    return std * (np.linalg.pinv(directions * std) @ off)
+
+
 def stepped(scene: Scene, freedom: Freedom, step: Float[ndarray, " d"]) -> Scene:
     """Cameras, mounts and rigs after a step in the order of the columns; points stay."""
     along = scene.camera_steps + step[: len(freedom.std)]

@@ -62,7 +62,7 @@ def adjust_case(
     combinations: Float[ndarray, "e p"] | None = None,
     exchanged: bool = False,
 ) -> Adjusted:
-    """The used images and gripper poses of a case adjusted from its fit to poses.
+    """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
 
     `prior` takes the place of the case's; the rest is as adjust_wrist takes it.
     """
@@ -78,6 +78,7 @@ def adjust_case(
         systematic=case.systematic,
         combinations=combinations,
         exchanged=exchanged,
+        near=case.adjusted if case.hand_eye.converged else None,
     )
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import get_lapack_funcs, solve_triangular
-from scipy.optimize import root_scalar
 
 from jcr.distributions import chi2
 from jcr.handeye.systematic import REACH, Region
@@ -53,6 +52,9 @@ POSES = 13
 """Unknowns of equation.py; what follows them are intrinsics."""
 COVERED = 0.99
 """By the ellipsoid that holds what it says."""
+HALVINGS = 40
+"""Of the interval in which the size of that ellipsoid lies, to 1e-11 of it: scipy.optimize takes longer to import than
+a calibration of a few images."""
 JITTER = (0.0, 1e-14, 1e-12, 1e-10)
 """Added to correlations whose least eigenvalue is lost in rounding."""
 SETTLED = 1e-4
@@ -496,12 +498,15 @@ def _widening(
     )
     unit = variance / (2 * mean)
 
-    def beyond(distance: float) -> float:
-        return float(weight @ chi2.cdf(distance / unit, mean / unit)) - COVERED
-
     normal = float(chi2.ppf(COVERED, size))
-    found = root_scalar(beyond, bracket=(1e-3, 1e4 * normal)).root
-    return max(1.0, float(found) / normal)
+    least, most = np.log([1e-3, 1e4 * normal])
+    for _ in range(HALVINGS):
+        middle = (least + most) / 2
+        if weight @ chi2.cdf(np.exp(middle) / unit, mean / unit) < COVERED:
+            least = middle
+        else:
+            most = middle
+    return max(1.0, float(np.exp(most)) / normal)
 
 
 def _between(one: Float[ndarray, "p p"], other: Float[ndarray, "p p"]) -> Float[ndarray, "p p"]:

@@ -19,7 +19,6 @@ LEAST_SIGMA_PX = 0.3
 """Of a match; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
 """An alternative that fits its own inliers worse is none."""
-STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -80,10 +79,39 @@ def sampson_px(
 ) -> Float[ndarray, " m"]:
     """Signed distances of matches from their epipolar lines, both images together."""
     essential = skew(direction) @ rotation  # x_i · E x_j = 0
-    h_i, h_j = (np.concatenate([ray, np.ones((len(ray), 1))], 1) for ray in (ray_i, ray_j))
+    h_i, h_j = _homogeneous(ray_i), _homogeneous(ray_j)
     line_i, line_j = h_j @ essential.T, h_i @ essential
-    norm = np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1))
-    return focal_px * (h_i * line_i).sum(1) / np.maximum(norm, 1e-12)
+    return focal_px * (h_i * line_i).sum(1) / _norm(line_i, line_j)
+
+
+def _by_step(
+    rotation: Float[ndarray, "3 3"],
+    direction: Float[ndarray, "3"],
+    ray_i: Float[ndarray, "m 2"],
+    ray_j: Float[ndarray, "m 2"],
+    focal_px: float,
+) -> Float[ndarray, "m 5"]:
+    """Derivatives of `sampson_px` by the step of `_moved`."""
+    of_direction, h_i, h_j = skew(direction), _homogeneous(ray_i), _homogeneous(ray_j)
+    essential = of_direction @ rotation
+    by_step = np.concatenate(
+        [of_direction @ skew(np.eye(3)) @ rotation, skew(np.stack(_sideways(direction))) @ rotation]
+    )
+    line_i, line_j = h_j @ essential.T, h_i @ essential
+    line_i_by, line_j_by = h_j @ np.swapaxes(by_step, 1, 2), h_i @ by_step
+    norm = _norm(line_i, line_j)
+    distance = (h_i * line_i).sum(1) / norm
+    norm_by = (line_i_by[..., :2] * line_i[:, :2] + line_j_by[..., :2] * line_j[:, :2]).sum(2) / norm
+    return focal_px * (((h_i * line_i_by).sum(2) - distance * norm_by) / norm).T
+
+
+def _homogeneous(ray: Float[ndarray, "m 2"]) -> Float[ndarray, "m 3"]:
+    return np.concatenate([ray, np.ones((len(ray), 1))], 1)
+
+
+def _norm(line_i: Float[ndarray, "m 3"], line_j: Float[ndarray, "m 3"]) -> Float[ndarray, " m"]:
+    """Of the gradient of x_i · E x_j by the four coordinates of a match."""
+    return np.maximum(np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1)), 1e-12)
 
 
 def _of_essential(
@@ -122,14 +150,7 @@ def _refined(
     for _ in range(STEPS):
         sigma = max(1.48 * float(np.median(np.abs(residual))), LEAST_SIGMA_PX)
         weight = 1 / (1 + (residual / (2 * sigma)) ** 2)
-        jacobian = np.stack(
-            [
-                (sampson_px(*_moved(rotation, direction, STEP * unit), ray_i, ray_j, focal_px) - residual)
-                / STEP
-                for unit in np.eye(5)
-            ],
-            1,
-        )
+        jacobian = _by_step(rotation, direction, ray_i, ray_j, focal_px)
         information = jacobian.T @ (weight[:, None] * jacobian)
         gradient = jacobian.T @ (weight * residual)
         step = -np.linalg.solve(information + damping * np.diag(np.diag(information) + 1e-9), gradient)
@@ -151,10 +172,15 @@ def _refined(
 def _moved(
     rotation: Float[ndarray, "3 3"], direction: Float[ndarray, "3"], step: Float[ndarray, "5"]
 ) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]:
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    across = _unit(np.cross(direction, helper))
-    sideways = step[3] * across + step[4] * np.cross(direction, across)
-    return rotation_exp(step[:3]) @ rotation, _unit(direction + sideways)
+    one, other = _sideways(direction)
+    return rotation_exp(step[:3]) @ rotation, _unit(direction + step[3] * one + step[4] * other)
+
+
+def _sideways(direction: Float[ndarray, "3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+    """Two unit vectors across a direction and each other."""
+    across_with = skew(direction)
+    one = _unit(across_with[:, int(np.argmin(np.abs(direction)))])
+    return one, across_with @ one
 
 
 def _axis(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from PIL import Image
+from PIL import WebPImagePlugin as _  # noqa: F401  (else Pillow loads all its formats to find this one, in 0.1 s)
 
 from jcr.camera import project, unproject, without_distortion
 from jcr.capture.images import encode_png

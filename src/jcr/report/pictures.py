@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jcr.camera import is_distorted, project, resized, undistort_image, unproject, without_distortion
+from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
 from jcr.capture.images import read_image
 from jcr.geometry import apply, inverse
 from jcr.records import Capture, ImageVerdict, Intrinsics
@@ -99,14 +99,15 @@ def thumbnails(capture: Capture, lens: Intrinsics | None) -> list[str]:
     width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
     width = max(width, SMALLEST)
 
+    size = width, round(width * shape)
+    undistort = None
+    if lens is not None and is_distorted(lens):
+        small = resized(lens, *size)
+        undistort = undistortion(small, without_distortion(small))
+
     def thumbnail(name: str) -> str:
-        pixels = read_image(capture.folder / name)
-        size = width, round(width / pixels.shape[1] * pixels.shape[0])
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-        if lens is not None and is_distorted(lens):
-            small = resized(lens, *size)
-            pixels = undistort_image(pixels, small, without_distortion(small))
-        return picture_url(pixels, "JPEG")
+        pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
+        return picture_url(pixels if undistort is None else undistort(pixels), "JPEG")
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(thumbnail, capture.images))

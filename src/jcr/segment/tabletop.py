@@ -102,7 +102,9 @@ def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     along /= np.linalg.norm(along)
     rotation = np.stack([along, np.cross(up, along), up], axis=1)
     on = np.abs(distance) < 3 * noise
-    _, place = np.unique(np.floor((x[on] - middle) @ rotation[:, :2] / PATCH), axis=0, return_inverse=True)
+    patch = np.floor((x[on] - middle) @ rotation[:, :2] / PATCH).astype(np.int64)
+    patch -= patch.min(0)
+    _, place = np.unique(np.ravel_multi_index(tuple(patch.T), patch.max(0) + 1), return_inverse=True)
     bend = ndimage.median(distance[on], place, np.arange(place.max() + 1))
     on_plane = np.abs((cloud.points_in_base - middle) @ up) < 3 * noise
     return Support(

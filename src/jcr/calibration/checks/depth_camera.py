@@ -8,7 +8,6 @@ calibration; it is measured by it.
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.optimize import nnls
 
 from jcr.capture.depth_images import read_depth
 from jcr.geometry import apply, inverse
@@ -86,6 +85,8 @@ def _pairs(
 
 def _noise(depth: Float[ndarray, " k"], residual: Float[ndarray, " k"]) -> tuple[float, float]:
     """a (m) and b (1/m) of sigma² = a² + (b z²)², by the spread of the residuals in bins of distance."""
+    from scipy.optimize import nnls  # few captures have a depth camera, and it takes 0.1 s
+
     bins = np.array_split(np.argsort(depth), BINS)
     z = np.array([np.median(depth[rows]) for rows in bins])
     variance = np.array([(NORMAL * np.median(np.abs(residual[rows]))) ** 2 for rows in bins])

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
@@ -232,6 +230,10 @@ def _tested(
 
 def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:
     """Steps per unit of time (base axes) at each image of an arm that goes smoothly through all of them."""
+    # They take as long to import as all of SciPy that every command needs.
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     position = CubicSpline(moment, base_from_gripper[:, :3, 3])
     rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
     little = 1e-3 * float(np.diff(moment).min())
