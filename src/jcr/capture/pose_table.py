@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.capture.checks import require_frames
 from jcr.capture.options import ReadOptions, UnitsName
 from jcr.capture.plain_files import shown
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
@@ -55,6 +56,8 @@ def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     else:
         columns = dict(zip(cells.names, cells.columns(), strict=True))
     image = next((columns[name] for name in _IMAGE if name in columns), None)
+    if image is not None:
+        require_frames(len(image), str(file), 0)  # a row a frame: before a million numbers are read
     stamp = next((columns[name] for name in _STAMP if name in columns), None)
     base_from_gripper = poses_of_columns(columns, cells.units, options, str(file))
     stamp_numbers = None if stamp is None else np.array([stamp_ns(text, str(file)) for text in stamp])
