@@ -1,6 +1,5 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,14 +9,15 @@ from numpy import ndarray
 
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
+from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.stage import calibrate
 from jcr.camera import fold_distance_px
-from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image, show_one_view
-from jcr.capture.names import paired_by_name
+from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, rotation_angle
+from jcr.geometry import largest_motion
 from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.equation import ASSUMED_NOISE
 from jcr.handeye.next_poses import next_poses
@@ -28,20 +28,19 @@ from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import (
+    CAMERA,
     Capture,
     Finding,
     HandEye,
-    Kind,
     NextPose,
     Observability,
     PosePairs,
     Reconstruction,
     Verdict,
+    without_consequences,
 )
 from jcr.records.words import remedy, sentence, unobservable
 
-STILL = (20e-3, np.radians(5.0))
-"""m, rad: a gripper that moves farther is seen to, in images of a camera that it carries."""
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
@@ -100,13 +99,13 @@ def check(
     if isinstance(capture, str | Path):
         capture = read_source(capture)
     gripper = capture.base_from_gripper
-    motion = inverse(gripper)[:, None] @ gripper[None]
-    move = float(np.linalg.norm(motion[..., :3, 3], axis=-1).max())
-    turn = float(rotation_angle(motion[..., :3, :3]).max())
-    sharp, remarks, is_still = np.zeros(0), [*capture.notes], False
+    move, turn = largest_motion(gripper)
+    sharp, remarks = np.zeros(0), [*capture.notes]
+    views: tuple[Finding, ...] = ()
     if isinstance(capture, Capture):
-        brightness, sharp, is_still = _looks(capture)
-        remarks += _picture_remarks(capture, brightness, sharp)
+        brightness, sharp = _looks(capture)
+        views = view_findings(capture)
+        remarks += _exposure_remarks(capture, brightness)
         if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
             remarks.append(
                 f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"
@@ -119,12 +118,7 @@ def check(
     if isinstance(capture, Capture):
         unused = robot_errors(capture, CalibrateOptions()).unused
         remarks += [] if unused is None else [sentence(unused)]
-    faults: list[str] = []
-    if is_still and (move > STILL[0] or turn > STILL[1]):
-        still = Finding(
-            kind=Kind.STATIC_IMAGES, severity="rejects", mend="images", value=move, details={"rotation": turn}
-        )
-        faults.append(sentence(still))
+    faults = [sentence(one) for one in views if one.severity == "rejects"]
     held, quick = None, False
     if isinstance(capture, PosePairs):
         held = _held_against(gripper, capture, robot_noise)
@@ -134,7 +128,7 @@ def check(
     if held is not None:
         faults += held.faults
         remarks += held.remarks
-    if ratio is not None:
+    if ratio is not None and (hand_eye is None or not any(one.kind in CAMERA for one in hand_eye.findings)):
         angles = angle_finding(*ratio)
         remarks += [] if angles is None else [sentence(angles)]
     trusted = hand_eye is not None and hand_eye.converged
@@ -142,6 +136,12 @@ def check(
     seen = observability(gripper, x) if hand_eye is None or quick else hand_eye.observability
     if hand_eye is None:
         faults += [f"{unobservable(one)}; {remedy(one)}" for one in seen.findings]
+    if faults:
+        views = as_causes(views)
+        faults = list(
+            dict.fromkeys((*(sentence(one) for one in views if one.severity == "rejects"), *faults))
+        )
+    remarks += [sentence(one) for one in views if one.severity == "warns"]
     noise = robot_noise or ASSUMED_NOISE
     if hand_eye is not None and trusted and robot_noise is None:
         noise = (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
@@ -173,7 +173,9 @@ def _looked_at(
     if not thorough and len(capture) > QUICK:
         rows = np.linspace(0, len(capture) - 1, QUICK).round().astype(int)
         held = _registered(_of_rows(capture, rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        if not held.faults and held.hand_eye is not None and held.hand_eye.inliers.sum() == QUICK:
+        agree = held.hand_eye is not None and held.hand_eye.inliers.sum() == QUICK
+        # Angles that differ have a cause, which all images at full size may show.
+        if agree and not held.faults and (held.ratio is None or angle_finding(*held.ratio) is None):
             return held, True
     return _registered(capture, robot_noise, seed, progress), False
 
@@ -204,24 +206,18 @@ def _registered(
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Held(None, None, (str(error),), () if board is None else (sentence(board),))
-    by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    held = _held_against(
-        capture.base_from_gripper[found.image_index],
-        found,
-        robot_noise,
-        {by_number: poses[found.image_index] for by_number, poses in by_name.items()},
-    )
-    wrong: tuple[Finding, ...] = ()
-    if size_px is None and held.hand_eye is not None and held.hand_eye.converged:
-        wrong = left_out_poses(capture, found, held.hand_eye)
-    named = {
-        severity: [sentence(one) for one in wrong if one.severity == severity]
-        for severity in ("rejects", "warns")
-    }
-    return replace(
-        held,
-        faults=(*held.faults, *named["rejects"]),
-        remarks=(*held.remarks, *named["warns"], *found.warnings, *found.notes),
+    if size_px is not None:
+        return _held_against(capture.base_from_gripper[found.image_index], found, robot_noise)
+    mm_deg = None if robot_noise is None else (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
+    hand_eye = calibrate(capture, found, CalibrateOptions(robot_noise=mm_deg))
+    if hand_eye.converged:
+        hand_eye = hand_eye.with_findings(*left_out_poses(capture, found, hand_eye))
+    ratio, said = hand_eye.robot.angle_ratio, without_consequences(hand_eye.findings)
+    return _Held(
+        hand_eye,
+        None if ratio is None or not hand_eye.converged else (ratio.ratio, ratio.std),
+        tuple(sentence(one) for one in said if one.severity == "rejects"),
+        (*(sentence(one) for one in said if one.severity == "warns"), *found.notes),
     )
 
 
@@ -229,11 +225,10 @@ def _held_against(
     used: Float[ndarray, "m 4 4"],
     found: Reconstruction | PosePairs,
     robot_noise: tuple[float, float] | None,
-    by_name: Mapping[bool, Float[ndarray, "m 4 4"]] | None = None,
 ) -> _Held:
     camera = found.recon_from_camera
     hand_eye, ratio = solve_hand_eye(used, camera, robot_noise=robot_noise), None
-    reading = better_reading(used, camera, by_name)
+    reading = better_reading(used, camera)
     faults = [] if reading is None else [sentence(convention_finding(reading))]
     faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
     remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
@@ -242,21 +237,14 @@ def _held_against(
     return _Held(hand_eye, ratio, tuple(faults), tuple(remarks))
 
 
-def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"], bool]:
-    """Mean grey level and relative sharpness of every image, and whether all show one view."""
-    first = read_image(capture.folder / capture.images[0])
-    looks, is_still = [], len(capture) > 1
-    for name in capture.images:
-        image = read_image(capture.folder / name)
-        looks.append(brightness_and_sharpness(image))
-        is_still = is_still and show_one_view(first, image)
+def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
+    """Mean grey level and relative sharpness of every image."""
+    looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
-    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still
+    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9)
 
 
-def _picture_remarks(capture: Capture, brightness: Float[ndarray, " n"], sharpness: Float[ndarray, " n"]):
-    for name, grey, sharp in zip(capture.images, brightness, sharpness, strict=True):
+def _exposure_remarks(capture: Capture, brightness: Float[ndarray, " n"]):
+    for name, grey in zip(capture.images, brightness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
             yield f"{name} is {fault}; expose it again"
-        elif sharp < BLURRED:
-            yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"

@@ -27,7 +27,7 @@ from jcr.cli.result import show
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
-from jcr.records import Capture, CellCamera, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, CellCamera, Intrinsics, Pointmaps, Reconstruction, Tracks, no_reconstruction
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -374,7 +374,7 @@ def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
     capture = run.capture
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
     error = NotTrustedError(fault, remedy)
-    failed = failed_file(capture, "colmap", error, {"reconstruct": 2.0}, "0.0")
+    failed = failed_file(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, verdict_of
+from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
 
@@ -23,7 +23,7 @@ def summary(content: "CalibrationFile") -> str:
     """What was found, what was left out, and what would help."""
     lines = found(content)
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
-    if content.next_poses:
+    if content.next_poses and not is_explained(content.findings):
         then = " ".join(significant(1e3 * std) for std in content.next_poses[-1].expected_std[:3])
         near = ", ".join(pose.like for pose in content.next_poses)
         if (
