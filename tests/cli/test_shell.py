@@ -20,6 +20,7 @@ from capture_writers import write_easy_handeye2
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.completion import SHELLS, arguments_of, script
 from jcr.cli.output import Output
+from jcr.cli.query import labelled
 from jcr.export.formats import FORMATS
 from jcr.export.options import FormatName
 from jcr.geometry import scale_translation
@@ -89,6 +90,12 @@ def test_what_decides_is_told_quiet_or_not(tmp_path: Path, capsys: pytest.Captur
     assert dispatch(["export", str(tmp_path / "out"), "urdf", "--force", "--quiet"]) == 0
     told = capsys.readouterr()
     assert told.err.startswith("warning: the calibration is rejected") and told.err.count("\n") == 1
+
+
+def test_a_query_says_on_what_its_points_lie():
+    said = labelled(np.array([0, 2, 2, 1, 2, 0]), ("none", "table", "object 1", "object 2"))
+    assert said == "; by label: table 1, object 1 3"
+    assert labelled(np.zeros(3, int), ("none",)) == ""
 
 
 def test_errors_are_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
