@@ -38,6 +38,10 @@ class Faults:
     """Names of its parameters, and by how much the true one is more than the believed one."""
     rolling_px: float = 0.0
     """By how much the last row is shifted against the first in x."""
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """s1 to s4 of OpenCV's thin prism."""
+    centre_sags_px: float = 0.0
+    """By how much optics on springs move the image when gravity is along it, in x and in y alike."""
     slip: tuple[float, float] = (0.0, 0.0)
     """m, rad about random axes: the camera moves on the gripper."""
     slip_after: float = 0.5
@@ -97,6 +101,8 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         x_in_camera = apply(inverse(cameras[k]), points)
         x_px = project(zoomed(camera, float(focal[k])), x_in_camera)
         x_px[:, 0] += faults.rolling_px * (x_px[:, 1] / LENS.height - 0.5)
+        x_px += camera.fx * _through_prism(x_in_camera[:, :2] / x_in_camera[:, 2:], faults.prism)
+        x_px -= faults.centre_sags_px * cameras[k, 2, :2]  # gravity, along -z of the base, in camera axes
         inside = (x_px > 0).all(1) & (x_px < [LENS.width, LENS.height]).all(1) & (x_in_camera[:, 2] > 0)
         seen = np.flatnonzero(inside)
         image.append(np.full(len(seen), k))
@@ -104,6 +110,12 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         pixels.append(x_px[seen] + NOISE_PX * rng.normal(size=(len(seen), 2)))
     tracks = Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), points)
     return FaultyCapture(reported, tracks, cameras, x, slipped, LENS)
+
+
+def _through_prism(x: Float[ndarray, "p 2"], s: tuple[float, float, float, float]) -> Float[ndarray, "p 2"]:
+    """Displacements of rays (x, y, 1), OpenCV's thin prism distortion."""
+    r2 = (x**2).sum(1)
+    return np.stack([s[0] * r2 + s[1] * r2**2, s[2] * r2 + s[3] * r2**2], axis=1)
 
 
 def apply_all(a_from_b: Float[ndarray, "n 4 4"], x_in_b: Float[ndarray, "p 3"]) -> Float[ndarray, "n p 3"]:

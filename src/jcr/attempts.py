@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate
@@ -14,16 +15,35 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
-from jcr.records import CAUSES, Attempt, Capture, Finding, HandEye, HeldOut, Mend, Reconstruction
-from jcr.records.words import text
+from jcr.records import (
+    LASTING,
+    Attempt,
+    Capture,
+    Finding,
+    HandEye,
+    HeldOut,
+    Kind,
+    Mend,
+    Reconstruction,
+    no_reconstruction,
+    strongest_first,
+)
+from jcr.records.words import remedy, text
 
 
 class NothingFoundError(NotTrustedError):
-    """No back end that was tried came to a calibration."""
+    """No back end that was tried came to a calibration; `findings` say why, strongest first."""
 
-    def __init__(self, failure: NotTrustedError, attempts: tuple[Attempt, ...]) -> None:
-        super().__init__(failure.what, *failure.remedies, also=failure.also)
+    def __init__(
+        self, failure: NotTrustedError, attempts: tuple[Attempt, ...], causes: tuple[Finding, ...] = ()
+    ) -> None:
         self.attempts = attempts
+        self.findings = strongest_first((*causes, *no_reconstruction(failure)))
+        first = self.findings[0]
+        if first.kind is Kind.NO_RECONSTRUCTION:
+            super().__init__(failure.what, *failure.remedies, also=failure.also)
+        else:  # too few features, and what would give more, are its consequences
+            super().__init__(text(first), *filter(None, [remedy(first)]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,13 +128,15 @@ class Tried:
         """The account of one that is not kept; what failed has its own reason."""
         return self.account if why_not is None else replace(self.account, why_not=why_not)
 
-    def require_found(self) -> "Tried":
-        """Itself; raises InputError or NothingFoundError where there is nothing to keep."""
+    def require_found(self, of_images: tuple[Finding, ...]) -> "Tried":
+        """Itself, with what the images alone say of the capture; raises InputError or NothingFoundError where there is
+        nothing to keep."""
         if isinstance(self.failure, InputError):
             raise self.failure
         if self.failure is not None:
-            raise NothingFoundError(self.failure, self.attempts)
-        return self
+            raise NothingFoundError(self.failure, self.attempts, as_causes(of_images))
+        found = of_images if self.hand_eye.is_sound else as_causes(of_images)
+        return replace(self, calibrated=self.hand_eye.with_findings(*found)) if found else self
 
 
 HELPS: tuple[Mend, ...] = ("reconstruction", "images")
@@ -136,7 +158,7 @@ def needs_another(tried: Tried) -> bool:
     if tried.calibrated is None:
         return True
     rejected = rejection(tried)
-    return rejected is not None and rejected.kind not in CAUSES and rejected.mend in HELPS
+    return rejected is not None and rejected.kind not in LASTING and rejected.mend in HELPS
 
 
 def choose(
@@ -159,19 +181,34 @@ def choose(
     depth_options = depth_options or DepthOptions()
     first, *others = tries(options)
     if not others:
-        return _tried(capture, first, calibrate_options, depth_options, progress, chosen).require_found()
+        kept = _tried(capture, first, calibrate_options, depth_options, progress, chosen)
+        return kept.require_found(_of_images(capture, kept))
     kept = _tried(capture, first, calibrate_options, depth_options, progress)
     if isinstance(kept.failure, InputError) and options.weights is not None:
         raise kept.failure
     if not needs_another(kept) and BACKENDS[kept.account.backend].hub_id:
         kept = kept.noted(kept.title)
-    for one in others:
+    of_images = _of_images(capture, kept)
+    # A camera at rest shows every back end the same one view.
+    tried = [] if any(one.severity == "rejects" for one in of_images) else others
+    for one in tried:
         if not needs_another(kept):
             kept = _alone(kept)
             break
         kept = _better(kept, _tried(capture, one, calibrate_options, depth_options, progress))
-    chosen(kept.require_found().reconstruction)
+    kept = kept.require_found(of_images)
+    chosen(kept.reconstruction)
     return kept
+
+
+def _of_images(capture: Capture, tried: Tried) -> tuple[Finding, ...]:
+    """What the images alone say of a capture that failed, is not accepted as it is, or has images without a use."""
+    if isinstance(tried.failure, InputError):
+        return ()
+    found = tried.calibrated
+    if found is not None and found.verdict == "accepted" and found.inliers.sum() == len(capture):
+        return ()
+    return view_findings(capture)
 
 
 def _alone(kept: Tried) -> Tried:
@@ -194,7 +231,8 @@ def again(
     """A reconstruction that was chosen before, and read in `read_s` seconds, calibrated again; raises as `choose`."""
     tried = _reconstructed(reconstruction, read_s, None)
     surfaces = _with_surface(capture, tried, options, depth_options or DepthOptions(), progress, memory_gb)
-    return _calibrated(capture, surfaces, options, progress).require_found()
+    kept = _calibrated(capture, surfaces, options, progress)
+    return kept.require_found(_of_images(capture, kept))
 
 
 def timings_of(attempts: tuple[Attempt, ...]) -> dict[str, float]:
@@ -282,6 +320,12 @@ def _calibrated(
     return calibrated
 
 
+def _is_explained(tried: Tried) -> bool:
+    """Whether what rejects it is a cause, which holds for every reconstruction of the same images."""
+    rejected = rejection(tried)
+    return rejected is not None and rejected.kind in LASTING
+
+
 def _better(one: Tried, other: Tried) -> Tried:
     """Which of two is kept, noting why; `one` is known to be doubtful, and was tried first."""
     if isinstance(other.failure, InputError) and not BACKENDS[other.account.backend].hub_id:
@@ -304,6 +348,8 @@ def _better(one: Tried, other: Tried) -> Tried:
         return other.noted(note).kept_after(one, untrusted)
     farther = "rejected, and its leave-one-out error is the larger one: "
     note = f"{doubt}, and so is {other.name}; "
+    if _is_explained(other) and not _is_explained(one):
+        return other.noted(f"{note}{other.name} shows why").kept_after(one, untrusted)
     if other.leave_one_out_m < one.leave_one_out_m:
         note += f"{other.with_error} was used and not {one.with_error}"
         return other.noted(note).kept_after(one, farther + one.with_error)

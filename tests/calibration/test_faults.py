@@ -39,6 +39,18 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         3.0,
     ),
     "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
+    "thin prism": (
+        Faults(prism=(0.02, 0.0, 0.01, 0.0)),
+        r"a thin-prism distortion of up to ([\d.]+) ± \S+ px",
+        [5.6],
+        0.6,
+    ),
+    "image-stabilised optics": (
+        Faults(centre_sags_px=12.0),
+        r"moves with gravity, by ([\d.]+) ± \S+ px",
+        [12.0],
+        0.6,
+    ),
     "slip": (
         Faults(slip=(3.6e-3, np.radians(1.1))),
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",

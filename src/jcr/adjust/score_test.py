@@ -1,7 +1,8 @@
 """What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
 
-The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length and
-a shear for each image by itself. A hypothesis is a few combinations of these columns. How much freeing them would lower
+The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length, a
+shear and an offset for each image by itself, and a thin prism. A hypothesis is a few combinations of these columns. How
+much freeing them would lower
 the cost, at one Gauss-Newton step, over the dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil.
 Soc. 44, 1948), here beside F, for the robot pose noise was estimated from few residuals. The same step shows how large
 they are and how far X would move; the adjustment with them free (`freed`) is what they come to.
@@ -16,7 +17,7 @@ from numpy import ndarray
 from jcr.adjust.images import ImageEvidence, evidence
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.adjust.robots import Adjusted, equations_of
-from jcr.adjust.scene import Freedom, NuisancePrior
+from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
 from jcr.handeye.components import POSES, solve
@@ -24,15 +25,14 @@ from jcr.records import Intrinsics
 
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
 """Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
-WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL = 1.0, 0.3, 0.05
+WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
     """The equations of every column that may be freed; what was adjusted is eliminated.
 
-    The columns are the parameters of the wrist camera in `units`, the logarithms of the images' focal lengths over the
-    camera's, and their shears in focal lengths.
+    The columns are the parameters of the wrist camera in `units`, then the nuisances in the order of NuisancePrior.
     """
 
     hessian: Float[ndarray, "e e"]
@@ -48,6 +48,8 @@ class Alternatives:
     """What each of them counts in: focal lengths in themselves, the centre in widths."""
     distance: Float[ndarray, " m"]
     """Median depth of the points of each image (m)."""
+    down_in_camera: Float[ndarray, "m 3"]
+    """Of each image, the direction against the base's z axis."""
 
     @property
     def columns(self) -> int:
@@ -75,6 +77,15 @@ class Alternatives:
         """Combinations: x of each image moves by its share of the focal length over its height."""
         return self._of_images(1, shares)
 
+    def offset_by_gravity(self) -> Float[ndarray, "e 2"]:
+        """Combinations: the offset of each image in x by gravity along x, in y by gravity along y."""
+        x, y = self.down_in_camera[:, :2].T
+        return np.concatenate([self._of_images(2, x[:, None]), self._of_images(3, y[:, None])], axis=1)
+
+    def prism(self) -> Float[ndarray, "e 4"]:
+        """Combinations: the coefficients of a thin prism."""
+        return np.eye(self.columns)[:, -PRISM:]
+
     def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
         out = np.zeros((self.columns, shares.shape[1]))
         first = len(self.names) + block * self.images
@@ -94,16 +105,19 @@ class Tested:
     """The step of X that comes with it, gripper axes."""
 
 
-def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
+def alternatives(
+    adjusted: Adjusted, prior: IntrinsicsPrior, model_error_std: float | None = None
+) -> Alternatives:
     """The columns and equations about an adjustment of a wrist camera, a rig an image.
 
-    `prior` is what was known of the intrinsics; what was freed beyond it is among the columns.
+    `prior` is what was known of the intrinsics; what was freed beyond it is among the columns. `model_error_std` is how
+    large, in widths of the image, what the camera's model leaves may be; None: as large as it was estimated.
     """
     given = adjusted.given
     problem, camera = given.evidence.problem, given.evidence.scene.cameras[0]
     names, units, m = parameter_names(camera), units_of(camera), len(problem.observations.rig)
     freedom, own = problem.freedom, len(prior.std)
-    weak = np.r_[weak_of(camera), [WEAK_FOCAL] * m, [WEAK_SHEAR] * m]
+    weak = np.r_[weak_of(camera), _weak_nuisances(m)]
     all_free = Freedom(
         intrinsics=(
             IntrinsicsPrior(
@@ -111,15 +125,17 @@ def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
             ),
         ),
         mounts=freedom.mounts,
-        nuisance=NuisancePrior(np.eye(2 * m), weak[len(names) :]),
+        nuisance=NuisancePrior(np.eye(OF_IMAGE * m + PRISM), weak[len(names) :]),
         start=freedom.start,
-        model_error_std=freedom.model_error_std,
+        model_error_std=freedom.model_error_std
+        if model_error_std is None
+        else np.full_like(freedom.model_error_std, model_error_std),
     )
     scene = given.evidence.scene
     steps = np.r_[
         scene.camera_steps[:own],
         beyond_prior(adjusted, prior) / units,
-        scene.nuisances(freedom).ravel(),
+        scene.nuisances(freedom),
         scene.camera_steps[freedom.model_error_columns],
     ]
     wider = evidence(
@@ -148,6 +164,7 @@ def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
         names=names,
         units=units,
         distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
+        down_in_camera=-(adjusted.placed.z[0] @ adjusted.placed.scene.world_from_rig)[:, 2, :3],
     )
 
 
@@ -196,7 +213,7 @@ def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
     """The combinations of columns of `Alternatives` that give every image a focal length of its own."""
     q = len(parameter_names(camera))
-    out = np.zeros((q + 2 * images, images))
+    out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0
     out[q : q + images, 1:] = differences(images)
     return out
@@ -214,7 +231,7 @@ def freed(freedom: Freedom, combinations: Float[ndarray, "e p"], camera: Intrins
     """
     q, own = len(parameter_names(camera)), freedom.intrinsics[0]
     of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
-    weak = np.repeat([WEAK_FOCAL, WEAK_SHEAR], len(of_images) // 2)
+    weak = _weak_nuisances((len(of_images) - PRISM) // OF_IMAGE)
     return replace(
         freedom,
         intrinsics=(
@@ -225,6 +242,12 @@ def freed(freedom: Freedom, combinations: Float[ndarray, "e p"], camera: Intrins
         ),
         nuisance=NuisancePrior(of_images, _std(of_images, weak)),
     )
+
+
+def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
+    """Standard deviations of nuisances that only keep finite what the images cannot see."""
+    of_images = np.repeat([WEAK_FOCAL, WEAK_SHEAR, WEAK_OFFSET, WEAK_OFFSET], images)
+    return np.r_[of_images, np.full(PRISM, WEAK_PRISM)]
 
 
 def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:

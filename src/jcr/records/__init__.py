@@ -48,14 +48,17 @@ from jcr.records.cloud import PointCloud
 from jcr.records.findings import (
     CAMERA,
     CAUSES,
+    LASTING,
     Finding,
     Kind,
     Mend,
     Severity,
     Verdict,
+    is_explained,
     no_reconstruction,
     strongest_first,
     verdict_of,
+    without_consequences,
 )
 from jcr.records.reconstruction import (
     BOTH,
@@ -75,6 +78,7 @@ __all__ = [
     "Budget",
     "CAMERA",
     "CAUSES",
+    "LASTING",
     "COVARIANCE_ORDER",
     "CameraEvidence",
     "COEFFICIENTS",
@@ -122,7 +126,9 @@ __all__ = [
     "WithGivenIntrinsics",
     "WithGivenIntrinsics",
     "coefficients_of",
+    "is_explained",
     "no_reconstruction",
     "strongest_first",
     "verdict_of",
+    "without_consequences",
 ]

@@ -310,12 +310,27 @@ class Estimate:
         known = self.intrinsics_covariance
         return None if known is None else np.sqrt(np.diag(known))
 
-    def with_fault(self, covariance: Float[ndarray, "7 7"]) -> "Estimate":
-        """The same, as uncertain as a fault with this covariance makes it."""
-        budget = self.budget
+    def with_fault(
+        self,
+        covariance: Float[ndarray, "7 7"],
+        shifts: tuple[Float[ndarray, "7"], Float[ndarray, " q"]] | None = None,
+    ) -> "Estimate":
+        """The same, as uncertain as a fault with this covariance makes it.
+
+        `shifts` are those of COVARIANCE_ORDER and of camera.parameters together, where the intrinsics move with it.
+        """
+        budget, cross, known = self.budget, self.intrinsics_cross, self.intrinsics_covariance
         if budget is not None:
             budget = replace(budget, faults=budget.faults + covariance)
-        return replace(self, covariance=self.covariance + covariance, budget=budget)
+        if shifts is not None and cross is not None and known is not None:
+            cross, known = cross + np.outer(*shifts), known + np.outer(shifts[1], shifts[1])
+        return replace(
+            self,
+            covariance=self.covariance + covariance,
+            budget=budget,
+            intrinsics_cross=cross,
+            intrinsics_covariance=known,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

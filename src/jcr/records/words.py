@@ -141,6 +141,9 @@ def unobservable(finding: Finding) -> str:
 
 
 def _to_observe(finding: Finding) -> str:
+    # Of images that are missing the motions would do: moving otherwise is no remedy.
+    if finding.mend != "motion":
+        return ""
     return _UNSEEN[str(finding.details["motion"])][1].format(**_of_axis(finding))
 
 
@@ -244,6 +247,14 @@ def _left_out(finding: Finding) -> str:
     typical = f"{1e3 * _number(finding, 'residual'):.1f} mm"
     much = "the leave-one-out error ({mm:.1f} mm) is well above the fit's residual"
     return f"{_said(much, finding)} ({typical}): too few images for this motion"
+
+
+def _blurred(finding: Finding) -> str:
+    edges = _said("edges {value:.0f} px wide", finding)
+    if len(finding.images) == 1:
+        return f"{finding.images[0]} is blurred ({edges})"
+    count = f"{len(finding.images)} of {_number(finding, 'of'):.0f}"
+    return f"{count} images are blurred, such as {finding.images[0]} ({edges})"
 
 
 # The camera.
@@ -441,6 +452,14 @@ _TEXT: dict[Kind, Words] = {
         "each image is sheared by itself, {value:.1f} px from top to bottom (rms, {chance}), as by the rolling shutter "
         "of a moving camera"
     ),
+    Kind.THIN_PRISM: (
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}), for which the intrinsics "
+        "have no coefficients: the sensor is tilted, or the optics are decentred"
+    ),
+    Kind.CENTRE_SAGS: (
+        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image ({chance}): the "
+        "optics are image-stabilised or loose"
+    ),
     Kind.INTRINSICS: _intrinsics,
     Kind.SLIP: (
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]} ({chance})"
@@ -495,6 +514,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.STATIC_IMAGES: (
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates by {deg:.0f}°"
     ),
+    Kind.BLURRED: _blurred,
+    Kind.FEW_USED: (
+        "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of all are not"
+    ),
     Kind.POSES_SWAPPED: "{images[0]} and {images[1]} have each other's gripper pose",
     Kind.POSE_CONTRADICTS_IMAGE: (
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the gripper"
@@ -514,6 +537,10 @@ _REMEDY: dict[Kind, Words] = {
     Kind.ZOOM: "calibrate the images before or after it, or --focus varies",
     Kind.ROLLING_SHUTTER: AT_REST,
     Kind.ROLLING_SHUTTER_BY_IMAGE: AT_REST,
+    Kind.THIN_PRISM: (
+        "undistort the images with OpenCV's thin prism model (CALIB_THIN_PRISM_MODEL) and give the intrinsics of these"
+    ),
+    Kind.CENTRE_SAGS: "switch image stabilisation off, or fix the optics",
     Kind.INTRINSICS: CALIBRATE_INTRINSICS,
     Kind.SLIP: _one_part,
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
@@ -538,6 +565,8 @@ _REMEDY: dict[Kind, Words] = {
     Kind.STATIC_IMAGES: (
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose"
     ),
+    Kind.BLURRED: "take them again at rest, in focus and with more light",
+    Kind.FEW_USED: "let the views overlap more and show more texture, or use a board (jcr docs markers)",
     Kind.POSES_SWAPPED: "exchange the two poses",
     Kind.POSE_CONTRADICTS_IMAGE: "correct that pose, or drop the image",
 }

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.model_error import TYPICAL
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import (
     Alternatives,
@@ -30,7 +31,7 @@ from jcr.calibration.checks.checked import Checked
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.camera import parameter_names, parameters
 from jcr.geometry import step_between
-from jcr.records import Finding, Intrinsics, Kind, Tracks
+from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
 
 LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
@@ -42,13 +43,20 @@ AT_ONCE = 2
 """Faults named of one capture."""
 MOST_POINTS, WELL_SEEN = 800, 3
 """Points that take part, first those in this many images: more tell a fault no better, and take time."""
-LEAST_SHEAR_PX = 3.0
-"""From top to bottom; less of it than this is what a distortion model leaves over."""
+LEAST_PX = {
+    Kind.ROLLING_SHUTTER: 3.0,
+    Kind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
+    Kind.CENTRE_SAGS: 3.0,
+    Kind.THIN_PRISM: 1.0,
+}
+"""What is measured in pixels and smaller is what a distortion model leaves over."""
 MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
+MENDS: dict[Kind, Mend] = {Kind.THIN_PRISM: "intrinsics", Kind.CENTRE_SAGS: "mount"}
+"""What would help where other images would not."""
 FOCUS = {"distance", "scatter", "zoom"}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
@@ -72,7 +80,7 @@ def check_camera(case: Case) -> Checked:
         return Checked(faults)
     (contradiction,) = checked.findings
     if of_intrinsics is not None:
-        contradiction = replace(of_intrinsics, shift=contradiction.shift)
+        contradiction = replace(of_intrinsics, shift=contradiction.shift, intrinsics_shift=None)
     others = [one for one in faults if one.kind is not Kind.INTRINSICS]
     return replace(checked, findings=(*others, contradiction))
 
@@ -120,6 +128,11 @@ class _State:
         """Of what may be freed beside."""
         return alternatives(self.adjusted, self.case.intrinsics_prior)
 
+    @cached_property
+    def equations_of_a_good_camera(self) -> Alternatives:
+        """The same where its model may leave as little as that of a good camera: the rest needs another explanation."""
+        return alternatives(self.adjusted, self.case.intrinsics_prior, TYPICAL)
+
     @property
     def camera(self) -> Intrinsics:
         """As adjusted."""
@@ -130,7 +143,7 @@ class _State:
         """How far the columns that may be freed are from where they start."""
         evidence = self.adjusted.given.evidence
         of_camera = beyond_prior(self.adjusted, self.case.intrinsics_prior) / self.equations.units
-        return np.r_[of_camera, evidence.scene.nuisances(evidence.problem.freedom).ravel()]
+        return np.r_[of_camera, evidence.scene.nuisances(evidence.problem.freedom)]
 
     def shift_from(self, before: "_State") -> Float[ndarray, "7"]:
         """How far the calibration is from what it was, in records.COVARIANCE_ORDER."""
@@ -156,10 +169,11 @@ def _faults(case: Case) -> tuple[Finding, ...]:
         after = None
         if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * std).any():
             after = _with(state, best)
-        if after is None or not _is_material(after, state, std):
+        found = None if after is None else _finding(after, state, alone)
+        if after is None or found is None or not _is_material(found, std):
             dismissed.append(best)
             continue
-        named.append(_finding(after, state, alone))
+        named.append(found)
         state = after
     return tuple(named)
 
@@ -187,25 +201,28 @@ def _with(state: _State, best: _Hypothesis) -> _State | None:
         return None
 
 
-def _is_material(after: _State, before: _State, std: Float[ndarray, "6"]) -> bool:
+def _is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     """Whether what was freed is large enough to be a fault, and moves the calibration."""
-    m = after.equations.images
-    shear = after.total[-m:]
-    small = np.sqrt(np.mean(shear**2)) * after.camera.fx < LEAST_SHEAR_PX
-    if after.found[-1].kind.startswith("shear") and small:
+    if found.value is not None and found.value < LEAST_PX.get(found.kind, -np.inf):
         return False
-    return bool((np.abs(after.shift_from(before)[:6]) > MATERIAL * std).any())
+    assert found.shift is not None
+    return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
 def _finding(after: _State, before: _State, alone: Tested) -> Finding:
     """The last hypothesis that was freed, as a finding."""
-    best, equations = after.found[-1], after.equations
-    last = tested(equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
+    best = after.found[-1]
+    last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
-    names = [after.case.names[row] for row in after.case.used]
-    given = after.case.reconstruction.intrinsics
-    size = _size(best, after.total, last, equations, given, after.camera, names)
-    return Finding(severity="warns", p=p, shift=tuple(after.shift_from(before).tolist()), **size)
+    size = _of_intrinsics(after, last) if best.of_intrinsics else _size(after, last)
+    moved = parameters(after.camera) - parameters(before.camera)
+    return Finding(
+        severity="warns",
+        p=p,
+        shift=tuple(after.shift_from(before).tolist()),
+        intrinsics_shift=tuple(moved.tolist()),
+        **size,
+    )
 
 
 def _some(tracks: Tracks, seed: int = 0) -> Tracks:
@@ -225,16 +242,25 @@ def _all(state: _State) -> Float[ndarray, "e r"]:
 
 
 def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis | None:
-    """The hypothesis of least p, if that is little enough to be believed."""
-    before, result = _all(state), None
-    for candidate in _hypotheses(state):
-        if any(_alike(candidate, one) for one in (*state.found, *dismissed)):
-            continue
-        beside = np.concatenate([before, candidate.beside], axis=1)
-        log_p = tested(state.equations, candidate.free, beside).log_p + np.log(candidate.places)
-        if result is None or log_p < result[0]:
-            result = log_p, candidate
-    return None if result is None or result[0] > LOG_P else result[1]
+    """Of the hypotheses whose p is little enough to be believed the one that explains most.
+
+    What the camera's model leaves grows with whatever is wrong, until every explanation gains as little. Which of them
+    is the right one shows where it may not.
+    """
+    believed = [
+        one
+        for one in _hypotheses(state)
+        if not any(_alike(one, other) for other in (*state.found, *dismissed))
+        and _log_p(one, state, state.equations) <= LOG_P
+    ]
+    if len(believed) < 2:
+        return believed[0] if believed else None
+    return min(believed, key=lambda one: _log_p(one, state, state.equations_of_a_good_camera))
+
+
+def _log_p(one: _Hypothesis, state: _State, equations: Alternatives) -> float:
+    beside = np.concatenate([_all(state), one.beside], axis=1)
+    return tested(equations, one.free, beside).log_p + float(np.log(one.places))
 
 
 def _alike(one: _Hypothesis, other: _Hypothesis) -> bool:
@@ -277,47 +303,71 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.focal_of_images(after[:, None])
         found.append(_Hypothesis("zoom", free, common, len(steps), int(k) - 1))
+    of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
+    found += [
+        _Hypothesis("prism", equations.prism(), of_centre),
+        _Hypothesis("sag", equations.offset_by_gravity(), of_centre),
+    ]
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
     kind = "aspect" if state.case.capture.intrinsics is None else "intrinsics"
     found.append(_Hypothesis(kind, equations.of_camera(_freed(kind, equations)), nothing))
     return found
 
 
-def _size(
-    fault: _Hypothesis,
-    total: Float[ndarray, " e"],
-    last: Tested,
-    equations: Alternatives,
-    given: Intrinsics,
-    now: Intrinsics,
-    images: Sequence[str],
-) -> dict[str, Any]:
-    """The fields of a finding that say what and how large the fault is."""
-    value = _value(fault, total)
+def _of_intrinsics(after: _State, last: Tested) -> dict[str, Any]:
+    """The fields of a finding that say which intrinsics the images show."""
+    equations, kind = after.equations, after.found[-1].kind
+    units = dict(zip(equations.names, equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    if fault.of_intrinsics:
-        units = dict(zip(equations.names, equations.units, strict=True))
-        names = _freed(fault.kind, equations)
-        details = _parameters({name: std[k] * units[name] for k, name in enumerate(names)}, given, now)
-        return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
-    kind, size, error = {
-        "distance": (Kind.FOCUS_BY_DISTANCE, value[0], std[0]),
-        "scatter": (Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), np.median(std)),
-        "zoom": (Kind.ZOOM, value[0], std[0]),
-        "shear": (Kind.ROLLING_SHUTTER, abs(value[0]), std[0]),
-        "shear of each": (Kind.ROLLING_SHUTTER_BY_IMAGE, np.sqrt(np.mean(value**2)), np.median(std)),
-    }[fault.kind]
-    unit = float(np.ptp(np.log(equations.distance))) if fault.kind == "distance" else 1.0
-    if fault.kind.startswith("shear"):
-        unit = given.fx
-    between = images[fault.after : fault.after + 2] if fault.kind == "zoom" else ()
+    names = _freed(kind, equations)
+    given = after.case.reconstruction.intrinsics
+    details = _parameters({name: std[k] * units[name] for k, name in enumerate(names)}, given, after.camera)
+    return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
+
+
+def _size(after: _State, last: Tested) -> dict[str, Any]:
+    """The fields of a finding that say what and how large the fault is."""
+    fault, equations = after.found[-1], after.equations
+    value = _value(fault, after.total)
+    std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
+    typical, each = float(np.sqrt(np.mean(value**2))), float(np.median(std))
+    spread = float(np.ptp(np.log(equations.distance)))
+    focal_px, width = after.case.reconstruction.intrinsics.fx, after.camera.width
+    names = [after.case.names[row] for row in after.case.used]
+    changed = tuple(names[fault.after : fault.after + 2])
+    match fault.kind:
+        case "distance":
+            kind, size, error = Kind.FOCUS_BY_DISTANCE, spread * value[0], spread * std[0]
+        case "scatter":
+            kind, size, error = Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), each
+        case "zoom":
+            kind, size, error = Kind.ZOOM, value[0], std[0]
+        case "shear":
+            kind, size, error = Kind.ROLLING_SHUTTER, focal_px * typical, focal_px * each
+        case "shear of each":
+            kind, size, error = Kind.ROLLING_SHUTTER_BY_IMAGE, focal_px * typical, focal_px * each
+        case "prism":
+            kind, (size, error) = Kind.THIN_PRISM, _largest_px(after, value, last.covariance)
+        case _:
+            kind, size, error = Kind.CENTRE_SAGS, width * typical, width * each / np.sqrt(2)
     return {
         "kind": kind,
-        "mend": "images",
-        "value": unit * float(size),
-        "std": unit * float(error),
-        "images": tuple(between),
+        "mend": MENDS.get(kind, "images"),
+        "value": float(size),
+        "std": float(error),
+        "images": changed if fault.kind == "zoom" else (),
     }
+
+
+def _largest_px(
+    after: _State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
+) -> tuple[float, float]:
+    """The displacement by a thin prism where it is largest among the points, and its standard deviation."""
+    by = after.adjusted.given.evidence.problem.prism
+    moved = np.linalg.norm(by @ value, axis=1)
+    k = int(moved.argmax())
+    along = (by[k] @ value / max(float(moved[k]), 1e-12)) @ by[k]
+    return float(moved[k]), float(np.sqrt(along @ covariance @ along))
 
 
 def _freed(kind: str, equations: Alternatives) -> tuple[str, ...]:

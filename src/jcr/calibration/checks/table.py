@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.camera import check_camera
-from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction
+from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction, check_registered
 from jcr.calibration.checks.checked import Checked
 from jcr.calibration.checks.convention import check_convention
 from jcr.calibration.checks.robot import check_robot
@@ -38,6 +38,7 @@ def _fit_was_rejected(case: Case) -> bool:
 
 
 CHECKS = (
+    Check(check_registered),
     Check(check_convention, _fit_was_rejected),
     Check(check_camera, lambda case: case.shows_camera and case.adjusted is not None),
     Check(check_robot, _is_observable),
