@@ -4,6 +4,7 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from jcr.records.assessed import Assessed
 from jcr.records.calibration import (
     COVARIANCE_ORDER,
     AngleRatio,
@@ -70,6 +71,7 @@ from jcr.records.reconstruction import (
 
 __all__ = [
     "AngleRatio",
+    "Assessed",
     "Attempt",
     "BOTH",
     "Budget",
