@@ -69,6 +69,7 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
     Kind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},
     Kind.SECOND_ON_ARM: {"details": {"arm": "right"}},
+    Kind.ONE_GRIPPER_POSE: {"images": ("a.png",)},
     Kind.NOT_FIXED: {"value": 0.1, "images": ("a.png", "b.png"), "details": SIZE},
     Kind.NOT_RIGID: {"value": 0.1, "details": {"camera": "wrist"}},
     Kind.IMAGE_MISSES: {"value": 9.0, "images": ("a.png",), "details": {"mount": "base"}},

@@ -39,7 +39,7 @@ def adjust_wrist(
     prior = prior_of(intrinsics, HELD) if prior is None else prior
     freedom = Freedom.of((intrinsics,), (prior,), len(each))
     if combinations is not None:
-        freedom = freed(freedom, combinations, intrinsics)
+        freedom = freed(freedom, combinations, each)
     arm = ArmPoses(
         rigs=each,
         base_from_gripper=base_from_gripper,

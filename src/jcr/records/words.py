@@ -477,6 +477,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.FEW_POINTS_SHARED: "{images[0]} shares {value:.0f} points with the mapped scene, too few",
     Kind.FEW_LOCALISED: "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
     Kind.NO_COMMON_POSE: "none of its images was taken with an image that is used",
+    Kind.ONE_GRIPPER_POSE: (
+        "its images show one gripper pose only: whether it is on the gripper, and at which frame each image was taken, "
+        "cannot be tested"
+    ),
     Kind.SECOND_ON_ARM: "a second camera on arm {arm}: one each is supported",
     Kind.NOT_FIXED: (
         "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not fixed"
@@ -485,6 +489,7 @@ _TEXT: dict[Kind, Words] = {
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not rigid, or "
         "the images are not of the frames that they stand for"
     ),
+    Kind.FAR_FROM_GRIPPER: "it is {value:.2f} m from the gripper's frame",
     Kind.IMAGE_MISSES: _misses,
     Kind.PLACE_UNCERTAIN: _place_uncertain,
     Kind.AT_ANOTHER_CAMERA: (
@@ -532,6 +537,8 @@ _REMEDY: dict[Kind, Words] = {
     Kind.EARLIER_VERSION: _given_remedy,
     Kind.FEW_POINTS_SHARED: "it must see the same scene, unchanged, from a direction not too different",
     Kind.FEW_LOCALISED: "add images of the mapped scene",
+    Kind.ONE_GRIPPER_POSE: ("add an image at another gripper pose, or write mount base for a fixed camera"),
+    Kind.FAR_FROM_GRIPPER: "check that it is on the gripper, and that the images are of the frames that they stand for",
     Kind.NOT_FIXED: "of a camera on the gripper write mount gripper, of several cameras give each its own name",
     Kind.PLACE_UNCERTAIN: _to_place,
     Kind.POINTS_CROWDED: "more of the scene in view would help",
