@@ -63,6 +63,7 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.WRONG_MOUNT: {"details": {"camera": "overhead"}},
     Kind.SYSTEMATIC_ERRORS: {"value": 0.01, "p": 1e-9, "details": SIZE},
     Kind.JOINT_OFFSETS: {"joints": (2,), "p": 1e-9, "details": {"joint_2": 0.01, "joint_2_std": 0.001}},
+    Kind.LENGTHS: {"value": 0.02, "std": 0.002, "p": 1e-9, "details": AT | {"frame": "base"}},
     Kind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
     Kind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
     Kind.OWN_REJECTED: {"details": {"camera": "wrist"}},

@@ -26,13 +26,15 @@ def adjust_wrist(
     systematic: Float[ndarray, "s s"] | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
     exchanged: bool = False,
+    bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
     """Images and robot adjusted from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
     `noise` is the robot's (m, rad), at least; it is estimated with the rest. `prior` is what is known of the
     intrinsics; None: that they are exact. `systematic` is the covariance of the systematic errors of the gripper poses
     at 1 rad; None: that of errors smooth over the poses. `combinations` of the columns of score_test.Alternatives are
-    free too. `exchanged`: the camera stands still, and the arm carries what it sees.
+    free too. `exchanged`: the camera stands still, and the arm carries what it sees. `bent` are
+    errors that were found of the gripper poses (handeye/bent.py), of one standard deviation each.
     """
     x, scale, z = start
     each = np.arange(len(base_from_gripper))
@@ -46,6 +48,7 @@ def adjust_wrist(
         systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
         start=(x, z),
         exchanged=exchanged,
+        bent=bent,
     )
     return adjust(
         Scene(

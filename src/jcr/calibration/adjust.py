@@ -61,6 +61,7 @@ def adjust_case(
     prior: IntrinsicsPrior | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
     exchanged: bool = False,
+    bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
     """The used images and gripper poses of a case adjusted from its fit to poses.
 
@@ -78,6 +79,7 @@ def adjust_case(
         systematic=case.systematic,
         combinations=combinations,
         exchanged=exchanged,
+        bent=bent,
     )
 
 

@@ -11,7 +11,7 @@ from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.handeye.equation import ASSUMED_NOISE, expected_covariance, point_ahead, pose_information
 from jcr.handeye.next_poses import looked_at, next_poses
 from jcr.handeye.observability import excitation
-from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement
+from jcr.records import BENT, Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -47,8 +47,8 @@ def advised(
         metres, radians = hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation
         at_least = max(metres, ASSUMED_NOISE[0]), max(radians, ASSUMED_NOISE[1])
         _, proposed = next_poses(used, PROPOSED, noise=at_least, distance_m=1e-3 * required.distance_mm)
-        by_lens = np.sqrt(np.diag(_by_intrinsics(hand_eye)))
-        proposed = [replace(pose, expected_std=np.hypot(pose.expected_std, by_lens)) for pose in proposed]
+        lasting = np.sqrt(np.diag(_by_lasting_faults(hand_eye)))
+        proposed = [replace(pose, expected_std=np.hypot(pose.expected_std, lasting)) for pose in proposed]
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
@@ -110,11 +110,12 @@ def _worthwhile(
     """How many poses would reach what is required, and those poses, which shrink the reported uncertainty most.
 
     Errors shrink by the share by which the expected ones of the poses alone do: images, intrinsics and correlated errors
-    make the two differ. No views make up for given intrinsics that are wrong, nor for systematic errors of the robot
-    where they are most of it; a smaller part may be that their size is hardly known, and more views tell it.
+    make the two differ. No views make up for given intrinsics that are wrong, for a robot that is bent, or for errors
+    of it that are systematic where they are most; a smaller part may be that their size is hardly known, and more views
+    tell it.
     """
     x, noise = hand_eye.gripper_from_camera, (hand_eye.robot_noise.translation, hand_eye.robot_noise.rotation)
-    stays = _by_intrinsics(hand_eye)
+    stays = _by_lasting_faults(hand_eye)
     systematic = None if hand_eye.budget is None else hand_eye.budget.robot_systematic
     if systematic is not None and 2 * np.trace(systematic[:3, :3]) > np.trace(hand_eye.covariance[:3, :3]):
         stays = stays + systematic
@@ -152,8 +153,7 @@ def _shrunk(now: float, stays: float, expected: Float[ndarray, "k n n"]) -> Floa
     return np.sqrt(stays**2 + (now**2 - stays**2) * variance[1:] / variance[0])
 
 
-def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
-    """What wrong intrinsics add to the covariance."""
-    return sum(
-        (one.covariance for one in hand_eye.findings if one.mend == "intrinsics"), start=np.zeros((7, 7))
-    )
+def _by_lasting_faults(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
+    """What wrong intrinsics and a bent robot add to the covariance."""
+    lasting = (one for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT)
+    return sum((one.covariance for one in lasting), start=np.zeros((7, 7)))

@@ -37,11 +37,13 @@ from jcr.cell.localise import (
     spread,
 )
 from jcr.geometry import inverse, motion_length, scale_translation, step_between
+from jcr.handeye.bent import bends
 from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.records import (
+    BENT,
     Capture,
     CellCamera,
     Finding,
@@ -359,9 +361,12 @@ class _Rigs:
         """The arms, the capture's own first."""
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
+        poses = self._capture.base_from_gripper[self._rows]
+        bent = [one.kind for one in hand_eye.findings if one.kind in BENT]
         first = ArmPoses(
             rigs=np.arange(len(self._rows)),
-            base_from_gripper=self._capture.base_from_gripper[self._rows],
+            base_from_gripper=poses,
+            bent=bends(bent, poses) if bent else None,
             systematic=robot.systematic,
             start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
         )

@@ -47,6 +47,7 @@ from jcr.records.capture import (
 )
 from jcr.records.cloud import PointCloud
 from jcr.records.findings import (
+    BENT,
     CAMERA,
     CAUSES,
     Finding,
@@ -73,6 +74,7 @@ __all__ = [
     "AngleRatio",
     "Assessed",
     "Attempt",
+    "BENT",
     "BOTH",
     "Budget",
     "CAMERA",

@@ -43,6 +43,9 @@ class Kind(StrEnum):
     ROBOT_UNUSED = "robot not used"
     SYSTEMATIC_ERRORS = "systematic robot errors"
     JOINT_OFFSETS = "joint offsets"
+    LENGTHS = "robot lengths differ by direction"
+    BASE_LEANS = "robot base leans with reach"
+    TOOL_SAGS = "tool sags"
     ANGLE_RATIO = "camera and gripper angles differ"
     BOARD_SIZE = "board size contradicts the robot"
     NETWORK_SCALE = "a network's metre contradicts the robot"
@@ -123,16 +126,22 @@ CAMERA = frozenset(
     }
 )
 """Kinds that say that the camera is not one with these intrinsics."""
-CAUSES = CAMERA | {
-    Kind.BOARD_SIZE,
-    Kind.SLIP,
-    Kind.DRIFT,
-    Kind.DELAY,
-    Kind.POSE_CONVENTION,
-    Kind.WRONG_MOUNT,
-    Kind.STATIC_IMAGES,
-    Kind.POSES_SWAPPED,
-}
+BENT = frozenset({Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+"""Kinds that say that the robot's poses are bent by where the gripper is."""
+CAUSES = (
+    CAMERA
+    | BENT
+    | {
+        Kind.BOARD_SIZE,
+        Kind.SLIP,
+        Kind.DRIFT,
+        Kind.DELAY,
+        Kind.POSE_CONVENTION,
+        Kind.WRONG_MOUNT,
+        Kind.STATIC_IMAGES,
+        Kind.POSES_SWAPPED,
+    }
+)
 """Kinds that explain others: what is uncertain, or does not fit, is so because of them."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 

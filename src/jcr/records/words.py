@@ -344,6 +344,28 @@ def _joints_off(finding: Finding) -> str:
     return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
 
 
+def _lengths(finding: Finding) -> str:
+    value, std = _value_and_std(finding)
+    size = f"{100 * abs(value):.1f} ± {significant(100 * std)} % too {'long' if value > 0 else 'short'}"
+    return (
+        f"along {_of_axis(finding)['axis']} the robot's positions are {size} beside those across it "
+        f"({_said('{chance}', finding)})"
+    )
+
+
+def _leans(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    which = "leans towards the gripper" if size > 0 else "leans away from the gripper"
+    by = f"{abs(size):.1f} ± {significant(std)}° per metre of reach"
+    return f"the robot's base {which} by {by}, which its poses do not say ({_said('{chance}', finding)})"
+
+
+def _sags(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    by = f"{size:.2f} ± {significant(std)}° where it is level"
+    return f"what the gripper carries rotates under its weight by {by} ({_said('{chance}', finding)})"
+
+
 def _angles_differ(finding: Finding) -> str:
     ratio, std = _value_and_std(finding)
     off, more = ratio - 1, "more" if ratio > 1 else "less"
@@ -457,6 +479,9 @@ _TEXT: dict[Kind, Words] = {
         "offsets or link errors"
     ),
     Kind.JOINT_OFFSETS: _joints_off,
+    Kind.LENGTHS: _lengths,
+    Kind.BASE_LEANS: _leans,
+    Kind.TOOL_SAGS: _sags,
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
@@ -524,6 +549,9 @@ _REMEDY: dict[Kind, Words] = {
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
     Kind.DELAY: "stop the arm at each image, or read pose and image by the same clock",
     Kind.WRONG_MOUNT: "write mount gripper for {camera}",
+    Kind.LENGTHS: "check that axis (a lift, a rail, a gantry): its gear ratio, its unit",
+    Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
+    Kind.TOOL_SAGS: "stiffen its mount, or lighten it",
     Kind.BOARD_SIZE: _to_size,
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",
