@@ -72,7 +72,7 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     ),
     "tool sags": (
         Faults(sag=0.02),
-        r"rotates under its weight by ([\d.]+) ± \S+° where it is level",
+        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as a tool",
         [np.degrees(0.02)],
         0.1,
     ),

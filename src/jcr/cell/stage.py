@@ -62,6 +62,9 @@ MEDIAN_PX = 3.0
 """Images of a camera that miss by more, of one 1600 px wide, do not fit one place."""
 FAR_FROM_GRIPPER = 0.5
 """m: the camera of a gripper that is farther from its frame is likely to be another's."""
+SURE_OF_INTRINSICS = 3.5
+"""Standard deviations from which a further camera's images are said to contradict its intrinsics: one image of 127
+points showed those of another camera, 3.5 % too long, by 4.4."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 EXACT = 1e-6
@@ -499,7 +502,8 @@ def _examined(
 ) -> tuple[Adjusted, list[tuple[Finding, ...]]]:
     """All images adjusted, and what those of each camera show against it (calibration/checks/camera.py).
 
-    Where they contradict intrinsics that were given, the images are adjusted as if none had been.
+    Where they contradict intrinsics that were given, or leave doubt of them, the images are adjusted as if none had
+    been: of one image the given ones would weigh more than what it shows, and the answer be wrong by many sigmas.
     """
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
     for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
@@ -508,7 +512,7 @@ def _examined(
         faults = camera_faults(imaged)
         contradiction = None
         if is_given and all(one.kind is Kind.INTRINSICS for one in faults):
-            contradiction = contradicted_by(imaged)
+            contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
         if contradiction is not None:
             answer, contradicted = contradiction
             images = images.with_freed(prior_of(imaged.start, ESTIMATED), c)

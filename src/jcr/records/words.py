@@ -363,7 +363,7 @@ def _leans(finding: Finding) -> str:
 def _sags(finding: Finding) -> str:
     size, std = (np.degrees(number) for number in _value_and_std(finding))
     by = f"{size:.2f} ± {significant(std)}° where it is level"
-    return f"what the gripper carries rotates under its weight by {by} ({_said('{chance}', finding)})"
+    return f"the gripper rotates by {by}, as a tool does that sags under its weight ({_said('{chance}', finding)})"
 
 
 def _angles_differ(finding: Finding) -> str:
@@ -551,7 +551,7 @@ _REMEDY: dict[Kind, Words] = {
     Kind.WRONG_MOUNT: "write mount gripper for {camera}",
     Kind.LENGTHS: "check that axis (a lift, a rail, a gantry): its gear ratio, its unit",
     Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
-    Kind.TOOL_SAGS: "stiffen its mount, or lighten it",
+    Kind.TOOL_SAGS: "stiffen its mount, and check the zero of the wrist's joints, which looks like it",
     Kind.BOARD_SIZE: _to_size,
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",

@@ -26,6 +26,8 @@ from jcr.records import Estimate, Finding, Kind
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
 true intrinsics, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
+DOUBT = 2.0, 0.5
+"""Standard deviations and share of what matters that leave doubt."""
 OFF = 0.01
 """Relative. Intrinsics stored with real captures are up to 1.2 % from those of a board (jcr docs results/real)."""
 OFF_CENTRE = ESTIMATED["cx"]
@@ -42,7 +44,7 @@ def intrinsics_contradiction(case: Case) -> Checked:
     """
     held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
     contradiction = contradicted_by(of_case(case))
-    if contradiction is None:
+    if contradiction is None or contradiction[1].severity == "informs":
         return Checked()
     freed, contradicted = contradiction
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
@@ -60,20 +62,22 @@ def intrinsics_contradiction(case: Case) -> Checked:
     return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
 
 
-def contradicted_by(imaged: Imaged) -> tuple[Adjusted, Finding] | None:
-    """The images adjusted as if no intrinsics had been given for one camera, and that they contradict those that were;
-    None where they do not.
+def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Finding] | None:
+    """The images adjusted as if no intrinsics had been given for one camera, and what they show against those that were;
+    None where that is nothing. A finding of less than `sure` standard deviations only informs: it leaves doubt.
 
     Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt, or the
     camera is rejected, are the intrinsics adjusted until they settle.
     """
-    if imaged.std.any() and not _found_off(imaged, imaged.adjusted, SURE / 2, 0.5):
+    if imaged.std.any() and not _found_off(imaged, imaged.adjusted, *DOUBT):
         return None
     freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None)
-    found = _found_off(imaged, freed, SURE, 1.0)
+    surely = _found_off(imaged, freed, sure, 1.0)
+    found = surely or _found_off(imaged, freed, *DOUBT)
     if not found:
         return None
-    return freed, Finding(kind=Kind.INTRINSICS, severity="warns", mend="intrinsics", details=found)
+    severity = "warns" if surely else "informs"
+    return freed, Finding(kind=Kind.INTRINSICS, severity=severity, mend="intrinsics", details=found)
 
 
 def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
