@@ -224,6 +224,17 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
 
 
 @pytest.mark.slow
+def test_exact_intrinsics_are_kept_for_a_camera_that_is_held_against_itself(tabletop: Path, calibrated):
+    old, reconstruction, hand_eye = calibrated
+    capture = jcr.read_capture(tabletop)
+    assert capture.intrinsics is not None
+    given = replace(capture.intrinsics, fx=1.02 * capture.intrinsics.fx, fy=1.02 * capture.intrinsics.fy)
+    exact = replace(fixed(capture, capture.images[11]), intrinsics=given, intrinsics_std=np.zeros(9))
+    (camera,) = place_cameras(old, [exact], reconstruction, hand_eye).cameras
+    assert camera.findings == () and camera.intrinsics == given
+
+
+@pytest.mark.slow
 def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses(calibrated):
     """One image fits any frame: that of another was 0.35 m and 64° off, accepted with 0.2 mm."""
     old, reconstruction, hand_eye = calibrated

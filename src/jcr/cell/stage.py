@@ -507,6 +507,9 @@ def _examined(
     """
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
     for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
+        if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is held against itself
+            found.append(())
+            continue
         is_given = member.camera.intrinsics is not None
         imaged = _imaged(images, answer, _found(member, c, answer, place, hand_eye), c, place, is_given)
         faults = camera_faults(imaged)
