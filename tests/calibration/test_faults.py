@@ -2,19 +2,25 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
+from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.faults import LENS, Faults, faulty_capture
+from benchmarks.simulated.observations import LENS as OBSERVED_BY
+from benchmarks.simulated.observations import observed
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.carried import exchanged, refined
 from jcr.geometry import inverse, retract, step_between
-from jcr.records import Kind
+from jcr.handeye.arms import RobotName, arm_named
+from jcr.records import BENT, Capture, Kind, Reconstruction
 from jcr.records.words import sentence
+from jcr.simulate.robots import PresetName
 
 pytestmark = pytest.mark.slow
 
@@ -64,6 +70,24 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         [30.0, 0.0],
         1.0,
     ),
+    "lift too long": (
+        Faults(lengths=(0.0, 0.0, 0.02)),
+        r"along the base's z axis the robot's positions are ([\d.]+) ± \S+ % too long",
+        [2.0],
+        0.5,  # ± 0.2
+    ),
+    "stand leans": (
+        Faults(tilt_by_reach=float(np.radians(4))),
+        r"the robot's base leans towards the gripper by ([\d.]+) ± \S+° per metre of reach",
+        [4.0],
+        0.3,
+    ),
+    "tool sags": (
+        Faults(sag=0.02),
+        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as a tool",
+        [np.degrees(0.02)],
+        0.1,
+    ),
     "delay": (
         Faults(delay_s=0.1, view_s=4.0),
         r"as if read ([\d.]+) ± \S+ of the time from one image to the next too late",
@@ -101,6 +125,22 @@ def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
     for seed in range(3):
         _, hand_eye = calibrated(Faults(), seed, (8, 12, 16)[seed], estimated)
         assert hand_eye.warnings == ()
+
+
+@pytest.mark.parametrize(("arm", "preset"), [("ur5e", "typical"), ("panda", "low-cost")])
+def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotName, preset: PresetName):
+    problem = bent_problem(arm_named(arm), preset, 12, 2)
+    capture = Capture(
+        Path("."), tuple(f"{k}.png" for k in range(12)), problem.base_from_gripper, (640, 480), OBSERVED_BY
+    )
+    reconstruction = Reconstruction(
+        image_index=np.arange(12),
+        recon_from_camera=problem.recon_from_camera,
+        intrinsics=OBSERVED_BY,
+        tracks=observed(problem, np.random.default_rng(2), 300, 0.4),
+        backend="simulated",
+    )
+    assert not BENT & {one.kind for one in calibrate(capture, reconstruction).findings}
 
 
 def test_a_focus_that_varies_is_modelled():

@@ -4,6 +4,7 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from jcr.records.assessed import Assessed
 from jcr.records.calibration import (
     COVARIANCE_ORDER,
     AngleRatio,
@@ -46,6 +47,7 @@ from jcr.records.capture import (
 )
 from jcr.records.cloud import PointCloud
 from jcr.records.findings import (
+    BENT,
     CAMERA,
     CAUSES,
     LASTING,
@@ -73,7 +75,9 @@ from jcr.records.reconstruction import (
 
 __all__ = [
     "AngleRatio",
+    "Assessed",
     "Attempt",
+    "BENT",
     "BOTH",
     "Budget",
     "CAMERA",

@@ -45,6 +45,9 @@ class Kind(StrEnum):
     ROBOT_UNUSED = "robot not used"
     SYSTEMATIC_ERRORS = "systematic robot errors"
     JOINT_OFFSETS = "joint offsets"
+    LENGTHS = "robot lengths differ by direction"
+    BASE_LEANS = "robot base leans with reach"
+    TOOL_SAGS = "tool sags"
     ANGLE_RATIO = "camera and gripper angles differ"
     BOARD_SIZE = "board size contradicts the robot"
     NETWORK_SCALE = "a network's metre contradicts the robot"
@@ -59,9 +62,11 @@ class Kind(StrEnum):
     FEW_POINTS_SHARED = "few points shared with the scene"
     FEW_LOCALISED = "few images localised"
     NO_COMMON_POSE = "no image taken with one that is used"
+    ONE_GRIPPER_POSE = "camera seen at one gripper pose"
     SECOND_ON_ARM = "second camera on another arm"
     NOT_FIXED = "camera not fixed"
     NOT_RIGID = "camera not rigid on the gripper"
+    FAR_FROM_GRIPPER = "camera far from the gripper"
     IMAGE_MISSES = "image contradicts the camera's place"
     PLACE_UNCERTAIN = "camera's place too uncertain"
     AT_ANOTHER_CAMERA = "camera stands where another was"
@@ -130,17 +135,23 @@ CAMERA = frozenset(
     }
 )
 """Kinds that say that the camera is not one with these intrinsics."""
-LASTING = CAMERA | {
-    Kind.BOARD_SIZE,
-    Kind.SLIP,
-    Kind.DRIFT,
-    Kind.DELAY,
-    Kind.POSE_CONVENTION,
-    Kind.WRONG_MOUNT,
-    Kind.STATIC_IMAGES,
-    Kind.BLURRED,
-    Kind.POSES_SWAPPED,
-}
+BENT = frozenset({Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+"""Kinds that say that the robot's poses are bent by where the gripper is."""
+LASTING = (
+    CAMERA
+    | BENT
+    | {
+        Kind.BOARD_SIZE,
+        Kind.SLIP,
+        Kind.DRIFT,
+        Kind.DELAY,
+        Kind.POSE_CONVENTION,
+        Kind.WRONG_MOUNT,
+        Kind.STATIC_IMAGES,
+        Kind.BLURRED,
+        Kind.POSES_SWAPPED,
+    }
+)
 """Kinds about camera, robot, mount and order: they hold for every reconstruction of the same images."""
 CAUSES = LASTING | {Kind.FEW_USED}
 """Kinds that explain others: what is uncertain, or does not fit, is so because of them."""

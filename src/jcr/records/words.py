@@ -355,6 +355,28 @@ def _joints_off(finding: Finding) -> str:
     return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
 
 
+def _lengths(finding: Finding) -> str:
+    value, std = _value_and_std(finding)
+    size = f"{100 * abs(value):.1f} ± {significant(100 * std)} % too {'long' if value > 0 else 'short'}"
+    return (
+        f"along {_of_axis(finding)['axis']} the robot's positions are {size} beside those across it "
+        f"({_said('{chance}', finding)})"
+    )
+
+
+def _leans(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    which = "leans towards the gripper" if size > 0 else "leans away from the gripper"
+    by = f"{abs(size):.1f} ± {significant(std)}° per metre of reach"
+    return f"the robot's base {which} by {by}, which its poses do not say ({_said('{chance}', finding)})"
+
+
+def _sags(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    by = f"{size:.2f} ± {significant(std)}° where it is level"
+    return f"the gripper rotates by {by}, as a tool does that sags under its weight ({_said('{chance}', finding)})"
+
+
 def _angles_differ(finding: Finding) -> str:
     ratio, std = _value_and_std(finding)
     off, more = ratio - 1, "more" if ratio > 1 else "less"
@@ -476,6 +498,9 @@ _TEXT: dict[Kind, Words] = {
         "offsets or link errors"
     ),
     Kind.JOINT_OFFSETS: _joints_off,
+    Kind.LENGTHS: _lengths,
+    Kind.BASE_LEANS: _leans,
+    Kind.TOOL_SAGS: _sags,
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
@@ -496,6 +521,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.FEW_POINTS_SHARED: "{images[0]} shares {value:.0f} points with the mapped scene, too few",
     Kind.FEW_LOCALISED: "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
     Kind.NO_COMMON_POSE: "none of its images was taken with an image that is used",
+    Kind.ONE_GRIPPER_POSE: (
+        "its images show one gripper pose only: whether it is on the gripper, and at which frame each image was taken, "
+        "cannot be tested"
+    ),
     Kind.SECOND_ON_ARM: "a second camera on arm {arm}: one each is supported",
     Kind.NOT_FIXED: (
         "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not fixed"
@@ -504,6 +533,7 @@ _TEXT: dict[Kind, Words] = {
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not rigid, or "
         "the images are not of the frames that they stand for"
     ),
+    Kind.FAR_FROM_GRIPPER: "it is {value:.2f} m from the gripper's frame",
     Kind.IMAGE_MISSES: _misses,
     Kind.PLACE_UNCERTAIN: _place_uncertain,
     Kind.AT_ANOTHER_CAMERA: (
@@ -546,6 +576,9 @@ _REMEDY: dict[Kind, Words] = {
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
     Kind.DELAY: "stop the arm at each image, or read pose and image by the same clock",
     Kind.WRONG_MOUNT: "write mount gripper for {camera}",
+    Kind.LENGTHS: "check that axis (a lift, a rail, a gantry): its gear ratio, its unit",
+    Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
+    Kind.TOOL_SAGS: "stiffen its mount, and check the zero of the wrist's joints, which looks like it",
     Kind.BOARD_SIZE: _to_size,
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",
@@ -559,6 +592,8 @@ _REMEDY: dict[Kind, Words] = {
     Kind.EARLIER_VERSION: _given_remedy,
     Kind.FEW_POINTS_SHARED: "it must see the same scene, unchanged, from a direction not too different",
     Kind.FEW_LOCALISED: "add images of the mapped scene",
+    Kind.ONE_GRIPPER_POSE: ("add an image at another gripper pose, or write mount base for a fixed camera"),
+    Kind.FAR_FROM_GRIPPER: "check that it is on the gripper, and that the images are of the frames that they stand for",
     Kind.NOT_FIXED: "of a camera on the gripper write mount gripper, of several cameras give each its own name",
     Kind.PLACE_UNCERTAIN: _to_place,
     Kind.POINTS_CROWDED: "more of the scene in view would help",
