@@ -152,6 +152,17 @@ BENCHES = {
         measures=(*SOLVER, "benchmarks/simulated"),
         long="three times as many draws of everything",
     ),
+    "attack_images": Bench(
+        "images with one fault through jcr calibrate: named, rejected, or wrong; and false alarms",
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/simulate",
+            "benchmarks/simulated",
+        ),
+        long="ten draws of every fault instead of two, and ten times as many captures with nothing wrong",
+    ),
     "table2": Bench(
         "heights of objects in simulated scenes, from 8 and 10 images",
         measures=(*SOLVER, *FEATURES, *DEPTH, "src/jcr/segment", "src/jcr/simulate"),
