@@ -161,7 +161,7 @@ BENCHES = {
             "src/jcr/simulate",
             "benchmarks/simulated",
         ),
-        long="ten draws of every fault instead of one, and 200 captures with nothing wrong instead of 10",
+        long="ten draws of every fault instead of one, and 200 captures with nothing wrong instead of 5",
     ),
     "table2": Bench(
         "heights of objects in simulated scenes, from 8 and 10 images",

@@ -29,7 +29,7 @@ from jcr.results import RunResult
 SCENES = 5
 SEEDS, LONG_SEEDS = range(1, 2), range(1, 11)
 """The first is of an arm with systematic errors."""
-CLEAN, LONG_CLEAN = 10, 200
+CLEAN, LONG_CLEAN = 5, 200
 CLEAN_SIZES = (0.5, 1.0, 2.0)
 """Of the random errors of poses, in those of the arm; intrinsics are given in every other clean capture."""
 SIGMAS = 3.0
