@@ -85,7 +85,7 @@ def test_a_row_counts_silence_apart_from_what_is_said_or_within_its_sigma():
     case = Case("a zoom", Fault(make.zoomed(1.1)), frozenset({Kind.ZOOM}))
     text = page({case: [within, silent, jointly, warned, rejected]}, [within, warned])
     assert "| a zoom | 5 | 2 | focal length changed once 2 | 1 | 1 | 1 | **2** |" in text
-    assert "2 silently wrong; of 2 captures with nothing wrong 1 are called faulty" in text
+    assert "2 silently wrong (a zoom); of 2 captures with nothing wrong 1 are called faulty" in text
     # A wrong image that takes no part is as good as named.
     alone = Case("one pose", Fault(wrong=(3,)))
     assert replace(within, left_out=frozenset({3})).is_named(alone) and not within.is_named(alone)
