@@ -241,7 +241,8 @@ def page(rows: dict[Case, list[Outcome]], clean: Sequence[Outcome]) -> str:
         f"> Captures of images with one fault, {len(every)} through `jcr calibrate`: "
         f"{sum(not one.accepted for one in every)} are rejected, {sum(one.is_within for one in every)} accepted and "
         f"within 3 σ, {sum(one.accepted and not one.is_within and bool(one.kinds) for one in every)} accepted with a "
-        f"warning and farther off, {silent} silently wrong{f' ({of_cases})' if silent else ''}; of {len(clean)} captures with nothing wrong {len(alarms)} "
+        f"warning and farther off, {silent} silently wrong{f' ({of_cases})' if silent else ''}; "
+        f"of {len(clean)} captures with nothing wrong {len(alarms)} "
         "are called faulty.",
         "",
         f"{IMAGES} images of 640x480 of {SCENES} rendered scenes, JPEG, with noise; robot pose noise 0.3 mm and 0.06° "
