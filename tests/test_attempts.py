@@ -51,9 +51,10 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return names
 
 
-def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
+def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
     lens = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
-    tracks = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    n = observations
+    tracks = Tracks(np.zeros(n, int), np.zeros((n, 2)), np.arange(n), np.zeros((n, 3)))
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
@@ -89,7 +90,10 @@ def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.Monke
 
 
 def auto_result(
-    problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
+    problem: HandEyeProblem,
+    answers: dict[str, np.ndarray | Exception],
+    monkeypatch: pytest.MonkeyPatch,
+    observations: int = 0,
 ) -> tuple[Reconstruction, list[str]]:
     """What auto keeps where each back end, or features, give these camera poses or this error; which ones it ran."""
     tried = []
@@ -99,7 +103,7 @@ def auto_result(
         answer = answers[options.backend if options.features == "auto" else options.features]
         if isinstance(answer, Exception):
             raise answer
-        return reconstruction(options.backend, answer)
+        return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(attempts, "reconstruct", answered)
     choice = attempts.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
@@ -267,6 +271,30 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     refused = NotTrustedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
     assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
+
+
+def test_what_plenty_of_features_reject_colours_do_not_accept(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Direct alignment tests no camera: a stronger fault, which features reject, would get the less honest answer."""
+    present |= {"xfeat", "da3"}
+    monkeypatch.setattr(attempts, "TEXTURED", 10)
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good = problem.recon_from_camera
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    answers = {"sift": shuffled, "xfeat": shuffled, "da3": good, "direct": good}
+    kept, tried = auto_result(problem, answers, monkeypatch, observations=80)
+    assert tried == ["colmap", "colmap"] and kept.backend == "colmap"
+    assert kept.notes[0].startswith("da3 was not tried: it is for scenes without features")
+    _, tried = auto_result(problem, answers, monkeypatch, observations=79)
+    assert tried == ["colmap", "colmap", "da3"]
+    # A scene full of features that agree on nothing is none without features; one of too few of them is.
+    lost = NotTrustedError("0 of 8 images registered", despite_texture=True)
+    with pytest.raises(NotTrustedError, match="0 of 8.*da3 was not tried"):
+        auto_result(problem, answers | {"sift": lost, "xfeat": lost}, monkeypatch)
+    few = NotTrustedError("0 of 8 images registered").with_more("too little texture")
+    _, tried = auto_result(problem, answers | {"sift": few, "xfeat": lost}, monkeypatch)
+    assert tried == ["colmap", "colmap", "da3"]
 
 
 def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(

@@ -97,7 +97,7 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     first = round(faults.slip_after * images)
     mounted = np.stack([x if k < first else slipped for k in range(images)])
     cameras = true @ mounted
-    reported = _late(true, faults) if faults.delay_s else true
+    reported = late(true, faults.delay_s, faults.view_s) if faults.delay_s else true
     reported = disturbed(_bent(reported, faults), faults.robot_noise, rng)
     reported[:, :3, 3] *= faults.pose_scale
     points = rng.uniform(LOW, HIGH, (POINTS, 3))
@@ -160,10 +160,10 @@ def apply_all(a_from_b: Float[ndarray, "n 4 4"], x_in_b: Float[ndarray, "p 3"]) 
     return x_in_b @ np.swapaxes(a_from_b[:, :3, :3], 1, 2) + a_from_b[:, None, :3, 3]
 
 
-def _late(true: Float[ndarray, "n 4 4"], faults: Faults) -> Float[ndarray, "n 4 4"]:
-    """Poses of an arm that moves through these without a stop, a little later."""
-    at = faults.view_s * np.arange(len(true))
-    later = at + faults.delay_s
+def late(true: Float[ndarray, "n 4 4"], delay_s: float, view_s: float) -> Float[ndarray, "n 4 4"]:
+    """Poses of an arm that moves through these without a stop, one every `view_s`, `delay_s` later."""
+    at = view_s * np.arange(len(true))
+    later = at + delay_s
     position = CubicSpline(at, true[:, :3, 3])(later)
     rotation = RotationSpline(at, Rotation.from_matrix(true[:, :3, :3]))(later)
     return transform(rotation.as_matrix(), position)

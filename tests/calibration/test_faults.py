@@ -12,12 +12,16 @@ from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.faults import LENS, Faults, faulty_capture
 from benchmarks.simulated.observations import LENS as OBSERVED_BY
 from benchmarks.simulated.observations import observed
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.carried import exchanged, refined
 from jcr.geometry import inverse, retract, step_between
 from jcr.handeye.arms import RobotName, arm_named
+from jcr.handeye.solve import solve_hand_eye
+from jcr.handeye.systematic import systematic_errors
 from jcr.records import BENT, Capture, Kind, Reconstruction
 from jcr.records.words import sentence
 from jcr.simulate.robots import PresetName
@@ -165,6 +169,19 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert np.trace(hand_eye.budget.faults) > 0
     error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
+
+
+@pytest.mark.parametrize("mm", [3.0, 30.0, 100.0])
+def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large(mm: float):
+    """The fit takes it for noise of all translations, beside which it was lost the more the larger it was."""
+    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
+    gripper = problem.base_from_gripper.copy()
+    gripper[4:, :3, 3] += 1e-3 * mm * gripper[4:, :3, 0]
+    systematic = systematic_errors(gripper)
+    hand_eye = solve_hand_eye(gripper, problem.recon_from_camera, systematic=systematic)
+    found = sequence_fault(hand_eye, gripper, problem.recon_from_camera, list("abcdefgh"), systematic)
+    assert found is not None and found.kind is Kind.SLIP and found.images == ("d", "e")
+    assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)
 
 
 def test_one_wrong_pose_among_right_ones_is_no_slip():
