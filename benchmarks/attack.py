@@ -32,6 +32,9 @@ NAMES = {
     Kind.ROLLING_SHUTTER: "rolling shutter",
     Kind.ROLLING_SHUTTER_BY_IMAGE: "rolling shutter",
     Kind.INTRINSICS: "intrinsics",
+    Kind.LENGTHS: "lengths",
+    Kind.BASE_LEANS: "base leans",
+    Kind.TOOL_SAGS: "tool sags",
     Kind.SLIP: "slip",
     Kind.DRIFT: "drift",
     Kind.DELAY: "delay",
@@ -77,6 +80,11 @@ CASES = (
     ),
     Case("poses read 100 ms late, 3 s from view to view", Faults(delay_s=0.1, view_s=3.0), draws=DRAWS),
     Case("6 s from view to view", Faults(delay_s=0.1, view_s=6.0), draws=DRAWS),
+    Case("positions along z 2 % too long", Faults(lengths=(0.0, 0.0, 0.02))),
+    Case("along z 4 %", Faults(lengths=(0.0, 0.0, 0.04))),
+    Case("along x 2 %", Faults(lengths=(0.02, 0.0, 0.0))),
+    Case("the stand leans by 4° per metre of reach", Faults(tilt_by_reach=float(np.radians(4)))),
+    Case("the tool sags by 1.1° where it is level", Faults(sag=0.02)),
     Case("positions 1 % too long", Faults(pose_scale=1.01)),
     Case("positions 5 % too long", Faults(pose_scale=1.05)),
 )
@@ -136,7 +144,7 @@ def calibrated(
 
 
 def outcome(found: FaultyCapture, hand_eye: HandEye) -> Outcome:
-    """Against the camera's place before a slip or after it, whichever is nearer."""
+    """Against the camera's place before or after a slip, by poses as reported or as they were: whichever is farther."""
     std = np.sqrt(np.diag(hand_eye.covariance)[:6])
     said = frozenset(NAMES[finding.kind] for finding in hand_eye.findings if finding.kind in NAMES)
     steps = [

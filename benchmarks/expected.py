@@ -10,14 +10,16 @@ import numpy as np
 from benchmarks.seen import WAYS, Knowledge
 from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.observations import observed
+from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import of_images
 from jcr.calibration.expected import Expectation, assumed, assumed_of, expected, typical_camera
+from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import errors_of, robot_errors
 from jcr.calibration.seen import within_95
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.check import QUICK, calibrated, check, spread_rows
+from jcr.check import QUICK, check, spread_rows
 from jcr.errors import InputError, NotTrustedError
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
@@ -131,7 +133,8 @@ def _of_draw(seed: int) -> Row | None:
     options = CalibrateOptions()
     robot = robot_errors(capture, options)
     rows = spread_rows(count)
-    case = calibrated(capture, _of_rows(reconstruction, rows), robot.of(rows), None)
+    case = fitted(capture, _of_rows(reconstruction, rows), CalibrateOptions(), robot.of(rows))
+    case = adjusted(case) if case.hand_eye.converged else case
     hand_eye = calibrate(capture, reconstruction, options)
     if not hand_eye.converged or not case.hand_eye.converged:
         return None

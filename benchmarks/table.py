@@ -196,6 +196,19 @@ BENCHES = {
         measures=(*SOLVER, "benchmarks/simulated"),
         long="three times as many draws of everything",
     ),
+    "attack_images": Bench(
+        "Faults from images on",
+        HONEST,
+        "images with one fault through jcr calibrate: named, rejected, or wrong; and false alarms",
+        measures=(
+            *SOLVER,
+            *FEATURES,
+            "src/jcr/reconstruct/direct",
+            "src/jcr/simulate",
+            "benchmarks/simulated",
+        ),
+        long="ten draws of every fault instead of one, and 200 captures with nothing wrong instead of 5",
+    ),
     "table2": Bench(
         "Heights of objects",
         MAPPED,

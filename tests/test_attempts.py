@@ -19,9 +19,10 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_exp, transform
+from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import Backend, ReconstructOptions
-from jcr.records import Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, Pointmaps, Reconstruction, Tracks
 
 GARBAGE = {
     "enc_embed_dim": 32,
@@ -35,8 +36,9 @@ GARBAGE = {
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
-    """The search for other readings of the poses takes seconds and is tested elsewhere."""
+    """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
     monkeypatch.setattr(convention, "better_reading", lambda *_: None)
+    monkeypatch.setattr(attempts, "view_findings", lambda _: ())
 
 
 @pytest.fixture
@@ -49,9 +51,10 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return names
 
 
-def reconstruction(backend: str, poses: np.ndarray) -> Reconstruction:
+def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
     lens = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
-    tracks = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
+    n = observations
+    tracks = Tracks(np.zeros(n, int), np.zeros((n, 2)), np.arange(n), np.zeros((n, 3)))
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
@@ -74,8 +77,23 @@ def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: ob
     return replace(made, pointmaps=pointmaps)
 
 
+def capture_of(problem: HandEyeProblem) -> Capture:
+    names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
+    return Capture(Path(), names, problem.base_from_gripper, (640, 480))
+
+
+def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> HandEye:
+    """What COLMAP's calibration is, of the first images, that have these camera poses."""
+    monkeypatch.setattr(attempts, "reconstruct", lambda *_: reconstruction("colmap", poses))
+    options = ReconstructOptions(backend="colmap")
+    return attempts.choose(capture_of(problem), options, CalibrateOptions()).hand_eye
+
+
 def auto_result(
-    problem: HandEyeProblem, answers: dict[str, np.ndarray | Exception], monkeypatch: pytest.MonkeyPatch
+    problem: HandEyeProblem,
+    answers: dict[str, np.ndarray | Exception],
+    monkeypatch: pytest.MonkeyPatch,
+    observations: int = 0,
 ) -> tuple[Reconstruction, list[str]]:
     """What auto keeps where each back end, or features, give these camera poses or this error; which ones it ran."""
     tried = []
@@ -85,12 +103,10 @@ def auto_result(
         answer = answers[options.backend if options.features == "auto" else options.features]
         if isinstance(answer, Exception):
             raise answer
-        return reconstruction(options.backend, answer)
+        return reconstruction(options.backend, answer, observations)
 
     monkeypatch.setattr(attempts, "reconstruct", answered)
-    names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
-    capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
-    choice = attempts.choose(capture, ReconstructOptions(), CalibrateOptions())
+    choice = attempts.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
     assert [attempt.backend for attempt in choice.attempts] == tried
     kept = [attempt for attempt in choice.attempts if attempt.why_not is None]
     assert [attempt.backend for attempt in kept] == [choice.reconstruction.backend]
@@ -125,6 +141,81 @@ def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
     assert kept.backend == "colmap" and "damaged" in kept.notes[0]
     with pytest.raises(NotTrustedError, match="0 of 8"):
         auto_result(problem, {"mast3r": damaged, "colmap": nothing}, monkeypatch)
+
+
+BLUR = Finding(
+    kind=Kind.BLURRED,
+    severity="warns",
+    mend="images",
+    images=tuple(f"{k:02d}.png" for k in range(6)),
+    value=14.0,
+    details={"of": 8.0},
+)
+
+
+def test_blurred_images_are_the_reason_and_not_what_follows(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
+    monkeypatch.setattr(attempts, "view_findings", lambda _: (BLUR,))
+    nothing = NotTrustedError("0 of 8 images registered (too little texture)", "put a newspaper on the table")
+    with pytest.raises(attempts.NothingFoundError) as caught:
+        auto_result(problem, {"colmap": nothing, "direct": nothing}, monkeypatch)
+    assert str(caught.value).startswith("6 of 8 images are blurred") and "texture" not in str(caught.value)
+    assert [one.kind for one in caught.value.findings[:2]] == [Kind.BLURRED, Kind.NO_RECONSTRUCTION]
+    # Of a calibration that is accepted it is a warning, and of one that uses all images without any, no word.
+    kept = chosen(problem, problem.recon_from_camera[:7], monkeypatch)
+    assert kept.verdict == "accepted with warnings" and kept.findings[0] == BLUR
+    kept = chosen(problem, problem.recon_from_camera, monkeypatch)
+    assert kept.verdict == "accepted" and BLUR not in kept.findings
+
+
+def test_a_camera_at_rest_is_reconstructed_once(present: set[str], monkeypatch: pytest.MonkeyPatch):
+    present.add("xfeat")
+    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
+    still = Finding(kind=Kind.STATIC_IMAGES, severity="rejects", value=0.5, details={"rotation": 1.0})
+    monkeypatch.setattr(attempts, "view_findings", lambda _: (still,))
+    tried = []
+
+    def nothing(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
+        tried.append(options.features)
+        raise NotTrustedError("0 of 8 images registered")
+
+    monkeypatch.setattr(attempts, "reconstruct", nothing)
+    with pytest.raises(attempts.NothingFoundError, match="all images show the same view"):
+        attempts.choose(capture_of(problem), ReconstructOptions(), CalibrateOptions())
+    assert len(tried) == 1
+
+
+def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever its leave-one-out error, which a cause makes large."""
+    present.add("mast3r")
+    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
+    sound = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
+    uncertain = Finding(
+        kind=Kind.UNCERTAIN, severity="rejects", mend="images", value=0.03, details={"part": "translation"}
+    )
+    intrinsics = Finding(
+        kind=Kind.INTRINSICS,
+        severity="rejects",
+        mend="intrinsics",
+        details={"focal": 310.0, "focal_std": 2.0, "focal_given": 465.0},
+    )
+    held_out = sound.held_out
+    assert held_out is not None
+    of_backend = {
+        "mast3r": sound.with_findings(uncertain),
+        "colmap": replace(sound, held_out=replace(held_out, translation_mm=40.0)).with_findings(
+            uncertain, intrinsics
+        ),
+    }
+    monkeypatch.setattr(attempts, "calibrate", lambda _, made, __: of_backend[made.backend])
+    poses = problem.recon_from_camera
+    kept, tried = auto_result(problem, {"mast3r": poses, "colmap": poses}, monkeypatch)
+    assert tried == ["mast3r", "colmap"] and kept.backend == "colmap"
+    assert of_backend["colmap"].doubt is not None and "a focal length of 310" in of_backend["colmap"].doubt
 
 
 @pytest.mark.slow
@@ -180,6 +271,30 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     refused = NotTrustedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
     assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
+
+
+def test_what_plenty_of_features_reject_colours_do_not_accept(
+    present: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Direct alignment tests no camera: a stronger fault, which features reject, would get the less honest answer."""
+    present |= {"xfeat", "da3"}
+    monkeypatch.setattr(attempts, "TEXTURED", 10)
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    good = problem.recon_from_camera
+    shuffled = good[np.random.default_rng(4).permutation(8)]
+    answers = {"sift": shuffled, "xfeat": shuffled, "da3": good, "direct": good}
+    kept, tried = auto_result(problem, answers, monkeypatch, observations=80)
+    assert tried == ["colmap", "colmap"] and kept.backend == "colmap"
+    assert kept.notes[0].startswith("da3 was not tried: it is for scenes without features")
+    _, tried = auto_result(problem, answers, monkeypatch, observations=79)
+    assert tried == ["colmap", "colmap", "da3"]
+    # A scene full of features that agree on nothing is none without features; one of too few of them is.
+    lost = NotTrustedError("0 of 8 images registered", despite_texture=True)
+    with pytest.raises(NotTrustedError, match="0 of 8.*da3 was not tried"):
+        auto_result(problem, answers | {"sift": lost, "xfeat": lost}, monkeypatch)
+    few = NotTrustedError("0 of 8 images registered").with_more("too little texture")
+    _, tried = auto_result(problem, answers | {"sift": few, "xfeat": lost}, monkeypatch)
+    assert tried == ["colmap", "colmap", "da3"]
 
 
 def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(

@@ -1,6 +1,7 @@
 """What `jcr check` names before heavy work: a camera at rest, poses that were exchanged, images that show nothing."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +12,9 @@ import pytest
 
 import jcr
 from benchmarks.simulated.problem import hand_eye_problem
+from conftest import shrunk_capture
 from jcr.calibration.checks.left_out import left_out_poses
-from jcr.capture.images import read_image, show_one_view
+from jcr.capture.images import BLURRED_EDGE, edge_width, read_image, show_one_view
 from jcr.cli import dispatch
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
@@ -44,6 +46,32 @@ def test_no_two_images_of_a_camera_that_moves_show_one_view(tabletop: Path):
     # Nor does a plain wall with noise, which shows no view at all.
     plain = [RNG.normal(120, 4, first.shape).astype(np.uint8) for _ in range(2)]
     assert not show_one_view(*plain)
+
+
+def test_blur_is_measured_by_the_image_itself(tabletop: Path):
+    """Not against the other images, which may all be blurred; a plain wall with noise has no edges to judge by."""
+    sharp = [read_image(tabletop / f"images/{k:02d}.jpg") for k in range(12)]
+    assert max(edge_width(image) for image in sharp) < 0.6 * BLURRED_EDGE
+    along = np.zeros((21, 21), np.float32)
+    along[10] = 1 / 21
+    for blurred in (cv2.GaussianBlur(sharp[0], (0, 0), 5), cv2.filter2D(sharp[0], -1, along)):
+        assert edge_width(np.asarray(blurred, np.uint8)) > BLURRED_EDGE
+    assert edge_width(RNG.normal(120, 4, sharp[0].shape).astype(np.uint8)) == 0.0
+
+
+@pytest.mark.slow
+def test_a_wrong_focal_length_is_named_before_what_follows_from_it(tabletop: Path, tmp_path: Path, capsys):
+    """Half as long again: 303.9 px are true."""
+    folder = shrunk_capture(tabletop, tmp_path / "capture", 8, 320)
+    content = json.loads((folder / "capture.json").read_text())
+    content["intrinsics"] |= {name: 1.5 * content["intrinsics"][name] for name in ("fx", "fy")}
+    (folder / "capture.json").write_text(json.dumps(content))
+    assert dispatch(["check", str(folder)]) == 3
+    said = capsys.readouterr()
+    assert re.search(
+        r"fault: the images show a focal length of 30[345]\.\d ± \S+ px where 456\.0 is given", said.out
+    )
+    assert "expected" not in said.out and "agree" not in said.out and "add images" not in said.out
 
 
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
@@ -88,7 +116,10 @@ def test_exchanged_poses_are_found_where_the_matching_leaves_their_images_out(
         json.dumps({"frames": frames, "intrinsics": content["intrinsics"]})
     )
     assert dispatch(["check", str(tmp_path)]) == 3
-    assert "images/03.jpg and images/08.jpg have each other's gripper pose" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "images/03.jpg and images/08.jpg have each other's gripper pose" in said.err
+    # That the others agree, and what to expect of them, is no answer to a fault.
+    assert "poses and images agree" not in said.out and "expected uncertainty" not in said.out
 
 
 @pytest.mark.slow

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from benchmarks.simulated.problem import TARGET_IN_BASE, disturbed
 from jcr.camera import NO_DISTORTION, parameter_names, parameters, project, with_parameters, zoomed
 from jcr.geometry import apply, inverse, rotation_exp, transform
+from jcr.handeye.known_scale import fit_known_scale
 from jcr.records import Intrinsics, Tracks
 from jcr.simulate.poses import gripper_poses, random_hand_eye
+from jcr.simulate.robots import EFFECTIVE_NOISE, EFFECTIVE_POSES
 
 LENS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
 """What the user believes the camera to be."""
@@ -38,18 +40,33 @@ class Faults:
     """Names of its parameters, and by how much the true one is more than the believed one."""
     rolling_px: float = 0.0
     """By how much the last row is shifted against the first in x."""
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """s1 to s4 of OpenCV's thin prism."""
+    centre_sags_px: float = 0.0
+    """By how much optics on springs move the image when gravity is along it, in x and in y alike."""
     slip: tuple[float, float] = (0.0, 0.0)
     """m, rad about random axes: the camera moves on the gripper."""
     slip_after: float = 0.5
     """Share of the images before it."""
     pose_scale: float = 1.0
     """Of the reported positions."""
+    lengths: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """By which the reported positions are too long along each axis of the base, relative: a lift, a rail, a gantry."""
+    tilt_by_reach: float = 0.0
+    """rad per m: a stand leans towards a gripper as far away as it is, horizontally, and no pose says so."""
+    sag: float = 0.0
+    """rad by which a level tool rotates towards the floor; of one that points down nothing."""
     delay_s: float = 0.0
     """By which poses are read late while the arm moves."""
     view_s: float = 2.0
     """From one view to the next, of an arm that moves."""
     robot_noise: tuple[float, float] = (3e-4, 0.001)
     """m, rad: one sigma per axis, white."""
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether poses are wrong by where they are."""
+        return any(self.lengths) or bool(self.tilt_by_reach or self.sag)
 
 
 @dataclass(frozen=True)
@@ -63,9 +80,9 @@ class FaultyCapture:
     base_from_camera: Float[ndarray, "n 4 4"]
     """Where the cameras were."""
     gripper_from_camera: Float[ndarray, "4 4"]
-    """Before a slip."""
+    """Before a slip; of poses that are bent the effective one."""
     gripper_from_camera_after: Float[ndarray, "4 4"]
-    """After it."""
+    """After it; of poses that are bent that of the true ones."""
     lens: Intrinsics
     """As believed."""
 
@@ -80,8 +97,8 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     first = round(faults.slip_after * images)
     mounted = np.stack([x if k < first else slipped for k in range(images)])
     cameras = true @ mounted
-    reported = _late(true, faults) if faults.delay_s else true
-    reported = disturbed(reported, faults.robot_noise, rng)
+    reported = late(true, faults.delay_s, faults.view_s) if faults.delay_s else true
+    reported = disturbed(_bent(reported, faults), faults.robot_noise, rng)
     reported[:, :3, 3] *= faults.pose_scale
     points = rng.uniform(LOW, HIGH, (POINTS, 3))
     depth = np.median(apply_all(inverse(cameras), points)[..., 2], axis=1)
@@ -97,13 +114,45 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         x_in_camera = apply(inverse(cameras[k]), points)
         x_px = project(zoomed(camera, float(focal[k])), x_in_camera)
         x_px[:, 0] += faults.rolling_px * (x_px[:, 1] / LENS.height - 0.5)
+        x_px += camera.fx * _through_prism(x_in_camera[:, :2] / x_in_camera[:, 2:], faults.prism)
+        x_px -= faults.centre_sags_px * cameras[k, 2, :2]  # gravity, along -z of the base, in camera axes
         inside = (x_px > 0).all(1) & (x_px < [LENS.width, LENS.height]).all(1) & (x_in_camera[:, 2] > 0)
         seen = np.flatnonzero(inside)
         image.append(np.full(len(seen), k))
         point.append(seen)
         pixels.append(x_px[seen] + NOISE_PX * rng.normal(size=(len(seen), 2)))
     tracks = Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), points)
+    if faults.is_bent:
+        x, slipped = _effective(x, images, faults, rng), x
     return FaultyCapture(reported, tracks, cameras, x, slipped, LENS)
+
+
+def _through_prism(x: Float[ndarray, "p 2"], s: tuple[float, float, float, float]) -> Float[ndarray, "p 2"]:
+    """Displacements of rays (x, y, 1), OpenCV's thin prism distortion."""
+    r2 = (x**2).sum(1)
+    return np.stack([s[0] * r2 + s[1] * r2**2, s[2] * r2 + s[3] * r2**2], axis=1)
+
+
+def _bent(true: Float[ndarray, "n 4 4"], faults: Faults) -> Float[ndarray, "n 4 4"]:
+    """What an arm reports that is bent, or carries a tool that is."""
+    reach = true[:, :3, 3] * [1.0, 1.0, 0.0]
+    lean = faults.tilt_by_reach * np.cross([0.0, 0.0, 1.0], reach)
+    gravity = -true[:, 2, :3]
+    sag = faults.sag * np.cross([0.0, 0.0, 1.0], gravity)
+    reported = transform(rotation_exp(-lean), np.zeros(3)) @ true @ transform(rotation_exp(-sag), np.zeros(3))
+    reported[:, :3, 3] *= 1 + np.array(faults.lengths)
+    return reported
+
+
+def _effective(
+    x: Float[ndarray, "4 4"], images: int, faults: Faults, rng: np.random.Generator
+) -> Float[ndarray, "4 4"]:
+    """The transform that best predicts the camera from what such an arm reports at other poses of the same views."""
+    captures = -(-EFFECTIVE_POSES // images)
+    others = [gripper_poses("varied", images, TARGET_IN_BASE, x, rng) for _ in range(captures)]
+    true = np.concatenate(others)
+    fit = fit_known_scale(_bent(true, faults), true @ x, (x, np.eye(4)), EFFECTIVE_NOISE)
+    return fit.gripper_from_camera
 
 
 def apply_all(a_from_b: Float[ndarray, "n 4 4"], x_in_b: Float[ndarray, "p 3"]) -> Float[ndarray, "n p 3"]:
@@ -111,10 +160,10 @@ def apply_all(a_from_b: Float[ndarray, "n 4 4"], x_in_b: Float[ndarray, "p 3"]) 
     return x_in_b @ np.swapaxes(a_from_b[:, :3, :3], 1, 2) + a_from_b[:, None, :3, 3]
 
 
-def _late(true: Float[ndarray, "n 4 4"], faults: Faults) -> Float[ndarray, "n 4 4"]:
-    """Poses of an arm that moves through these without a stop, a little later."""
-    at = faults.view_s * np.arange(len(true))
-    later = at + faults.delay_s
+def late(true: Float[ndarray, "n 4 4"], delay_s: float, view_s: float) -> Float[ndarray, "n 4 4"]:
+    """Poses of an arm that moves through these without a stop, one every `view_s`, `delay_s` later."""
+    at = view_s * np.arange(len(true))
+    later = at + delay_s
     position = CubicSpline(at, true[:, :3, 3])(later)
     rotation = RotationSpline(at, Rotation.from_matrix(true[:, :3, :3]))(later)
     return transform(rotation.as_matrix(), position)

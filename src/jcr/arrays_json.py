@@ -3,6 +3,8 @@
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from jcr.geometry import require_rigid
@@ -19,15 +21,36 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
-def _covariance(rows: list[list[float]]) -> list[list[float]]:
+LEAST_EIGENVALUE = 1e-14
+"""Of errors in units of their standard deviations: below it they are not independent, but for digits that were lost."""
+LOST_DIGITS = 1e-3
+"""By which an eigenvalue of a part may be below 0: of motions that show little, the last digits are not exact."""
+
+
+def _part(rows: list[list[float]]) -> list[list[float]]:
     matrix = np.array(rows)
     std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    largest = np.outer(std, std)  # Cauchy-Schwarz; of motions that show little, the last digits are not exact
-    if (np.diag(matrix) < 0).any() or not (np.abs(matrix) <= 1.001 * largest + 1e-30).all():
+    largest = np.outer(std, std)  # Cauchy-Schwarz
+    if (np.diag(matrix) < 0).any() or not (np.abs(matrix) <= (1 + LOST_DIGITS) * largest + 1e-30).all():
         raise ValueError("no covariance: two errors vary together more than each by itself")
-    if not (np.abs(matrix - matrix.T) <= 1e-3 * largest + 1e-30).all():
+    if not (np.abs(matrix - matrix.T) <= LOST_DIGITS * largest + 1e-30).all():
         raise ValueError("no covariance: not symmetric")
+    if _least_eigenvalue(matrix, std) < -LOST_DIGITS:
+        raise ValueError("no covariance: some combination of errors has a negative variance")
     return rows
+
+
+def _whole(rows: list[list[float]]) -> list[list[float]]:
+    matrix = np.array(_part(rows))
+    std = np.sqrt(np.diag(matrix))
+    if not std.all() or _least_eigenvalue(matrix, std) < LEAST_EIGENVALUE:
+        raise ValueError("no covariance: some error, or a combination of errors, has no variance")
+    return rows
+
+
+def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) -> float:
+    unit = np.where(std > 0, std, 1.0)
+    return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])
 
 
 Spread = Annotated[float, Field(ge=0)]
@@ -38,5 +61,8 @@ Numbers6 = Annotated[list[float], Field(min_length=6, max_length=6)]
 Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
 Matrix = Annotated[list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 """Of a rigid transform."""
-Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_covariance)]
-Covariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_covariance)]
+Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole)]
+Covariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole)]
+"""Of everything that was estimated: positive definite."""
+PartCovariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part)]
+"""What one cause adds to it, which may be nothing."""

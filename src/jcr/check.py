@@ -1,11 +1,11 @@
 """Judging a capture before any heavy work: files, motion, what it shows, what to add, how it was written."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.adjust.foreseen import ForeseenCamera
@@ -13,6 +13,7 @@ from jcr.calibration.adjust import adjusted
 from jcr.calibration.case import Case
 from jcr.calibration.checks.left_out import left_out_poses
 from jcr.calibration.checks.robot import angle_finding
+from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
@@ -27,12 +28,12 @@ from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.poses import is_one
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
+from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
-from jcr.capture.images import BLURRED, brightness_and_sharpness, exposure_fault, read_image, show_one_view
-from jcr.capture.names import paired_by_name
+from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, rotation_angle
+from jcr.geometry import largest_motion
 from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.observability import observability
 from jcr.handeye.residuals import angle_ratio
@@ -51,10 +52,9 @@ from jcr.records import (
     Reconstruction,
     Verdict,
 )
+from jcr.records.findings import CAMERA, without_consequences
 from jcr.records.words import remedy, sentence, unobservable
 
-STILL = (20e-3, np.radians(5.0))
-"""m, rad: a gripper that moves farther is seen to, in images of a camera that it carries."""
 QUICK, QUICK_SIZE_PX = 8, 800
 """Images that tell in seconds whether the poses are theirs, and the long side at which they do."""
 
@@ -122,9 +122,9 @@ def check(
     alone, held = _by_itself(capture), _Held()
     if isinstance(capture, PosePairs):
         held = _pairs_held(capture, robot_noise)
-    elif look and not alone.faults:
+    elif look and not any(one.severity == "rejects" for one in alone.views):
         held = _looked_at(capture, alone.robot, robot_noise, seed, progress, thorough)
-    angles = None if held.ratio is None else angle_finding(*held.ratio)
+    angles = None if held.ratio is None or held.blames_camera else angle_finding(*held.ratio)
     counted = alone.clear if held.registered is None else held.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
     gripper, assumptions = capture.base_from_gripper[rows], held.assumptions
@@ -134,6 +134,9 @@ def check(
     if seen is None:
         seen = observability(gripper, None if held.assumptions is None else assumptions.gripper_from_camera)
     unseen = seen.findings if held.hand_eye is None else ()
+    faults = [*held.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)]
+    views = as_causes(alone.views) if faults else alone.views
+    causes = [sentence(one) for one in views if one.severity == "rejects"]
     ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
     suggestions = [ahead.next_pose(count, ahead.expected(count)) for count in range(1, suggest + 1)]
     return Examination(
@@ -146,8 +149,13 @@ def check(
         suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
         hand_eye=held.hand_eye,
         angle_ratio=held.ratio,
-        faults=(*alone.faults, *held.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)),
-        remarks=(*alone.remarks, *held.remarks, *([] if angles is None else [sentence(angles)])),
+        faults=tuple(dict.fromkeys((*causes, *faults))),
+        remarks=(
+            *alone.remarks,
+            *held.remarks,
+            *([] if angles is None else [sentence(angles)]),
+            *(sentence(one) for one in views if one.severity == "warns"),
+        ),
     )
 
 
@@ -162,20 +170,21 @@ class _Alone:
     clear: Int[ndarray, " c"]
     """Rows of the images that are sharp and well exposed."""
     sharpness: Float[ndarray, " n"]
-    faults: tuple[str, ...]
+    views: tuple[Finding, ...]
+    """What the images say against the capture, whatever their poses are."""
     remarks: tuple[str, ...]
 
 
 def _by_itself(capture: Capture | PosePairs) -> _Alone:
     gripper = capture.base_from_gripper
-    motion = inverse(gripper)[:, None] @ gripper[None]
+    move_m, turn_rad = largest_motion(gripper)
     alone = _Alone(
         robot=errors_of(gripper),
-        move_m=float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()),
-        turn_rad=float(rotation_angle(motion[..., :3, :3]).max()),
+        move_m=move_m,
+        turn_rad=turn_rad,
         clear=np.arange(len(gripper)),
         sharpness=np.zeros(0),
-        faults=(),
+        views=(),
         remarks=tuple(capture.notes),
     )
     if alone.move_m < 5e-3 and alone.turn_rad > np.radians(5):
@@ -188,24 +197,21 @@ def _by_itself(capture: Capture | PosePairs) -> _Alone:
 
 
 def _with_images(alone: _Alone, capture: Capture) -> _Alone:
-    robot, looks = robot_errors(capture, CalibrateOptions()), _looks(capture)
-    faults, unused = (), () if robot.unused is None else (sentence(robot.unused),)
-    if looks.are_one_view and (alone.move_m > STILL[0] or alone.turn_rad > STILL[1]):
-        still = Finding(
-            kind=Kind.STATIC_IMAGES,
-            severity="rejects",
-            mend="images",
-            value=alone.move_m,
-            details={"rotation": alone.turn_rad},
-        )
-        faults = (sentence(still),)
+    robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
+    brightness, sharpness = _looks(capture)
+    blurred = {name for one in views if one.kind is Kind.BLURRED for name in one.images}
+    clear = [
+        exposure_fault(grey) is None and name not in blurred
+        for name, grey in zip(capture.images, brightness, strict=True)
+    ]
+    unused = () if robot.unused is None else (sentence(robot.unused),)
     return replace(
         alone,
         robot=robot,
-        clear=np.flatnonzero(looks.are_clear),
-        sharpness=looks.sharpness,
-        faults=faults,
-        remarks=(*alone.remarks, *_remarks(capture, looks), *unused),
+        clear=np.flatnonzero(clear),
+        sharpness=sharpness,
+        views=views,
+        remarks=(*alone.remarks, *_remarks(capture, brightness), *unused),
     )
 
 
@@ -231,6 +237,11 @@ class _Held:
     """What is found of camera and robot; None where nothing was, or it would be rejected."""
 
     @property
+    def blames_camera(self) -> bool:
+        """Whether a fault of the camera was found: angles that differ follow from it."""
+        return self.hand_eye is not None and any(one.kind in CAMERA for one in self.hand_eye.findings)
+
+    @property
     def observability(self) -> Observability | None:
         """Of the poses that were held; None where they are not all."""
         if self.hand_eye is None or self.registered is None:
@@ -251,7 +262,9 @@ def _looked_at(
         rows = spread_rows(len(capture))
         few = _of_rows(capture, rows)
         held = _registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
-        if not held.faults and held.registered is not None and len(held.registered) == QUICK:
+        # Angles that differ have a cause, which all images at full size may show.
+        agree = held.ratio is None or angle_finding(*held.ratio) is None
+        if agree and not held.faults and held.registered is not None and len(held.registered) == QUICK:
             return replace(held, registered=None)
     return _registered(capture, robot, robot_noise, seed, progress)
 
@@ -289,37 +302,35 @@ def _registered(
             board = proposed([read_image(capture.folder / name) for name in capture.images])
         return _Held(faults=(str(error),), remarks=() if board is None else (sentence(board),))
     rows = found.image_index
-    case = calibrated(capture, found, robot.of(rows), robot_noise)
-    by_name = paired_by_name(capture.images, capture.base_from_gripper)
-    held = _held_against(
-        capture.base_from_gripper[rows],
-        found,
-        case.hand_eye,
-        {by_number: poses[rows] for by_number, poses in by_name.items()},
-    )
-    wrong: tuple[Finding, ...] = ()
-    if size_px is None and case.hand_eye.converged:
-        wrong = left_out_poses(capture, found, case.hand_eye)
-    named = {
-        severity: [sentence(one) for one in wrong if one.severity == severity]
-        for severity in ("rejects", "warns")
-    }
+    mm_deg = None if robot_noise is None else (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
+    options_then = CalibrateOptions(robot_noise=mm_deg)
+    if size_px is None:
+        case = checked(capture, found, options_then, robot.of(rows))
+        held = _by_calibration(capture, case)
+    else:
+        case = fitted(capture, found, options_then, robot.of(rows))
+        case = adjusted(case) if case.hand_eye.converged else case
+        held = _held_against(capture.base_from_gripper[rows], found, case.hand_eye)
     return replace(
         held,
-        faults=(*held.faults, *named["rejects"]),
-        remarks=(*held.remarks, *named["warns"], *found.warnings, *found.notes),
+        remarks=(*held.remarks, *found.notes),
         registered=rows[case.hand_eye.inliers],
         assumptions=assumed_of(case) if case.hand_eye.converged else None,
     )
 
 
-def calibrated(
-    capture: Capture, found: Reconstruction, robot: RobotErrors, noise: tuple[float, float] | None
-) -> Case:
-    """The first steps of a calibration: the fit, and where that is accepted the adjustment of images and robot."""
-    mm_deg = None if noise is None else (1e3 * noise[0], float(np.degrees(noise[1])))
-    case = fitted(capture, found, CalibrateOptions(robot_noise=mm_deg), robot)
-    return adjusted(case) if case.hand_eye.converged else case
+def _by_calibration(capture: Capture, case: Case) -> _Held:
+    """What a calibration finds, and of poses that it left out why."""
+    hand_eye = case.hand_eye
+    if hand_eye.converged:
+        hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
+    ratio, said = hand_eye.robot.angle_ratio, without_consequences(hand_eye.findings)
+    return _Held(
+        hand_eye=hand_eye,
+        ratio=None if ratio is None or not hand_eye.converged else (ratio.ratio, ratio.std),
+        faults=tuple(sentence(one) for one in said if one.severity == "rejects"),
+        remarks=tuple(sentence(one) for one in said if one.severity == "warns"),
+    )
 
 
 def _pairs_held(pairs: PosePairs, noise: tuple[float, float] | None) -> _Held:
@@ -338,10 +349,9 @@ def _held_against(
     used: Float[ndarray, "m 4 4"],
     found: Reconstruction | PosePairs,
     hand_eye: HandEye,
-    by_name: Mapping[bool, Float[ndarray, "m 4 4"]] | None = None,
 ) -> _Held:
     camera, ratio = found.recon_from_camera, None
-    reading = better_reading(used, camera, by_name)
+    reading = better_reading(used, camera)
     faults = [] if reading is None else [sentence(convention_finding(reading))]
     faults += [warning for warning in hand_eye.warnings if not hand_eye.converged]
     remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
@@ -350,40 +360,17 @@ def _held_against(
     return _Held(hand_eye=hand_eye, ratio=ratio, faults=tuple(faults), remarks=tuple(remarks))
 
 
-@dataclass(frozen=True)
-class _Looks:
-    """What each image looks like by itself."""
-
-    brightness: Float[ndarray, " n"]
-    """Mean grey level."""
-    sharpness: Float[ndarray, " n"]
-    """Relative to the median image's."""
-    are_one_view: bool
-
-    @property
-    def are_clear(self) -> Bool[ndarray, " n"]:
-        """Images that are sharp and well exposed."""
-        exposed = [exposure_fault(grey) is None for grey in self.brightness]
-        return np.array(exposed, bool) & (self.sharpness >= BLURRED)
-
-
-def _looks(capture: Capture) -> _Looks:
-    first = read_image(capture.folder / capture.images[0])
-    looks, is_still = [], len(capture) > 1
-    for name in capture.images:
-        image = read_image(capture.folder / name)
-        looks.append(brightness_and_sharpness(image))
-        is_still = is_still and show_one_view(first, image)
+def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
+    """Mean grey level and relative sharpness of every image."""
+    looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T
-    return _Looks(brightness, sharpness / max(float(np.median(sharpness)), 1e-9), is_still)
+    return brightness, sharpness / max(float(np.median(sharpness)), 1e-9)
 
 
-def _remarks(capture: Capture, looks: _Looks) -> Iterator[str]:
-    """What stands out in images and intrinsics."""
-    for name, grey, sharp in zip(capture.images, looks.brightness, looks.sharpness, strict=True):
+def _remarks(capture: Capture, brightness: Float[ndarray, " n"]) -> Iterator[str]:
+    """What stands out in the exposure of images and in intrinsics."""
+    for name, grey in zip(capture.images, brightness, strict=True):
         if (fault := exposure_fault(grey)) is not None:
             yield f"{name} is {fault}; expose it again"
-        elif sharp < BLURRED:
-            yield f"{name} is blurred ({100 * sharp:.0f} % of the median sharpness); take it again at rest"
     if capture.intrinsics is not None and (fold := fold_distance_px(capture.intrinsics)) is not None:
         yield f"the stored distortion folds over at {fold:.0f} px from the centre; it will not be used"

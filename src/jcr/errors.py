@@ -24,15 +24,20 @@ class InputError(ValueError):
 
 class NotTrustedError(RuntimeError):
     """The input is sound but the result is rejected: the reason, what would help, and what else is worth saying (exit
-    status 3)."""
+    status 3). `despite_texture`: the images show features enough, so that their lack is not the reason."""
 
-    def __init__(self, what: str, *remedies: str, also: Sequence[str] = ()) -> None:
+    def __init__(
+        self, what: str, *remedies: str, also: Sequence[str] = (), despite_texture: bool = False
+    ) -> None:
         super().__init__("; ".join((what, *remedies, *also)))
         self.what, self.remedies, self.also = what, remedies, tuple(also)
+        self.despite_texture = despite_texture
 
     def with_more(self, *also: str) -> "NotTrustedError":
         """The same with more to say."""
-        return NotTrustedError(self.what, *self.remedies, also=(*self.also, *also))
+        return NotTrustedError(
+            self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
+        )
 
 
 RejectedError = NotTrustedError

@@ -201,6 +201,14 @@ def motion_length(motion: Transforms) -> Float[ndarray, "*batch"] | np.floating:
     return np.linalg.norm(motion[..., :3, 3], axis=-1) + ARM * rotation_angle(motion[..., :3, :3])
 
 
+def largest_motion(a_from_b: Float[ndarray, "n 4 4"]) -> tuple[float, float]:
+    """The longest translation (m) and the largest rotation (rad) between any two of them."""
+    motion = inverse(a_from_b)[:, None] @ a_from_b[None]
+    return float(np.linalg.norm(motion[..., :3, 3], axis=-1).max()), float(
+        np.max(rotation_angle(motion[..., :3, :3]))
+    )
+
+
 def rotation_between_deg(
     a: Float[ndarray, "*#batch 3 3"], b: Float[ndarray, "*#batch 3 3"]
 ) -> Float[ndarray, "..."] | np.floating:

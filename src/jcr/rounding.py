@@ -2,6 +2,15 @@
 
 import numpy as np
 
+MOST_DECIMALS = 9
+
+
+def decimals_of(std: float) -> int:
+    """Decimals of a number that is known to one standard deviation: none is below a tenth of that."""
+    if not np.isfinite(std) or std <= 0:
+        return MOST_DECIMALS if std == 0 else 0
+    return int(np.clip(np.floor(1 - np.log10(std)), 0, MOST_DECIMALS))
+
 
 def significant(value: float, digits: int = 2) -> str:
     """The number with this many significant digits, never in powers of ten; at most six decimals."""

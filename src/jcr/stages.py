@@ -197,7 +197,7 @@ def _failed(
     content = failed_file(
         capture,
         error.attempts[-1].backend,
-        error,
+        error.findings,
         timings_of(error.attempts),
         __version__,
         error.attempts,

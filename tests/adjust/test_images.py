@@ -9,7 +9,7 @@ from benchmarks.simulated.cell import CellProblem, cell_problem
 from jcr.adjust.images import ImageProblem, derivatives, view_of
 from jcr.adjust.intrinsics_prior import MEASURED, prior_of
 from jcr.adjust.robots import adjust
-from jcr.adjust.scene import Freedom, NuisancePrior, Scene, at_start, stepped
+from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
 
 COUNT = 6
 
@@ -21,7 +21,8 @@ def two_cameras() -> tuple[CellProblem, Scene, Freedom]:
     freedom = Freedom.of(
         problem.cameras, [prior_of(camera, MEASURED) for camera in problem.cameras], images, [False, True]
     )
-    free = NuisancePrior(np.eye(2 * images), np.repeat([0.05, 0.3], images))
+    std = np.r_[np.repeat([0.05, 0.3, 0.05, 0.05], images), np.full(PRISM, 0.1)]
+    free = NuisancePrior(np.eye(OF_IMAGE * images + PRISM), std)
     scene = Scene(
         world_from_rig=problem.world_from_rig,
         rig_from_camera=problem.rig_from_camera,

@@ -2,19 +2,29 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
+from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.faults import LENS, Faults, faulty_capture
+from benchmarks.simulated.observations import LENS as OBSERVED_BY
+from benchmarks.simulated.observations import observed
+from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.carried import exchanged, refined
 from jcr.geometry import inverse, retract, step_between
-from jcr.records import Kind
+from jcr.handeye.arms import RobotName, arm_named
+from jcr.handeye.solve import solve_hand_eye
+from jcr.handeye.systematic import systematic_errors
+from jcr.records import BENT, Capture, Kind, Reconstruction
 from jcr.records.words import sentence
+from jcr.simulate.robots import PresetName
 
 pytestmark = pytest.mark.slow
 
@@ -39,6 +49,18 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         3.0,
     ),
     "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
+    "thin prism": (
+        Faults(prism=(0.02, 0.0, 0.01, 0.0)),
+        r"a thin-prism distortion of up to ([\d.]+) ± \S+ px",
+        [5.6],
+        0.6,
+    ),
+    "image-stabilised optics": (
+        Faults(centre_sags_px=12.0),
+        r"moves with gravity, by ([\d.]+) ± \S+ px",
+        [12.0],
+        0.6,
+    ),
     "slip": (
         Faults(slip=(3.6e-3, np.radians(1.1))),
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
@@ -51,6 +73,24 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
         r"moved on the gripper by ([\d.]+) mm and ([\d.]+)° after 05.png",
         [30.0, 0.0],
         1.0,
+    ),
+    "lift too long": (
+        Faults(lengths=(0.0, 0.0, 0.02)),
+        r"along the base's z axis the robot's positions are ([\d.]+) ± \S+ % too long",
+        [2.0],
+        0.5,  # ± 0.2
+    ),
+    "stand leans": (
+        Faults(tilt_by_reach=float(np.radians(4))),
+        r"the robot's base leans towards the gripper by ([\d.]+) ± \S+° per metre of reach",
+        [4.0],
+        0.3,
+    ),
+    "tool sags": (
+        Faults(sag=0.02),
+        r"the gripper rotates by ([\d.]+) ± \S+° where it is level, as a tool",
+        [np.degrees(0.02)],
+        0.1,
     ),
     "delay": (
         Faults(delay_s=0.1, view_s=4.0),
@@ -91,6 +131,22 @@ def test_nothing_is_named_where_nothing_is_wrong(estimated: bool):
         assert hand_eye.warnings == ()
 
 
+@pytest.mark.parametrize(("arm", "preset"), [("ur5e", "typical"), ("panda", "low-cost")])
+def test_joint_offsets_and_link_errors_are_not_named_as_a_bent_robot(arm: RobotName, preset: PresetName):
+    problem = bent_problem(arm_named(arm), preset, 12, 2)
+    capture = Capture(
+        Path("."), tuple(f"{k}.png" for k in range(12)), problem.base_from_gripper, (640, 480), OBSERVED_BY
+    )
+    reconstruction = Reconstruction(
+        image_index=np.arange(12),
+        recon_from_camera=problem.recon_from_camera,
+        intrinsics=OBSERVED_BY,
+        tracks=observed(problem, np.random.default_rng(2), 300, 0.4),
+        backend="simulated",
+    )
+    assert not BENT & {one.kind for one in calibrate(capture, reconstruction).findings}
+
+
 def test_a_focus_that_varies_is_modelled():
     """Held, the same focal length puts the camera 30 mm off."""
     found, hand_eye = calibrated(Faults(focal_by_distance=0.03), 0, options=CalibrateOptions(focus="varies"))
@@ -113,6 +169,19 @@ def test_the_parts_of_the_uncertainty_of_a_fixed_camera_are_the_whole_with_its_f
     assert np.trace(hand_eye.budget.faults) > 0
     error = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert error @ np.linalg.solve(hand_eye.covariance[:6, :6], error) < 16.8  # 99 % of chi2 of 6
+
+
+@pytest.mark.parametrize("mm", [3.0, 30.0, 100.0])
+def test_a_change_of_the_tool_in_translation_alone_is_named_in_few_images_however_large(mm: float):
+    """The fit takes it for noise of all translations, beside which it was lost the more the larger it was."""
+    problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(3e-4, 1e-3))
+    gripper = problem.base_from_gripper.copy()
+    gripper[4:, :3, 3] += 1e-3 * mm * gripper[4:, :3, 0]
+    systematic = systematic_errors(gripper)
+    hand_eye = solve_hand_eye(gripper, problem.recon_from_camera, systematic=systematic)
+    found = sequence_fault(hand_eye, gripper, problem.recon_from_camera, list("abcdefgh"), systematic)
+    assert found is not None and found.kind is Kind.SLIP and found.images == ("d", "e")
+    assert found.value == pytest.approx(1e-3 * mm, abs=1e-3)
 
 
 def test_one_wrong_pose_among_right_ones_is_no_slip():

@@ -16,11 +16,25 @@ from jcr.calibration.calibration_json import (
 )
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.poses import calibrate_poses
+from jcr.calibration.stage import calibrate
 from jcr.calibration.verdict import with_findings
+from jcr.calibration.words import summary
 from jcr.cell.cameras_json import in_words, read_cameras
 from jcr.errors import InputError
+from jcr.geometry import rotation_exp, transform
 from jcr.handeye.solve import solve_hand_eye
-from jcr.records import CAMERA, Finding, HandEye, Kind, PosePairs, verdict_of
+from jcr.records import (
+    CAMERA,
+    Capture,
+    Finding,
+    HandEye,
+    Intrinsics,
+    Kind,
+    PosePairs,
+    Reconstruction,
+    Tracks,
+    verdict_of,
+)
 from jcr.records.words import remedy, sentence, text
 from places import ROOT
 
@@ -63,18 +77,22 @@ EXAMPLES: dict[Kind, dict] = {
     Kind.WRONG_MOUNT: {"details": {"camera": "overhead"}},
     Kind.SYSTEMATIC_ERRORS: {"value": 0.01, "p": 1e-9, "details": SIZE},
     Kind.JOINT_OFFSETS: {"joints": (2,), "p": 1e-9, "details": {"joint_2": 0.01, "joint_2_std": 0.001}},
+    Kind.LENGTHS: {"value": 0.02, "std": 0.002, "p": 1e-9, "details": AT | {"frame": "base"}},
     Kind.IMAGES_ROTATED: {"value": 6.0, "details": {"rotated": "rotated by 90°"}},
     Kind.BOARD_IN_VIEW: {"details": {"board": "chessboard:9x6:SIDE"}},
     Kind.OWN_REJECTED: {"details": {"camera": "wrist"}},
     Kind.FEW_POINTS_SHARED: {"value": 3.0, "images": ("a.png",)},
     Kind.FEW_LOCALISED: {"value": 2.0, "details": {"needed": 3.0}},
     Kind.SECOND_ON_ARM: {"details": {"arm": "right"}},
+    Kind.ONE_GRIPPER_POSE: {"images": ("a.png",)},
     Kind.NOT_FIXED: {"value": 0.1, "images": ("a.png", "b.png"), "details": SIZE},
     Kind.NOT_RIGID: {"value": 0.1, "details": {"camera": "wrist"}},
     Kind.IMAGE_MISSES: {"value": 9.0, "images": ("a.png",), "details": {"mount": "base"}},
     Kind.PLACE_UNCERTAIN: {"value": 0.1, "details": SIZE | {"focal_std": 0.1}, "mend": "intrinsics"},
     Kind.AT_ANOTHER_CAMERA: {"images": ("a.png",), "details": {"camera": "wrist"}},
     Kind.ANOTHER_SCENE: {"value": 9.0, "details": {"camera": "wrist"}},
+    Kind.BLURRED: {"value": 14.0, "images": ("a.png", "b.png"), "details": {"of": 4.0}},
+    Kind.FEW_USED: {"value": 4.0, "details": {"of": 12.0}},
     Kind.STATIC_IMAGES: {"value": 0.2, "details": SIZE},
     Kind.POSES_SWAPPED: {"images": ("a.png", "b.png")},
     Kind.POSE_CONTRADICTS_IMAGE: {"value": 0.1, "images": ("a.png",), "details": SIZE},
@@ -120,6 +138,44 @@ def test_a_fault_that_is_too_much_rejects_and_comes_before_its_consequences(solv
     uncertain = replace(example(Kind.UNCERTAIN), severity="rejects")
     found = with_findings(solved.with_findings(uncertain), (fault,))
     assert [one.kind for one in found.findings] == [Kind.DELAY, Kind.UNCERTAIN]
+
+
+def test_what_a_cause_explains_is_not_another_fault():
+    problem = hand_eye_problem(np.random.default_rng(0), 12, robot_noise=(5e-4, 1e-3))
+    names = tuple(f"{k}.png" for k in range(12))
+    pairs = PosePairs(Path("a"), names, problem.base_from_gripper[::-1], problem.recon_from_camera, False)
+    content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0")
+    assert content.findings[0].kind is Kind.POSE_CONVENTION and Kind.UNCERTAIN in {
+        one.kind for one in content.findings
+    }
+    assert content.doubt is not None and "reverse order" in content.doubt
+    assert not any("add images" in said or "disagree" in said for said in content.remarks)
+    assert "more views" not in summary(content)
+
+
+def test_of_images_that_are_missing_the_motions_are_not_to_blame():
+    """Twelve general poses, whose first five rotate about one axis; only these are registered."""
+    rng = np.random.default_rng(3)
+    problem = hand_eye_problem(rng, 12, robot_noise=(2e-4, 5e-4))
+    gripper = problem.base_from_gripper.copy()
+    first = gripper[0]
+    yaw = rotation_exp(np.linspace(0, 1.5, 5)[:, None] * [0.0, 0.0, 1.0])
+    gripper[:5] = transform(yaw @ first[:3, :3], first[:3, 3] + 0.2 * rng.normal(size=(5, 3)))
+    camera = gripper[:5] @ problem.gripper_from_camera
+    made = Reconstruction(
+        image_index=np.arange(5),
+        recon_from_camera=camera,
+        intrinsics=Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480),
+        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        backend="colmap",
+    )
+    capture = Capture(Path(), tuple(f"{k}.png" for k in range(12)), gripper, (640, 480))
+    found = calibrate(capture, made)
+    assert [one.kind for one in found.findings[:2]] == [Kind.FEW_USED, Kind.UNOBSERVABLE]
+    assert found.findings[0].mend == "reconstruction" and found.observability.advice == ("",)
+    alone = replace(capture, images=capture.images[:5], base_from_gripper=gripper[:5])
+    found = calibrate(alone, made)
+    assert found.findings[0].kind is Kind.UNOBSERVABLE and "tilt the wrist" in found.observability.advice[0]
 
 
 def test_the_parts_of_the_uncertainty_are_the_whole_with_every_fault(solved: HandEye):

@@ -16,6 +16,8 @@ from jcr.adjust.images import ImageProblem, evidence, noise_of, view_of
 from jcr.adjust.intrinsics_prior import HELD, prior_of
 from jcr.adjust.robots import Adjusted, adjust
 from jcr.adjust.scene import Freedom, Scene, at_start, similarities
+from jcr.calibration.checks.camera import camera_faults
+from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, project, unproject, with_parameters
@@ -25,7 +27,8 @@ from jcr.cell import alone, carried, localise
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras
 from jcr.cell.found import CameraFound, CellFound, ImageFound
-from jcr.cell.stage import place_cameras
+from jcr.cell.images import CellImages
+from jcr.cell.stage import far_from_gripper, place_cameras
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
@@ -187,6 +190,120 @@ def test_a_picture_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated
     assert np.linalg.norm(error[:3]) < (0.004 if known else 0.01)
     assert error @ np.linalg.solve(camera.covariance, error) < 16.8
     assert camera.std_at_scene is not None and camera.std_at_scene < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wrong", "severity"),
+    [
+        ({"fx": 1.015, "fy": 1.015}, "informs"),
+        ({"fx": 1.03, "fy": 1.03}, "warns"),
+        ({"fx": 1.5, "fy": 1.5}, "warns"),
+        ({"cx": 1.125}, "warns"),
+    ],
+)
+def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_used(
+    tabletop: Path, calibrated, wrong: dict[str, float], severity: str
+):
+    """Used, 3 % too long are 10 mm off, 4.3 sigma; a centre 40 px off 2°, 6.8 sigma; another camera's do not fit."""
+    old, reconstruction, hand_eye = calibrated
+    capture = jcr.read_capture(tabletop)
+    true = capture.intrinsics
+    assert true is not None
+    given = replace(true, **{name: factor * getattr(true, name) for name, factor in wrong.items()})
+    overhead = replace(fixed(capture, capture.images[11]), intrinsics=given)
+    (camera,) = place_cameras(old, [overhead], reconstruction, hand_eye).cameras
+    assert [(one.kind, one.severity) for one in camera.findings] == [(FindingKind.INTRINSICS, severity)]
+    assert camera.converged
+    assert camera.parent_from_camera is not None and camera.covariance is not None
+    x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
+    error = step_between(camera.parent_from_camera, capture.base_from_gripper[11] @ x)
+    assert np.abs(error / np.sqrt(np.diag(camera.covariance))).max() < 3
+    assert np.linalg.norm(error[:3]) < 0.004
+    assert camera.intrinsics is not None and camera.intrinsics.fx == pytest.approx(true.fx, rel=0.01)
+
+
+@pytest.mark.slow
+def test_exact_intrinsics_are_kept_for_a_camera_that_is_held_against_itself(tabletop: Path, calibrated):
+    old, reconstruction, hand_eye = calibrated
+    capture = jcr.read_capture(tabletop)
+    assert capture.intrinsics is not None
+    given = replace(capture.intrinsics, fx=1.02 * capture.intrinsics.fx, fy=1.02 * capture.intrinsics.fy)
+    exact = replace(fixed(capture, capture.images[11]), intrinsics=given, intrinsics_std=np.zeros(9))
+    (camera,) = place_cameras(old, [exact], reconstruction, hand_eye).cameras
+    assert camera.findings == () and camera.intrinsics == given
+
+
+@pytest.mark.slow
+def test_a_second_camera_on_the_gripper_is_placed_by_images_of_two_gripper_poses(calibrated):
+    """One image fits any frame: that of another was 0.35 m and 64° off, accepted with 0.2 mm."""
+    old, reconstruction, hand_eye = calibrated
+
+    def second(*frames: int) -> CameraFound:
+        camera = CellCamera(
+            "second",
+            "gripper",
+            (old.images[4], old.images[6])[: len(frames)],
+            old.image_size,
+            old.intrinsics,
+            frame=np.array(frames),
+        )
+        return place_cameras(old, [camera], reconstruction, hand_eye).cameras[0]
+
+    for one in (second(5), second(4), second(4, 4)):
+        assert not one.converged and one.findings[0].kind is FindingKind.ONE_GRIPPER_POSE
+    assert second(4, 5).findings[0].kind is FindingKind.NOT_RIGID
+    both = second(4, 6)
+    assert both.verdict == "accepted" and both.parent_from_camera is not None
+    assert np.abs(step_between(both.parent_from_camera, hand_eye.gripper_from_camera)).max() < 1e-3
+    far = replace(both, parent_from_camera=transform(np.eye(3), np.array([0.7, 0.0, 0.2])))
+    assert [one.kind for one in filter(None, [far_from_gripper(far)])] == [FindingKind.FAR_FROM_GRIPPER]
+    assert far_from_gripper(both) is None and far_from_gripper(replace(far, mount="base")) is None
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.03])
+def test_a_zoom_of_a_second_camera_is_named_with_its_size_and_none_where_there_is_none(zoom: float):
+    problem = cell_problem("wrists", "white", COUNT, seed=1, points=150)
+    seen, camera = problem.observations, problem.cameras[1]
+    zoomed_from = COUNT + COUNT // 2
+    late = (seen.camera[seen.image] == 1) & (seen.image >= zoomed_from)
+    centre = np.array([camera.cx, camera.cy])
+    x_px = np.where(late[:, None], centre + zoom * (seen.x_px - centre), seen.x_px)
+    images = CellImages(
+        scene=Scene(
+            world_from_rig=problem.world_from_rig,
+            rig_from_camera=problem.rig_from_camera,
+            cameras=problem.cameras,
+            points_in_world=problem.points_in_world,
+        ),
+        observations=replace(seen, x_px=x_px),
+        freedom=Freedom.of(
+            problem.cameras, [prior_of(one) for one in problem.cameras], len(seen.rig), [False, True]
+        ),
+        arms=[
+            replace(arm, start=(arm.start[0], arm.start[1] @ scale_translation(np.eye(4), problem.scale)))
+            for arm in problem.arms
+        ],
+        noise=None,
+        prior=None,
+    )
+    answer, place = images.adjusted(), WANTED["wrists"][1]
+    second = Imaged(
+        adjusted=answer,
+        adjust=lambda prior, free: images.with_freed(prior, 1, free).adjusted(),
+        names=[f"{k}.png" for k in range(COUNT)],
+        start=camera,
+        is_given=True,
+        prior=images.freedom.intrinsics[1],
+        std=np.sqrt(np.diag(answer.transform(place)[1])),
+        answer=lambda adjusted: (place(adjusted.placed), adjusted.placed.scale),
+        camera=1,
+        place=place,
+    )
+    found = camera_faults(second)
+    assert [(one.kind, one.images) for one in found] == [(FindingKind.ZOOM, ("3.png", "4.png"))] * (zoom != 1)
+    for one in found:
+        assert one.value == pytest.approx(zoom - 1, abs=0.004) and one.shift is not None
 
 
 @pytest.mark.slow

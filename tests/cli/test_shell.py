@@ -15,11 +15,16 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from benchmarks.simulated.problem import hand_eye_problem
+from capture_writers import write_easy_handeye2
 from jcr.cli import COMMANDS, dispatch
 from jcr.cli.completion import SHELLS, arguments_of, script
 from jcr.cli.output import Output
+from jcr.cli.query import labelled
 from jcr.export.formats import FORMATS
 from jcr.export.options import FormatName
+from jcr.geometry import scale_translation
+from places import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +75,27 @@ def test_json_is_one_object_and_quiet_is_silence(
         assert dispatch([*commands[name], "--quiet"]) == 0, name
         told = capsys.readouterr()
         assert told.out and told.err == "", name
+
+
+def test_what_decides_is_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of four samples a wrong one cannot be identified: a warning, and no word else."""
+    problem = hand_eye_problem(np.random.default_rng(0), 4, robot_noise=(2e-4, 5e-4))
+    cameras = scale_translation(problem.recon_from_camera, problem.scale)
+    samples = write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
+    assert dispatch(["calibrate", str(samples), str(tmp_path / "out"), "--quiet"]) == 0
+    told = capsys.readouterr()
+    assert told.err.startswith("warning: with 4 images") and told.err.count("\n") == 1
+    rejected = ROOT / "tests" / "golden" / "calibration_rejected.json"
+    shutil.copy(rejected, tmp_path / "out" / "calibration.json")
+    assert dispatch(["export", str(tmp_path / "out"), "urdf", "--force", "--quiet"]) == 0
+    told = capsys.readouterr()
+    assert told.err.startswith("warning: the calibration is rejected") and told.err.count("\n") == 1
+
+
+def test_a_query_says_on_what_its_points_lie():
+    said = labelled(np.array([0, 2, 2, 1, 2, 0]), ("none", "table", "object 1", "object 2"))
+    assert said == "; by label: table 1, object 1 3"
+    assert labelled(np.zeros(3, int), ("none",)) == ""
 
 
 def test_errors_are_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -93,6 +93,11 @@ MANY = {
         [dict.fromkeys(("effector_wrt_world", "object_wrt_sensor"), np.eye(4).ravel().tolist())] * 1001,
         "1001 frames; choose 1000 at most",
     ),
+    "rows": (
+        "poses.csv",
+        "image,x,y,z,qx,qy,qz,qw\n" + "".join(f"{k}.png,0.5,0.1,0.4,0,0,0,1\n" for k in range(100_000)),
+        "100000 frames; choose 1000 at most",
+    ),
     "columns": (
         "poses.csv",
         ",".join(f"c{k}" for k in range(30_000)) + "\n" + ",".join("0" * 30_000),

@@ -15,11 +15,16 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+import jcr
 from chromium import Chromium
+from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.stage import calibrate
 from jcr.calibration.words import log, worst_direction
+from jcr.capture.capture_json import kept
 from jcr.capture.images import read_image
+from jcr.capture.options import ReadOptions
+from jcr.capture.robot_poses import numbers_from_poses, poses_from_numbers
 from jcr.cell.cameras_json import cameras_file
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cli.output import Output
@@ -27,7 +32,16 @@ from jcr.cli.result import show
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
-from jcr.records import Capture, CellCamera, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import (
+    COVARIANCE_ORDER,
+    Capture,
+    CellCamera,
+    Intrinsics,
+    Pointmaps,
+    Reconstruction,
+    Tracks,
+    no_reconstruction,
+)
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -38,7 +52,7 @@ from jcr.report.pictures import MAGNIFIED
 from jcr.represent.cloud import point_cloud
 from jcr.represent.options import MapOptions
 from jcr.results import RunResult
-from jcr.rounding import significant
+from jcr.rounding import decimals_of, significant
 from jcr.simulate.truth import Truth, read_truth
 
 pytestmark = pytest.mark.slow
@@ -229,7 +243,8 @@ def test_rejected_images_say_why(run: RunResult, page: str):
 def test_text_from_files_stays_text(page: str):
     elements = Elements(page)
     assert "<script>alert" not in page
-    assert len(elements.scripts) == 4  # the scene's data, the 3D view, the copy buttons, the large images
+    # The scene's data, the images' pixels, the 3D view, the copy buttons, the large images.
+    assert len(elements.scripts) == 5
     assert all(f"<i>{name}" in elements.text for name in ("mug", "tape"))
     scene = json.loads(elements.scripts[0])
     assert scene["views"][1]["name"] == Path(EVIL).name and Path(EVIL).name in elements.text
@@ -353,11 +368,59 @@ def test_reprojections_and_poses_to_add_are_those_of_the_run(run: RunResult, pag
     assert 0.25 < ways.std() < 0.35
     elements = Elements(page)
     for k, pose in enumerate(result.calibration.next_poses, start=1):
-        copied = np.array(json.loads(elements.copied(f"pose {k}")))
+        copied = np.array(json.loads(elements.copied(f"pose {k} as a matrix")))
         np.testing.assert_allclose(copied, pose.base_from_gripper, atol=1e-6)
         near = capture.base_from_gripper[capture.images.index(pose.like), :3, 3]
         assert f"{1e3 * np.linalg.norm(copied[:3, 3] - near):.0f}\u00a0mm" in elements.text
     assert all(part in elements.text for part in ("left of the tick", "tracked features in red"))
+
+
+@pytest.mark.parametrize(
+    ("convention", "robot", "as_written"),
+    [("kuka", None, "kuka"), (None, "ur5e", "ur"), (None, "panda", "franka"), (None, None, "quat-xyzw")],
+)
+def test_poses_to_add_are_in_the_notation_of_the_robot(
+    run: RunResult, convention: str | None, robot: str | None, as_written: str
+):
+    of_robot = replace(run, capture=replace(run.capture, pose_convention=convention, robot=robot))
+    elements = Elements(report_html(of_robot))
+    for k, pose in enumerate(run.hand_eye.next_poses, start=1):
+        numbers = np.array([float(part) for part in elements.copied(f"pose {k}").split(",")])
+        read = poses_from_numbers(numbers[None], as_written, "auto", "a test")[0]
+        assert np.abs(read - pose.base_from_gripper).max() < 2e-4
+    assert f"as {as_written} writes poses" in elements.text
+    assert (f"arm {robot}" if robot else "arm not named") in elements.text
+
+
+def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, tabletop: Path, run: RunResult):
+    scan = shrunk_capture(tabletop, tmp_path / "bin_picking", 3, 160)
+    frames = json.loads((scan / "capture.json").read_text())["frames"]
+    (scan / "capture.json").unlink()
+    rows = numbers_from_poses(np.array([frame["base_from_gripper"] for frame in frames]), "ur")
+    lines = [f"{frame['image']},{','.join(map(str, row))}" for frame, row in zip(frames, rows, strict=True)]
+    (scan / "poses.csv").write_text("\n".join(["image,x,y,z,rx,ry,rz", *lines]))
+    read = jcr.read_capture(scan, ReadOptions(pose_convention="ur"))
+    copied = kept(read, tmp_path / "out" / "capture")
+    assert copied.folder.name == "capture" and copied.pose_convention == "ur"
+    failed = failed_file(
+        copied, "colmap", no_reconstruction(NotTrustedError("nothing matched")), {"reconstruct": 1.0}, "0.0"
+    )
+    elements = Elements(failed_report_html(copied, failed))
+    assert "Hand-eye calibration of “bin_picking”" in elements.text
+    assert str(scan / "poses.csv") in elements.text and re.search(
+        r"20\d\d-\d\d-\d\d \d\d:\d\d UTC", elements.text
+    )
+    assert "wrist camera, 160 × 120 px, intrinsics estimated" in elements.text
+
+
+def test_no_digit_is_below_a_tenth_of_sigma():
+    assert [decimals_of(std) for std in (2.8e-5, 0.021, 0.1, 3.0, 40.0, np.inf)] == [5, 2, 2, 0, 0, 0]
+
+
+def test_the_covariance_is_offered_with_its_order(run: RunResult, page: str):
+    offered = json.loads(Elements(page).copied("the covariance"))
+    assert offered["order"] == list(COVARIANCE_ORDER)
+    assert np.array_equal(offered["covariance"], run.hand_eye.covariance)
 
 
 def test_unseen_direction_has_a_red_bar(run: RunResult):
@@ -374,7 +437,7 @@ def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
     capture = run.capture
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
     error = NotTrustedError(fault, remedy)
-    failed = failed_file(capture, "colmap", error, {"reconstruct": 2.0}, "0.0")
+    failed = failed_file(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
     names = [a.get("alt") for tag, a in elements.found if tag == "img"]
@@ -553,13 +616,25 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         " { b.click(); while (b.textContent !== 'copied') await new Promise(requestAnimationFrame);"
         " out.push([b.dataset.copy, await navigator.clipboard.readText()]); } return out; })()"
     )
-    assert len(copied) == 9 + 2  # notations, and poses to add
+    assert len(copied) == 10 + 2 * 2  # notations, and poses to add in two of them
     assert all(offered == found for offered, found in copied)
     # An image opens large with its marks, and arrow keys lead to the next.
     chromium.js("document.querySelectorAll('.images .shot')[1].click()")
     assert chromium.js("document.getElementById('large').open")
     width = "document.querySelector('#large img').getBoundingClientRect().width"
     assert chromium.js(width) > 3 * chromium.js(width.replace("#large", ".images"))
+    # Where a point is in the file of the image: what jcr touch asks for.
+    x, y = chromium.center("#large img")
+    chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+    name, *pixel = chromium.js("document.getElementById('pixel').textContent").split(",")
+    assert name == chromium.js("document.querySelector('#large img').alt")
+    assert [float(value) for value in pixel] == pytest.approx([319.5, 239.5], abs=1.5)
+    chromium.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", clickCount=1)
+    chromium.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=y, button="left", clickCount=1)
+    pasted = chromium.js("new Promise(done => setTimeout(() => done(navigator.clipboard.readText()), 200))")
+    *named, x_px, y_px = pasted.rsplit(",", 2)
+    assert named == [name] and chromium.js("document.getElementById('large').open")
+    assert [float(x_px), float(y_px)] == pytest.approx([float(value) for value in pixel], abs=1.0)
     first = chromium.js("document.querySelector('#large p').textContent")
     key = {"key": "ArrowRight", "code": "ArrowRight", "windowsVirtualKeyCode": 39}
     chromium.call("Input.dispatchKeyEvent", type="keyDown", **key)

@@ -7,6 +7,7 @@ the rigs while everything moves (robots.py); `evidence` is what is left without 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,7 +24,10 @@ from jcr.adjust.pixel_noise import (
     variance_ratios,
 )
 from jcr.adjust.scene import (
+    OF_IMAGE,
+    PRISM,
     Freedom,
+    Nuisances,
     Observations,
     Scene,
     at_start,
@@ -31,7 +35,7 @@ from jcr.adjust.scene import (
     similarities_of_rigs,
     stepped,
 )
-from jcr.camera import by_parameters, by_point, project
+from jcr.camera import by_parameters, by_point, project, unproject
 from jcr.geometry import apply, inverse, scale_translation, skew, step_between
 from jcr.least_squares import one_blas_thread
 
@@ -107,6 +111,18 @@ class ImageProblem:
             layout=layout,
             displacements=by,
         )
+
+    @cached_property
+    def prism(self) -> Float[ndarray, "k 2 4"]:
+        """Displacement (px) of each observation by the coefficients of a thin prism, whatever the scene is."""
+        out = np.zeros((len(self.layout.camera), 2, PRISM))
+        for c, lens in enumerate(self.freedom.start):
+            rows = np.flatnonzero(self.layout.camera == c)
+            r2 = (unproject(lens, self.observations.x_px[rows])[:, :2] ** 2).sum(1)
+            for axis, focal in enumerate((lens.fx, lens.fy)):
+                out[rows, axis, 2 * axis] = focal * r2
+                out[rows, axis, 2 * axis + 1] = focal * r2**2
+        return out
 
     def with_model_error(self, std: Float[ndarray, " e"]) -> "ImageProblem":
         """With displacements of another size."""
@@ -218,7 +234,8 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
         from_rig[rows] = (points - pose[:3, 3]) @ pose[:3, :3]
     from_camera, in_camera, from_centre = np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 2))
     residual = np.empty((k, 2))
-    log_focal, shear = scene.nuisances(problem.freedom)[:, observations.image]
+    own = Nuisances.of(scene.nuisances(problem.freedom))
+    log_focal, shear = own.log_focal[observations.image], own.shear[observations.image]
     for c, (lens, mount) in enumerate(zip(scene.cameras, scene.rig_from_camera, strict=True)):
         rows = np.flatnonzero(camera == c)
         from_camera[rows] = from_rig[rows] - mount[:3, 3]
@@ -228,7 +245,10 @@ def view_of(scene: Scene, problem: ImageProblem) -> View:
         from_centre[rows] = about
         moved = np.exp(log_focal[rows])[:, None] * about
         moved[:, 0] += lens.fx / lens.height * shear[rows] * about[:, 1]
+        moved += lens.width * own.offset[observations.image[rows]]
         residual[rows] = moved + centre - observations.x_px[rows]
+    if own.prism.any():
+        residual += problem.prism @ own.prism
     residual += problem.displacements @ scene.camera_steps[problem.freedom.model_error_columns]
     return View(from_rig, from_camera, in_camera, from_centre, residual)
 
@@ -359,7 +379,8 @@ def _nuisances_applied(
     """Derivatives of projections by the cameras as derivatives of projections by the images' own, in place."""
     if len(problem.freedom.nuisance.std) == 0:
         return by
-    log_focal, shear = scene.nuisances(problem.freedom)[:, problem.observations.image]
+    own, image = Nuisances.of(scene.nuisances(problem.freedom)), problem.observations.image
+    log_focal, shear = own.log_focal[image], own.shear[image]
     along = np.array([camera.fx / camera.height for camera in scene.cameras])[problem.layout.camera] * shear
     sheared = along[:, None] * by[:, 1]
     by *= np.exp(log_focal)[:, None, None]
@@ -387,7 +408,8 @@ def _with_nuisances(
     """Derivatives by the intrinsics with those by the nuisances of each image."""
     freedom, camera = problem.freedom, problem.layout.camera
     image, about = problem.observations.image, view.from_centre_px
-    log_focal, shear = scene.nuisances(freedom)[:, image]
+    own = Nuisances.of(scene.nuisances(freedom))
+    log_focal, shear = own.log_focal[image], own.shear[image]
     # Nuisances are about the principal point, which they leave where it is; a shear counts in the focal length.
     beside, of_shear = np.zeros_like(out), np.zeros((len(camera), out.shape[2]))
     for c, (lens, prior, columns) in enumerate(
@@ -399,10 +421,16 @@ def _with_nuisances(
     out = _nuisances_applied(out - beside, scene, problem) + beside
     out[:, 0] += of_shear
     by_shear = np.array([lens.fx / lens.height for lens in scene.cameras])[camera] * about[:, 1]
-    focal, sheared = freedom.nuisance.directions.reshape(2, -1, len(freedom.nuisance.std))[:, image]
+    directions, columns = freedom.nuisance.directions, freedom.nuisance_columns
+    of_images = directions[:-PRISM].reshape(OF_IMAGE, -1, directions.shape[1])
+    focal, sheared, *offset = of_images[:, image]
     scaled = np.exp(log_focal)[:, None] * about
-    out[:, :, freedom.nuisance_columns] = scaled[:, :, None] * focal[:, None]
-    out[:, 0, freedom.nuisance_columns] += by_shear[:, None] * sheared
+    out[:, :, columns] = scaled[:, :, None] * focal[:, None]
+    out[:, 0, columns] += by_shear[:, None] * sheared
+    width = np.array([lens.width for lens in scene.cameras])[camera]
+    out[:, :, columns] += width[:, None, None] * np.stack(offset, axis=1)
+    if directions[-PRISM:].any():
+        out[:, :, columns] += problem.prism @ directions[-PRISM:]
     return out
 
 

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import block_diag, cho_factor, cho_solve, solve_triangular
 
 from jcr.adjust.acceleration import Acceleration
 from jcr.adjust.elimination import Normal
@@ -76,6 +76,8 @@ class ArmPoses:
     """X and the transform from the world, scaled, to the frame in which X is sought."""
     exchanged: bool = False
     """The camera stands still and the arm carries what it sees."""
+    bent: Float[ndarray, "s b"] | None = None
+    """Errors of one standard deviation each that were found of the poses (handeye/bent.py)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -512,9 +514,19 @@ def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
             (known + known.T) / 2,
             region.left(systematic),
             given.noise,
+            _bent(given.arms, region),
         ),
         region,
     )
+
+
+def _bent(arms: Sequence[ArmPoses], region: Region) -> Float[ndarray, "s s"] | None:
+    """Covariance of what the errors that were found leave in the poses of all arms; None where none were."""
+    if all(arm.bent is None for arm in arms):
+        return None
+    each = [np.zeros((6 * len(arm.rigs), 0)) if arm.bent is None else arm.bent for arm in arms]
+    columns = np.asarray(block_diag(*each))
+    return region.left(columns @ columns.T)
 
 
 def _rig_information(

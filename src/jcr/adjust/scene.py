@@ -47,17 +47,40 @@ class Observations:
         )
 
 
+OF_IMAGE, PRISM = 4, 4
+"""Nuisances of each image, and those of the glass, which all share."""
+
+
 @dataclass(frozen=True)
 class NuisancePrior:
-    """Independent directions in which each image may differ from its camera, with their standard deviations.
+    """Independent directions in which images may differ from their camera's model, with their standard deviations.
 
-    An image has two such parameters: the logarithm of its own focal length over the camera's, and a shear, by which x
-    moves from the image's top to its bottom in focal lengths, as a rolling shutter does it.
+    An image has four such parameters: the logarithm of its own focal length over the camera's; a shear, by which x
+    moves from the image's top to its bottom in focal lengths, as a rolling shutter does it; and an offset in x and in y,
+    in widths of the image, as image stabilisation makes it. All images share the coefficients s1 to s4 of OpenCV's thin
+    prism distortion, which no model of camera.py has.
     """
 
     directions: Float[ndarray, "r e"]
-    """r = 2n: of the logarithms of all n images, then of their shears."""
+    """r = 4n + 4: of the logarithms of all n images, of their shears, of their offsets in x, in y, then of the prism."""
     std: Float[ndarray, " e"]
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """How n images differ from their camera's model."""
+
+    log_focal: Float[ndarray, " n"]
+    shear: Float[ndarray, " n"]
+    offset: Float[ndarray, "n 2"]
+    """In widths of the image."""
+    prism: Float[ndarray, " 4"]
+
+    @staticmethod
+    def of(flat: Float[ndarray, " r"]) -> "Nuisances":
+        """In the order of NuisancePrior's rows."""
+        log_focal, shear, x, y = flat[:-PRISM].reshape(OF_IMAGE, -1)
+        return Nuisances(log_focal, shear, np.stack([x, y], axis=1), flat[-PRISM:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +112,7 @@ class Freedom:
         return Freedom(
             intrinsics=tuple(priors),
             mounts=np.zeros(len(cameras), bool) if mounts is None else np.asarray(mounts, bool),
-            nuisance=NuisancePrior(np.zeros((2 * images, 0)), np.zeros(0)),
+            nuisance=NuisancePrior(np.zeros((OF_IMAGE * images + PRISM, 0)), np.zeros(0)),
             start=tuple(cameras),
         )
 
@@ -145,9 +168,9 @@ class Scene:
     """Of the intrinsics from where they start, along the directions of their priors, of the nuisances, and of what the
     models leave; empty: all are where they start."""
 
-    def nuisances(self, freedom: Freedom) -> Float[ndarray, "2 n"]:
-        """Of each image: logarithm of its focal length over the camera's, and its shear."""
-        return (freedom.nuisance.directions @ self.camera_steps[freedom.nuisance_columns]).reshape(2, -1)
+    def nuisances(self, freedom: Freedom) -> Float[ndarray, " r"]:
+        """How the images differ from their camera's model, in the order of NuisancePrior's rows."""
+        return freedom.nuisance.directions @ self.camera_steps[freedom.nuisance_columns]
 
 
 def at_start(scene: Scene, freedom: Freedom) -> Scene:

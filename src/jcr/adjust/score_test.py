@@ -1,45 +1,50 @@
 """What else the images could show: parameters beside those that were adjusted, tested where the adjustment ended.
 
-The mixed model is written once more with columns for what was fixed: every parameter of the camera, a focal length and
-a shear for each image by itself. A hypothesis is a few combinations of these columns. How much freeing them would lower
-the cost, at one Gauss-Newton step, over the dispersion of the residuals, is Rao's score test (Rao, Proc. Cambridge Phil.
-Soc. 44, 1948), here beside F, for the robot pose noise was estimated from few residuals. The same step shows how large
-they are and how far X would move; the adjustment with them free (`freed`) is what they come to.
+The mixed model is written once more with columns for what was fixed: every parameter of a camera, a focal length, a
+shear and an offset for each of its images by itself, and a thin prism. A hypothesis is a few combinations of these
+columns. How much freeing them would lower the cost, at one Gauss-Newton step, over the dispersion of the residuals, is
+Rao's score test (Rao, Proc. Cambridge Phil. Soc. 44, 1948), here beside F, for the robot pose noise was estimated from
+few residuals. The same step shows how large they are and how far the camera's place would move; the adjustment with them
+free (`freed`) is what they come to.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.adjust.images import ImageEvidence, evidence
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
-from jcr.adjust.robots import Adjusted, equations_of
-from jcr.adjust.scene import Freedom, NuisancePrior
+from jcr.adjust.robots import Adjusted, Placed, equations_of
+from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
-from jcr.handeye.components import POSES, solve
+from jcr.handeye.components import solve
 from jcr.records import Intrinsics
 
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
 """Standard deviations that only keep finite what the images cannot see: focal lengths relative, centre per width."""
-WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL = 1.0, 0.3, 0.05
+WEAK_DISTORTION, WEAK_SHEAR, WEAK_FOCAL, WEAK_OFFSET, WEAK_PRISM = 1.0, 0.3, 0.05, 0.1, 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternatives:
     """The equations of every column that may be freed; what was adjusted is eliminated.
 
-    The columns are the parameters of the wrist camera in `units`, the logarithms of the images' focal lengths over the
-    camera's, and their shears in focal lengths.
+    The columns are the parameters of one camera in `units`, then the nuisances of its images in the order of
+    NuisancePrior.
     """
 
     hessian: Float[ndarray, "e e"]
     right: Float[ndarray, " e"]
-    x_by_column: Float[ndarray, "6 e"]
-    """How far X moves with each column."""
+    place_by_column: Float[ndarray, "6 e"]
+    """How far the camera's place moves with each column."""
     images: int
+    """Of the camera."""
+    freedom: int
+    """Of the robots' residuals, by which their noise was estimated: fewer than the images have by far."""
     dispersion: float
     """Variance of what pulls at a parameter, over what the weights say."""
     names: tuple[str, ...]
@@ -48,16 +53,13 @@ class Alternatives:
     """What each of them counts in: focal lengths in themselves, the centre in widths."""
     distance: Float[ndarray, " m"]
     """Median depth of the points of each image (m)."""
+    down_in_camera: Float[ndarray, "m 3"]
+    """Of each image, the direction against the base's z axis."""
 
     @property
     def columns(self) -> int:
         """That may be freed."""
         return len(self.right)
-
-    @property
-    def freedom(self) -> int:
-        """Of the robot's residuals, by which its noise was estimated: fewer than the images have by far."""
-        return max(6 * self.images - POSES, 1)
 
     def of_camera(self, names: tuple[str, ...]) -> Float[ndarray, "e p"]:
         """Combinations: these parameters of the camera."""
@@ -75,6 +77,15 @@ class Alternatives:
         """Combinations: x of each image moves by its share of the focal length over its height."""
         return self._of_images(1, shares)
 
+    def offset_by_gravity(self) -> Float[ndarray, "e 2"]:
+        """Combinations: the offset of each image in x by gravity along x, in y by gravity along y."""
+        x, y = self.down_in_camera[:, :2].T
+        return np.concatenate([self._of_images(2, x[:, None]), self._of_images(3, y[:, None])], axis=1)
+
+    def prism(self) -> Float[ndarray, "e 4"]:
+        """Combinations: the coefficients of a thin prism."""
+        return np.eye(self.columns)[:, -PRISM:]
+
     def _of_images(self, block: int, shares: Float[ndarray, "m p"]) -> Float[ndarray, "e p"]:
         out = np.zeros((self.columns, shares.shape[1]))
         first = len(self.names) + block * self.images
@@ -91,95 +102,176 @@ class Tested:
     covariance: Float[ndarray, "p p"]
     """Of the combinations."""
     shift: Float[ndarray, "6"]
-    """The step of X that comes with it, gripper axes."""
+    """The step of the camera's place that comes with it, axes of its parent."""
 
 
-def alternatives(adjusted: Adjusted, prior: IntrinsicsPrior) -> Alternatives:
-    """The columns and equations about an adjustment of a wrist camera, a rig an image.
+def first_x(placed: Placed) -> Float[ndarray, "4 4"]:
+    """The place of a wrist camera that is the first of its arm."""
+    return placed.x[0]
 
-    `prior` is what was known of the intrinsics; what was freed beyond it is among the columns.
+
+def alternatives(
+    adjusted: Adjusted,
+    prior: IntrinsicsPrior,
+    camera: int = 0,
+    place: Callable[[Placed], Float[ndarray, "4 4"]] = first_x,
+    model_error_std: float | None = None,
+) -> Alternatives:
+    """The columns and equations of one camera about an adjustment.
+
+    `prior` is what was known of its intrinsics; what was freed beyond it is among the columns. `place` is where the
+    camera is on its parent. `model_error_std` is how large, in widths of the image, what the cameras' models leave may
+    be; None: as large as it was estimated.
     """
     given = adjusted.given
-    problem, camera = given.evidence.problem, given.evidence.scene.cameras[0]
-    names, units, m = parameter_names(camera), units_of(camera), len(problem.observations.rig)
-    freedom, own = problem.freedom, len(prior.std)
-    weak = np.r_[weak_of(camera), [WEAK_FOCAL] * m, [WEAK_SHEAR] * m]
-    all_free = Freedom(
-        intrinsics=(
-            IntrinsicsPrior(
-                np.column_stack([prior.directions, np.diag(units)]), np.r_[prior.std, weak[: len(names)]]
-            ),
-        ),
-        mounts=freedom.mounts,
-        nuisance=NuisancePrior(np.eye(2 * m), weak[len(names) :]),
-        start=freedom.start,
-        model_error_std=freedom.model_error_std,
-    )
-    scene = given.evidence.scene
-    steps = np.r_[
-        scene.camera_steps[:own],
-        beyond_prior(adjusted, prior) / units,
-        scene.nuisances(freedom).ravel(),
-        scene.camera_steps[freedom.model_error_columns],
-    ]
-    wider = evidence(
-        replace(scene, camera_steps=steps), replace(problem, freedom=all_free), given.evidence.noise
-    )
+    problem, own = given.evidence.problem, len(prior.std)
+    mine = np.flatnonzero(problem.observations.camera == camera)
+    wider = _with_all_free(adjusted, prior, camera, mine, model_error_std)
     placed = replace(adjusted.most_likely, scene=wider.scene)
     equations, _ = equations_of(placed, replace(given, evidence=wider))
     solution = solve(equations, adjusted.log_sizes)
     hessian = equations.jacobian.T @ solution.weighed + equations.prior_information
     right = -(solution.weighed.T @ equations.residual + equations.prior_gradient)
-    # What was adjusted: X, scale, base_from_world, the camera as far as it was free, and what its model leaves.
-    base, end = POSES + own, POSES + all_free.nuisance_columns.stop
+    # What was adjusted: the arms, the cameras as far as they were free, and what their models leave.
+    all_free, begin = wider.problem.freedom, adjusted.first_camera_column
+    of_camera, of_images = all_free.intrinsics_columns[camera], all_free.nuisance_columns
+    rest = begin + np.r_[of_camera.start + own : of_camera.stop, of_images]
+    kept = np.setdiff1d(np.arange(len(hessian)), rest)
     size = 1 / np.sqrt(hessian.diagonal())
-    kept, rest = np.r_[0:base, end : len(hessian)], np.arange(base, end)
     scaled = size[kept, None] * hessian[np.ix_(kept, kept)] * size[kept]
     coupling = hessian[np.ix_(kept, rest)]
     by_column = size[kept, None] * np.linalg.solve(scaled, size[kept, None] * coupling)
-    depth, image = wider.view.depth, problem.observations.image
-    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(m)])
+    start = given.evidence.scene.cameras[camera]
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
         right=right[rest] - by_column.T @ right[kept],
-        x_by_column=-by_column[:6],
-        images=m,
+        place_by_column=-_place_by_kept(adjusted, place, len(hessian), kept) @ by_column,
+        images=len(mine),
+        freedom=max(len(equations.residual) - begin, 1),
         dispersion=_dispersion(given.evidence),
-        names=names,
-        units=units,
-        distance=np.where(np.isfinite(distance), distance, np.nanmedian(distance)),
+        names=parameter_names(start),
+        units=units_of(start),
+        distance=_distances(wider, mine),
+        down_in_camera=_down(adjusted, camera, mine),
     )
 
 
+def _down(adjusted: Adjusted, camera: int, images: Int[ndarray, " m"]) -> Float[ndarray, "m 3"]:
+    """Of each image, the direction against the base's z axis in its camera."""
+    scene, rig = adjusted.placed.scene, adjusted.given.evidence.problem.observations.rig[images]
+    return -(adjusted.placed.z[0] @ scene.world_from_rig[rig] @ scene.rig_from_camera[camera])[:, 2, :3]
+
+
+def nuisances_of(images: Int[ndarray, " m"], count: int) -> Int[ndarray, " r"]:
+    """Of these images among the nuisances of `count`, and what all share."""
+    return np.r_[(count * np.arange(OF_IMAGE)[:, None] + images).ravel(), OF_IMAGE * count + np.arange(PRISM)]
+
+
+def _with_all_free(
+    adjusted: Adjusted,
+    prior: IntrinsicsPrior,
+    camera: int,
+    images: Int[ndarray, " m"],
+    model_error_std: float | None,
+) -> ImageEvidence:
+    """What the images show where every parameter of a camera and of its images is free."""
+    found = adjusted.given.evidence
+    problem, scene, own = found.problem, found.scene, len(prior.std)
+    freedom, m = problem.freedom, len(images)
+    start = scene.cameras[camera]
+    units = units_of(start)
+    wider = IntrinsicsPrior(
+        np.column_stack([prior.directions, np.diag(units)]), np.r_[prior.std, weak_of(start)]
+    )
+    rows = nuisances_of(images, len(problem.observations.rig))
+    left = freedom.model_error_std
+    all_free = replace(
+        freedom,
+        intrinsics=_with_one(freedom.intrinsics, camera, wider),
+        nuisance=NuisancePrior(np.eye(len(freedom.nuisance.directions))[:, rows], _weak_nuisances(m)),
+        model_error_std=left if model_error_std is None else np.full_like(left, model_error_std),
+    )
+    steps = scene.camera_steps
+    columns = freedom.intrinsics_columns[camera]
+    wider_steps = np.r_[
+        steps[: columns.start + own],
+        beyond_prior(adjusted, prior, camera) / units,
+        steps[columns.stop : freedom.nuisance_columns.start],
+        scene.nuisances(freedom)[rows],
+        steps[freedom.model_error_columns],
+    ]
+    return evidence(replace(scene, camera_steps=wider_steps), replace(problem, freedom=all_free), found.noise)
+
+
+def _with_one(
+    priors: tuple[IntrinsicsPrior, ...], camera: int, prior: IntrinsicsPrior
+) -> tuple[IntrinsicsPrior, ...]:
+    return (*priors[:camera], prior, *priors[camera + 1 :])
+
+
+def _place_by_kept(
+    adjusted: Adjusted,
+    place: Callable[[Placed], Float[ndarray, "4 4"]],
+    columns: int,
+    kept: Int[ndarray, " k"],
+) -> Float[ndarray, "6 k"]:
+    """How far a camera's place moves with each of the kept columns; with no parameter of a camera it does."""
+    derivative = adjusted.derivative(place)
+    arms = adjusted.first_camera_column
+    after = derivative.shape[1] - arms - adjusted.given.evidence.problem.freedom.model_error_columns.stop
+    wide = np.zeros((6, columns))
+    wide[:, :arms] = derivative[:, :arms]
+    if after:
+        wide[:, -after:] = derivative[:, -after:]
+    return wide[:, kept]
+
+
+def _distances(images: ImageEvidence, mine: Int[ndarray, " m"]) -> Float[ndarray, " m"]:
+    """Median depth of the points of each image; of one without points that of the others."""
+    depth, image = images.view.depth, images.problem.observations.image
+    distance = np.array([np.median(depth[image == k]) if (image == k).any() else np.nan for k in mine])
+    return np.where(np.isfinite(distance), distance, np.nanmedian(distance))
+
+
 def freed_intrinsics(
-    adjusted: Adjusted, prior: IntrinsicsPrior
+    adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0
 ) -> tuple[Float[ndarray, " q"], Float[ndarray, "q q"]]:
-    """The parameters of a wrist camera one Gauss-Newton step on, with another prior about where they started, and their
+    """The parameters of a camera one Gauss-Newton step on, with another prior about where they started, and their
     covariance."""
-    given, start = adjusted.given, adjusted.given.evidence.problem.freedom.start[0]
+    given = adjusted.given
     problem, scene = given.evidence.problem, given.evidence.scene
-    freedom = replace(problem.freedom, intrinsics=(prior,))
-    off = parameters(scene.cameras[0]) - parameters(start)
-    steps = scene.camera_steps[problem.freedom.nuisance_columns.start :]
+    freedom, now = problem.freedom, parameters(scene.cameras[camera])
+    columns = freedom.intrinsics_columns[camera]
+    off = now - parameters(freedom.start[camera])
+    steps = np.r_[
+        scene.camera_steps[: columns.start],
+        np.linalg.pinv(prior.directions) @ off,
+        scene.camera_steps[columns.stop :],
+    ]
     wider = evidence(
-        replace(scene, camera_steps=np.r_[np.linalg.pinv(prior.directions) @ off, steps]),
-        replace(problem, freedom=freedom),
+        replace(scene, camera_steps=steps),
+        replace(problem, freedom=with_intrinsics(freedom, prior, camera)),
         given.evidence.noise,
     )
     equations, _ = equations_of(adjusted.most_likely, replace(given, evidence=wider))
     solution = solve(equations, adjusted.log_sizes)
-    own = slice(POSES, POSES + len(prior.std))
+    begin = adjusted.first_camera_column + columns.start
+    own = slice(begin, begin + len(prior.std))
     covariance = solution.covariance[own, own]
-    found = parameters(scene.cameras[0]) + prior.directions @ solution.step[own]
-    return found, prior.directions @ covariance @ prior.directions.T
+    return now + prior.directions @ solution.step[own], prior.directions @ covariance @ prior.directions.T
 
 
-def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior) -> Float[ndarray, " q"]:
-    """How far the parameters of a wrist camera went by what was freed beside its prior, from where they started."""
-    evidence_of, own = adjusted.given.evidence, len(prior.std)
-    freedom = evidence_of.problem.freedom
-    steps = evidence_of.scene.camera_steps[freedom.intrinsics_columns[0]]
-    return freedom.intrinsics[0].directions[:, own:] @ steps[own:]
+def with_intrinsics(freedom: Freedom, prior: IntrinsicsPrior, camera: int = 0) -> Freedom:
+    """The freedom with another prior of a camera's intrinsics."""
+    return replace(freedom, intrinsics=_with_one(freedom.intrinsics, camera, prior))
+
+
+def beyond_prior(adjusted: Adjusted, prior: IntrinsicsPrior, camera: int = 0) -> Float[ndarray, " q"]:
+    """How far the parameters of a camera went by what was freed beside its prior, from where they started."""
+    found, own = adjusted.given.evidence, len(prior.std)
+    freedom = found.problem.freedom
+    steps = found.scene.camera_steps[freedom.intrinsics_columns[camera]]
+    return freedom.intrinsics[camera].directions[:, own:] @ steps[own:]
 
 
 def units_of(camera: Intrinsics) -> Float[ndarray, " q"]:
@@ -196,7 +288,7 @@ def weak_of(camera: Intrinsics) -> Float[ndarray, " q"]:
 def focal_lengths(camera: Intrinsics, images: int) -> Float[ndarray, "e p"]:
     """The combinations of columns of `Alternatives` that give every image a focal length of its own."""
     q = len(parameter_names(camera))
-    out = np.zeros((q + 2 * images, images))
+    out = np.zeros((q + OF_IMAGE * images + PRISM, images))
     out[:2, 0] = 1.0
     out[q : q + images, 1:] = differences(images)
     return out
@@ -207,24 +299,34 @@ def differences(count: int) -> Float[ndarray, "n d"]:
     return np.linalg.svd(np.eye(count) - 1 / count)[0][:, : count - 1]
 
 
-def freed(freedom: Freedom, combinations: Float[ndarray, "e p"], camera: Intrinsics) -> Freedom:
-    """A wrist camera's freedom with combinations of the columns of `Alternatives` free too.
+def freed(
+    freedom: Freedom,
+    combinations: Float[ndarray, "e p"],
+    images: Int[ndarray, " m"],
+    camera: int = 0,
+) -> Freedom:
+    """A freedom with combinations of the columns of one camera's `Alternatives` free too.
 
-    Parameters of the camera, in the units of `camera`, and of its images are freed each by themselves.
+    Parameters of the camera, in units of where it starts, and of its `images` are freed each by themselves.
     """
-    q, own = len(parameter_names(camera)), freedom.intrinsics[0]
+    start, own = freedom.start[camera], freedom.intrinsics[camera]
+    q, m = len(parameter_names(start)), len(images)
     of_camera, of_images = spanned(combinations[:q]), spanned(combinations[q:])
-    weak = np.repeat([WEAK_FOCAL, WEAK_SHEAR], len(of_images) // 2)
-    return replace(
-        freedom,
-        intrinsics=(
-            IntrinsicsPrior(
-                np.column_stack([own.directions, units_of(camera)[:, None] * of_camera]),
-                np.r_[own.std, _std(of_camera, weak_of(camera))],
-            ),
-        ),
-        nuisance=NuisancePrior(of_images, _std(of_images, weak)),
+    wider = IntrinsicsPrior(
+        np.column_stack([own.directions, units_of(start)[:, None] * of_camera]),
+        np.r_[own.std, _std(of_camera, weak_of(start))],
     )
+    all_rows = len(freedom.nuisance.directions)
+    directions = np.zeros((all_rows, of_images.shape[1]))
+    directions[nuisances_of(images, (all_rows - PRISM) // OF_IMAGE)] = of_images
+    std = _std(of_images, _weak_nuisances(m))
+    return replace(with_intrinsics(freedom, wider, camera), nuisance=NuisancePrior(directions, std))
+
+
+def _weak_nuisances(images: int) -> Float[ndarray, " r"]:
+    """Standard deviations of nuisances that only keep finite what the images cannot see."""
+    of_images = np.repeat([WEAK_FOCAL, WEAK_SHEAR, WEAK_OFFSET, WEAK_OFFSET], images)
+    return np.r_[of_images, np.full(PRISM, WEAK_PRISM)]
 
 
 def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> Float[ndarray, " p"]:
@@ -252,7 +354,7 @@ def tested(
     return Tested(
         float(f_distribution.logsf(max(gain - gain_without, 0.0) / spread / p, p, equations.freedom)),
         spread * to_value @ covariance @ to_value.T,
-        equations.x_by_column @ (more @ step - fewer @ without),
+        equations.place_by_column @ (more @ step - fewer @ without),
     )
 
 

@@ -27,6 +27,7 @@ def adjust_wrist(
     combinations: Float[ndarray, "e p"] | None = None,
     exchanged: bool = False,
     near: Adjusted | None = None,
+    bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
     """Images and robot adjusted from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
@@ -34,20 +35,22 @@ def adjust_wrist(
     intrinsics; None: that they are exact. `systematic` is the covariance of the systematic errors of the gripper poses
     at 1 rad; None: that of errors smooth over the poses. `combinations` of the columns of score_test.Alternatives are
     free too. `exchanged`: the camera stands still, and the arm carries what it sees. `near` is an adjustment of the same
-    poses and tracks, or of more of them, to begin from.
+    poses and tracks, or of more of them, to begin from. `bent` are errors that were found of the gripper poses
+    (handeye/bent.py), of one standard deviation each.
     """
     x, scale, z = start
     each = np.arange(len(base_from_gripper))
     prior = prior_of(intrinsics, HELD) if prior is None else prior
     freedom = Freedom.of((intrinsics,), (prior,), len(each))
     if combinations is not None:
-        freedom = freed(freedom, combinations, intrinsics)
+        freedom = freed(freedom, combinations, each)
     arm = ArmPoses(
         rigs=each,
         base_from_gripper=base_from_gripper,
         systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
         start=(x, z),
         exchanged=exchanged,
+        bent=bent,
     )
     return adjust(
         Scene(

@@ -61,6 +61,7 @@ def adjust_case(
     prior: IntrinsicsPrior | None = None,
     combinations: Float[ndarray, "e p"] | None = None,
     exchanged: bool = False,
+    bent: Float[ndarray, "s b"] | None = None,
 ) -> Adjusted:
     """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
 
@@ -79,6 +80,7 @@ def adjust_case(
         combinations=combinations,
         exchanged=exchanged,
         near=case.adjusted if case.hand_eye.converged else None,
+        bent=bent,
     )
 
 

@@ -14,7 +14,7 @@ from jcr.calibration.requirement import not_exact_enough
 from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
 from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError
 from jcr.files import write_text
 from jcr.intrinsics_json import IntrinsicsAndStd, IntrinsicsJson, Positive
 from jcr.records import (
@@ -37,10 +37,10 @@ from jcr.records import (
     ScaleCheck,
     Verdict,
     WithGivenIntrinsics,
-    no_reconstruction,
     strongest_first,
+    without_consequences,
 )
-from jcr.records.words import doubt_of, sentence
+from jcr.records.words import doubt_of, remedy, sentence, text
 
 FORMAT = "jcr.calibration/1"
 
@@ -212,9 +212,10 @@ class CalibrationFile(Part):
 
     @property
     def remarks(self) -> list[str]:
-        """What else the user must act on than why it is rejected or short, in words."""
+        """What else the user must act on than why it is rejected or short, in words; not what that explains."""
         first = self.short if self.converged else self.findings[0]
-        return [sentence(one) for one in self.findings if one.severity != "informs" and one is not first]
+        said = without_consequences(self.findings)
+        return [sentence(one) for one in said if one.severity != "informs" and one is not first]
 
     def with_findings(self, *findings: Finding) -> "CalibrationFile":
         """The same with more findings, and what is derived of them."""
@@ -289,12 +290,12 @@ def calibration_file(
 def failed_file(
     capture: Capture,
     backend: str,
-    error: NotTrustedError,
+    findings: Sequence[Finding],
     timings_s: dict[str, float],
     version: str,
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
-    """The file of a capture whose images gave no camera poses at all."""
+    """The file of a capture whose images gave no camera poses at all; `findings` say why, strongest first."""
     return CalibrationFile(
         mount=capture.mount,
         gripper_from_camera=None,
@@ -308,11 +309,11 @@ def failed_file(
         observability=Observed(
             observable=False,
             unobservable=["everything: no camera poses"],
-            advice=list(error.remedies) or [error.what],
+            advice=[remedy(findings[0]) or text(findings[0])],
         ),
         robot_noise=None,
         intrinsics=IntrinsicsAndStd.of(capture.intrinsics),
-        **_derived(no_reconstruction(error), ()),
+        **_derived(findings, ()),
         timings_s=timings_s,
         version=version,
         attempts=list(attempts),

@@ -13,6 +13,8 @@ from jcr.geometry import step_between
 
 OTHER = "reference"
 """Names the covariance of a calibration that does not say what it comes from."""
+NOTHING = 1e-6
+"""Share of a difference that is rounding."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,16 @@ def difference(ours: Known, other: Known) -> Difference:
     """
     step = step_between(ours.gripper_from_camera, other.gripper_from_camera)
     parts: dict[str, Float[ndarray, "6 6"]] = {}
+    together = np.zeros((6, 6))
     for known in (ours, other):
         if known.covariance is None:
             continue
-        for name, part in (known.parts or {OTHER: known.covariance}).items():
+        together += known.covariance
+        rest = known.covariance - sum(known.parts.values(), np.zeros((6, 6)))
+        for name, part in (known.parts | {OTHER: rest}).items():
             parts[name] = parts.get(name, np.zeros((6, 6))) + part
-    if not parts:
+    if not np.diag(together).all():  # neither states any, or both are said to be exact
         return Difference(step[:3], step[3:], None, None, None, {})
-    together = sum(parts.values(), np.zeros((6, 6)))
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
@@ -64,5 +68,9 @@ def difference(ours: Known, other: Known) -> Difference:
         np.abs(step) / std,
         squared,
         float(chi2.sf(squared, 6)),
-        {name: part / squared for name, part in sorted(explained.items(), key=lambda item: -item[1])},
+        {
+            name: part / squared
+            for name, part in sorted(explained.items(), key=lambda item: -item[1])
+            if name != OTHER or part > NOTHING * squared
+        },
     )

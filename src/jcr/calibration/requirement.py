@@ -18,7 +18,7 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.handeye.next_poses import assumed_camera
 from jcr.handeye.observability import excitation
-from jcr.records import Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
+from jcr.records import BENT, Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -45,7 +45,7 @@ def advised(
     used, robot = gripper[hand_eye.inliers], robot.of(np.flatnonzero(hand_eye.inliers))
     hand_eye = replace(hand_eye, in_use=in_use(hand_eye.estimate, scene or Scene(assumptions.distance_m)))
     required = _required(hand_eye, options)
-    assumptions = replace(assumptions, faults=_by_intrinsics(hand_eye))
+    assumptions = replace(assumptions, faults=_by_lasting_faults(hand_eye))
     if hand_eye.converged:
         reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
@@ -153,8 +153,7 @@ def _worthwhile(
     return reach, proposed
 
 
-def _by_intrinsics(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
-    """What wrong intrinsics add to the covariance."""
-    return sum(
-        (one.covariance for one in hand_eye.findings if one.mend == "intrinsics"), start=np.zeros((7, 7))
-    )
+def _by_lasting_faults(hand_eye: HandEye) -> Float[ndarray, "7 7"]:
+    """What wrong intrinsics and a bent robot add to the covariance."""
+    lasting = (one for one in hand_eye.findings if one.mend == "intrinsics" or one.kind in BENT)
+    return sum((one.covariance for one in lasting), start=np.zeros((7, 7)))

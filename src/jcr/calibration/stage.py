@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from jcr.calibration.adjust import adjusted
+from jcr.calibration.case import Case
 from jcr.calibration.checks.table import CHECKS
 from jcr.calibration.expected import assumed_of
 from jcr.calibration.fit import fitted
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_errors import RobotErrors, robot_errors
 from jcr.calibration.seen import with_given_intrinsics
 from jcr.calibration.verdict import with_checked
 from jcr.least_squares import one_blas_thread
@@ -30,6 +31,20 @@ def calibrate(
     """
     check_options(options := options or CalibrateOptions())
     robot = robot_errors(capture, options).of(reconstruction.image_index)
+    case = checked(capture, reconstruction, options, robot)
+    scene = case.scene_in_base
+    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, robot, assumed_of(case), scene)
+    if capture.intrinsics is None or scene is None:
+        return hand_eye
+    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)
+    return replace(hand_eye, with_given_intrinsics=pair)
+
+
+@one_blas_thread
+def checked(
+    capture: Capture, reconstruction: Reconstruction, options: CalibrateOptions, robot: RobotErrors
+) -> Case:
+    """The same without advice: fit, adjustment, and what the checks found. `robot` is of the registered images."""
     case = adjusted(fitted(capture, reconstruction, options, robot))
     for check in CHECKS:
         if check.needs(case):
@@ -39,9 +54,4 @@ def calibrate(
                 # A rejected fit may be so wrong, points behind the cameras, that there is nothing to compute.
                 if case.hand_eye.converged:
                     raise
-    scene = case.scene_in_base
-    hand_eye = advised(case.hand_eye, case.base_from_gripper, options, robot, assumed_of(case), scene)
-    if capture.intrinsics is None or scene is None:
-        return hand_eye
-    pair = with_given_intrinsics(hand_eye.estimate, reconstruction.intrinsics, scene.distance_m)
-    return replace(hand_eye, with_given_intrinsics=pair)
+    return case

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, model_validator
 
-from jcr.arrays_json import Covariance7, Part, Spread, Spread3
+from jcr.arrays_json import Covariance7, Part, PartCovariance7, Spread, Spread3
 from jcr.calibration.seen import joint_covariance
 from jcr.calibration.words import worst_direction
 from jcr.camera import parameter_names
@@ -30,7 +30,7 @@ class Share(Part):
 
     translation_mm: Spread
     rotation_deg: Spread
-    covariance: Covariance7 | None = None
+    covariance: PartCovariance7 | None = None
     """In the order of `uncertainty`; the parts' sum is the whole."""
 
     @classmethod

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
 from jcr.handeye.solve import judged
@@ -25,7 +27,9 @@ def with_findings(hand_eye: HandEye, findings: tuple[Finding, ...]) -> HandEye:
             named.append(finding)
             continue
         accepted = hand_eye.converged and verdict_of([*named, finding]) != "rejected"
-        hand_eye = replace(hand_eye, estimate=hand_eye.estimate.with_fault(finding.covariance))
+        both = finding.shift, finding.intrinsics_shift
+        shifts = None if both[1] is None else (np.array(both[0]), np.array(both[1]))
+        hand_eye = replace(hand_eye, estimate=hand_eye.estimate.with_fault(finding.covariance, shifts))
         # More images, the remedy for a large covariance, do not help against a fault: that finding is left out.
         if not accepted or not judged(hand_eye).converged:
             finding = replace(finding, severity="rejects")

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, verdict_of
+from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
 
@@ -23,7 +23,7 @@ def summary(content: "CalibrationFile") -> str:
     """What was found, what was left out, and what would help."""
     lines = found(content)
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
-    if content.next_poses:
+    if content.next_poses and not is_explained(content.findings):
         last = content.next_poses[-1]
         # Files of earlier versions expect of the camera alone.
         then = f"the camera ± {' '.join(significant(1e3 * std) for std in last.expected_std[:3])} mm"

@@ -15,6 +15,7 @@ from jcr.capture.depth_images import depth_of_frames
 from jcr.capture.lens_json import lens_as_json, read_lens, read_std, std_as_json
 from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
+from jcr.capture.robot_poses import CONVENTIONS
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
@@ -59,8 +60,10 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     joints = _joints(frames, images, file)
     robot, notes = _robot(content.get("robot"), joints, file)
     lens = read_lens(content.get("intrinsics"), capture.image_size, file)
+    convention = content.get("pose_convention")
     capture = replace(
         capture,
+        pose_convention=convention if isinstance(convention, str) and convention in CONVENTIONS else None,
         intrinsics=lens,
         intrinsics_std=read_std(content.get("intrinsics_std"), lens, file),
         notes=notes,
@@ -94,8 +97,19 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
     stated: dict[str, Any] = {"frames": frames, "intrinsics": lens}
     if capture.intrinsics_std is not None:
         stated["intrinsics_std"] = std_as_json(capture.intrinsics_std)
+    if capture.pose_convention is not None:
+        stated["pose_convention"] = capture.pose_convention
     stated |= arm | cameras_as_json(capture) | remarks
     write_text(folder / FILE, json.dumps(stated, indent=1) + "\n")
+
+
+def origin(folder: Path) -> Path:
+    """What a capture folder was read from: the table or recording whose frames were copied into it, or itself."""
+    content = read_json(folder / FILE) if (folder / FILE).is_file() else {}
+    content = content if isinstance(content, dict) else {}
+    made_from = content.get("made_from")
+    source = made_from[0] if isinstance(made_from, list) and made_from else content.get("source")
+    return Path(source) if isinstance(source, str) and source else folder.resolve()
 
 
 def kept(capture: Capture, folder: Path) -> Capture:

@@ -38,6 +38,13 @@ BITS_PER_SAMPLE = 258
 """The TIFF tag."""
 DEFECTIVE = 10_000
 """One pixel in this many may be one that the sensor does not read."""
+BLURRED_EDGE = 1 / 80
+"""Of the long side, or of EDGES_AT: the strongest edges of a sharp image climb within it. Those of images of eleven real
+arms took 1/300 to 1/98."""
+EDGES_AT = 640
+"""Pixels of the long side at which edges are measured; a smaller image is measured as it is."""
+LEAST_CONTRAST = 20
+"""Grey levels that the strongest edges climb, or there is none to judge by."""
 ONE_VIEW = 0.5
 """Of the sum of the squared details of two images, which unrelated images differ by."""
 DARK, BRIGHT = 12, 243
@@ -145,6 +152,23 @@ def brightness_and_sharpness(image: UInt8[ndarray, "h w 3"]) -> tuple[float, flo
     """Mean grey level, and variance of the Laplacian, which falls when an image is blurred."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return float(grey.mean()), float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:
+    """Over which share of the long side, or of EDGES_AT, the strongest edges climb along the axis that is blurred most.
+
+    By how much they climb within 2 pixels, over what they climb within 16: from 1/320, of sharp edges, to 1/40. 0 of an
+    image without edges.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = min(EDGES_AT / max(grey.shape), 1.0)
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.float32)
+    widths = [0.0]
+    for along in (grey, grey.T):
+        near, far = (float(np.quantile(np.abs(along[n:] - along[:-n]), 0.99)) for n in (2, 16))
+        if far > LEAST_CONTRAST:
+            widths.append(2 * far / max(near, 1.0) / EDGES_AT)
+    return max(widths)
 
 
 def show_one_view(first: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"]) -> bool:

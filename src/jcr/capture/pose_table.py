@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.capture.options import ReadOptions, UnitsName
+from jcr.capture.checks import require_frames
+from jcr.capture.options import ConventionName, ReadOptions, UnitsName
 from jcr.capture.plain_files import shown
 from jcr.capture.robot_poses import CONVENTIONS, poses_from_numbers
 from jcr.capture.table_cells import Cells, is_number, read_cells
@@ -27,7 +28,7 @@ _IMAGE = (
     "picture",
 )
 _STAMP = ("timestamp", "stamp", "time", "t")
-_SHOWN = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
+_SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
 _LAST_ROW = {"m30": "0", "m31": "0", "m32": "0", "m33": "1"}
 
@@ -43,6 +44,8 @@ class PoseTable:
     images: tuple[str, ...] | None
     """Names as they stand in the table."""
     stamp_ns: Int[ndarray, " n"] | None
+    convention: str
+    """A name of CONVENTIONS."""
 
 
 def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
@@ -55,19 +58,25 @@ def read_pose_table(file: Path, options: ReadOptions) -> PoseTable:
     else:
         columns = dict(zip(cells.names, cells.columns(), strict=True))
     image = next((columns[name] for name in _IMAGE if name in columns), None)
+    if image is not None:
+        require_frames(len(image), str(file), 0)  # a row a frame: before a million numbers are read
     stamp = next((columns[name] for name in _STAMP if name in columns), None)
+    options = replace(options, pose_convention=convention_of(columns, options, str(file)))
     base_from_gripper = poses_of_columns(columns, cells.units, options, str(file))
     stamp_numbers = None if stamp is None else np.array([stamp_ns(text, str(file)) for text in stamp])
-    return PoseTable(base_from_gripper, image, stamp_numbers)
+    return PoseTable(base_from_gripper, image, stamp_numbers, options.pose_convention)
+
+
+def convention_of(columns: dict[str, tuple[str, ...]], options: ReadOptions, where: str) -> ConventionName:
+    """The convention of named columns: that was asked for, or that they show."""
+    return options.pose_convention if options.pose_convention != "auto" else _shown(columns, where)
 
 
 def poses_of_columns(
     columns: dict[str, tuple[str, ...]], units: frozenset[str], options: ReadOptions, where: str
 ) -> Float[ndarray, "n 4 4"]:
     """base_from_gripper (n,4,4) from named columns of text, in the convention that they show or was asked for."""
-    convention = options.pose_convention
-    if convention == "auto":
-        convention = _shown(columns, where)
+    convention = convention_of(columns, options, where)
     wanted = CONVENTIONS[convention].columns
     rows = len(next(iter(columns.values())))
     if set(_LAST_ROW) <= set(wanted) and not set(_LAST_ROW) & set(columns):
@@ -128,7 +137,7 @@ def _unnamed(file: Path, cells: Cells, options: ReadOptions) -> dict[str, tuple[
     return named | dict(zip(wanted, columns, strict=True))
 
 
-def _shown(columns: dict[str, tuple[str, ...]], where: str) -> str:
+def _shown(columns: dict[str, tuple[str, ...]], where: str) -> ConventionName:
     """The convention that the names of the columns show."""
     for name in _SHOWN:
         if set(CONVENTIONS[name].columns) - set(_LAST_ROW) <= columns.keys():

@@ -94,6 +94,30 @@ CONVENTIONS = {
 }
 
 
+OF_ARM = {
+    "ur3e": "ur",
+    "ur5e": "ur",
+    "ur10e": "ur",
+    "panda": "franka",
+    "fr3": "franka",
+    "iiwa7": "kuka",
+    "iiwa14": "kuka",
+    "xarm6": "xarm",
+    "xarm7": "xarm",
+    "z1": "unitree",
+}
+"""What the controller of an arm (handeye.arms.ROBOT_NAMES) writes."""
+
+
+def units_of(convention: str) -> str:
+    """The units of a convention's numbers, for people: "m, rad", "mm, °", or "m" where no angle is among them."""
+    form = CONVENTIONS[convention]
+    length = "mm" if form.millimetres else "m"
+    return (
+        length if form.rotation is None or form.quaternion else f"{length}, {'°' if form.degrees else 'rad'}"
+    )
+
+
 def numbers_from_poses(
     base_from_gripper: Float[ndarray, "n 4 4"], convention: str, units: UnitsName = "auto"
 ) -> Float[ndarray, "n k"]:

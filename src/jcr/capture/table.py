@@ -34,7 +34,8 @@ def read(path: Path, options: ReadOptions) -> Capture:
     images, poses, notes = _paired(folder, file, table, options)
     capture = checked_capture(folder, images, poses, str(file))
     depths = depth_beside(folder, images)
-    return replace(with_camera_info(capture, options), source=file, notes=notes, depths=depths)
+    capture = replace(with_camera_info(capture, options), source=file, notes=notes, depths=depths)
+    return replace(capture, pose_convention=table.convention)
 
 
 def find_table(path: Path) -> Path | None:

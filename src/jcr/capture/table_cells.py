@@ -72,10 +72,11 @@ def is_number(cell: str) -> bool:
 
 def _ur_poses(file: Path) -> Cells | None:
     """A table whose lines hold poses as URScript writes them, p[x, y, z, rx, ry, rz], and what stands before them."""
-    lines = [line.strip() for line in read_text(file).splitlines()]
-    matches = [(number, line, _UR_POSE.search(line)) for number, line in enumerate(lines, 1)]
-    if not any(match for _, _, match in matches):
+    text = read_text(file)
+    if _UR_POSE.search(text) is None:
         return None
+    lines = [line.strip() for line in text.splitlines()]
+    matches = [(number, line, _UR_POSE.search(line)) for number, line in enumerate(lines, 1)]
     rows: list[list[str]] = []
     for number, line, match in matches:
         if match is not None:

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import skew
-from jcr.records import Finding, Intrinsics, Mount, Verdict, verdict_of
-from jcr.records.words import doubt_of, warnings_of
+from jcr.records import Assessed, Intrinsics, Mount
 
 if TYPE_CHECKING:
     from jcr.adjust.robots import Adjusted, Placed
@@ -30,8 +29,8 @@ class ImageFound:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraFound:
-    """Where one camera of the cell is."""
+class CameraFound(Assessed):
+    """Where one camera of the cell is; of one that was not found, a finding rejects it."""
 
     name: str
     mount: Mount
@@ -45,28 +44,6 @@ class CameraFound:
     """m along the optical axis to what it sees."""
     intrinsics: Intrinsics | None = None
     intrinsics_std: Float[ndarray, " q"] | None = None
-    findings: tuple[Finding, ...] = ()
-    """Strongest first; of one that was not found, one that rejects it."""
-
-    @property
-    def verdict(self) -> Verdict:
-        """That of the worst finding."""
-        return verdict_of(self.findings)
-
-    @property
-    def converged(self) -> bool:
-        """Whether it is accepted."""
-        return self.verdict != "rejected"
-
-    @property
-    def doubt(self) -> str | None:
-        """Why it is rejected, in words; None when it is not."""
-        return doubt_of(self.findings)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for each finding that rejects or warns."""
-        return warnings_of(self.findings)
 
     @property
     def std_at_scene(self) -> float | None:

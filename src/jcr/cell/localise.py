@@ -36,6 +36,8 @@ LEAST_SPREAD = 0.05
 TRIALS = 20_000
 FEW = 120
 """Points by SIFT below which networks look for more."""
+CLEARLY_MORE = 1.1
+"""Times the points that agree with given intrinsics: more are no chance of RANSAC."""
 SAME_VIEW = np.radians(5.0)
 """By which the place with these may be rotated against that without."""
 
@@ -180,7 +182,10 @@ def _located(
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     candidate = np.flatnonzero(good)
-    placed = _placed(seen.x_px[candidate], points[candidate], intrinsics, is_given, seed)
+    x_px, points_seen = seen.x_px[candidate], points[candidate]
+    placed = _placed(x_px, points_seen, intrinsics, is_given, seed)
+    if is_given:
+        placed = _with_more(placed, _placed(x_px, points_seen, intrinsics, False, seed))
     if placed is None:
         return 0
     recon_from_camera, intrinsics, inlier = placed
@@ -210,14 +215,25 @@ def _located(
     )
 
 
+def _with_more(given: "_Place | None", free: "_Place | None") -> "_Place | None":
+    """The place with the given intrinsics, unless one with another focal length explains clearly more points: wrong
+    intrinsics leave those points that agree with a wrong place."""
+    of_given, of_free = (0 if place is None else int(place[2].sum()) for place in (given, free))
+    return free if of_free > CLEARLY_MORE * of_given else given
+
+
+_Place = tuple[Float[ndarray, "4 4"], Intrinsics, ndarray]
+"""Pose, intrinsics and inliers."""
+
+
 def _placed(
     x_px: Float[ndarray, "p 2"],
     points: Float[ndarray, "p 3"],
     intrinsics: Intrinsics,
     is_given: bool,
     seed: int,
-) -> tuple[Float[ndarray, "4 4"], Intrinsics, ndarray] | None:
-    """Pose, intrinsics and inliers; None where no pose has enough of these."""
+) -> _Place | None:
+    """None where no pose has enough of these."""
     estimation, refinement = (
         pycolmap.AbsolutePoseEstimationOptions(),
         pycolmap.AbsolutePoseRefinementOptions(),

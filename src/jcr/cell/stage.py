@@ -13,15 +13,19 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.adjust.images import RigInformation, median_reprojection_px
-from jcr.adjust.intrinsics_prior import prior_about
-from jcr.adjust.robots import Adjusted, ArmPoses, Placed, adjust
+from jcr.adjust.intrinsics_prior import ESTIMATED, prior_about, prior_of
+from jcr.adjust.robots import Adjusted, ArmPoses, Placed
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.calibration.case import MIN_OBSERVATIONS, of_images
+from jcr.calibration.checks.camera import camera_faults, with_contradiction
+from jcr.calibration.checks.given_intrinsics import contradicted_by
+from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
+from jcr.cell.images import CellImages
 from jcr.cell.localise import (
     LEAST_SPREAD,
     Known,
@@ -33,12 +37,14 @@ from jcr.cell.localise import (
     spread,
 )
 from jcr.geometry import inverse, motion_length, scale_translation, step_between
+from jcr.handeye.bent import bends
 from jcr.handeye.solve import MAX_STD, solve_hand_eye
 from jcr.handeye.systematic import smooth_errors
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress, silent, steps
 from jcr.reconstruct.least_squares_matching import KEYPOINT_STD_PX
 from jcr.records import (
+    BENT,
     Capture,
     CellCamera,
     Finding,
@@ -47,7 +53,6 @@ from jcr.records import (
     Kind,
     Mend,
     Reconstruction,
-    strongest_first,
 )
 
 SAME_PLACE = (0.02, np.radians(2.0))
@@ -56,6 +61,11 @@ SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
 """Of the distance of the scene, rad: the same where a focal length estimated from one image is in it."""
 MEDIAN_PX = 3.0
 """Images of a camera that miss by more, of one 1600 px wide, do not fit one place."""
+FAR_FROM_GRIPPER = 0.5
+"""m: the camera of a gripper that is farther from its frame is likely to be another's."""
+SURE_OF_INTRINSICS = 3.5
+"""Standard deviations from which a further camera's images are said to contradict its intrinsics: one image of 127
+points showed those of another camera, 3.5 % too long, by 4.4."""
 AT_A_FRAME = (0.01, np.radians(1.0))
 """m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
 EXACT = 1e-6
@@ -116,13 +126,13 @@ def place_cameras(
             placed.append(member)
     if not placed:
         return CellFound(tuple(failed), (), None)
-    answer, medians = _adjusted(capture, reconstruction, hand_eye, known, placed, rigs, options)
+    images = _images_of(capture, reconstruction, hand_eye, known, placed, rigs, options)
     of = {member.camera.name: _place_of(member, c) for c, member in enumerate(placed, start=1)}
-    cameras = {
-        member.camera.name: _found(member, c, answer, of[member.camera.name], medians, hand_eye)
-        for c, member in enumerate(placed, start=1)
-    }
-    cameras |= {camera.name: camera for camera in failed}
+    answer, faults = _examined(images, placed, list(of.values()), hand_eye)
+    cameras = {camera.name: camera for camera in failed}
+    for c, (member, shown) in enumerate(zip(placed, faults, strict=True), start=1):
+        name = member.camera.name
+        cameras[name] = _with_faults(_found(member, c, answer, of[name], hand_eye), member, shown)
     arms = []
     for k, arm in enumerate(rigs.arms, start=1):
         transform, covariance = answer.transform(lambda p, k=k: p.z[0] @ inverse(p.z[k]))
@@ -182,6 +192,12 @@ class _Seen:
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
         return intrinsics or best.intrinsics
 
+    @property
+    def agrees_with_given(self) -> bool:
+        """Whether all places were found with intrinsics that were given, and none with a focal length of its own."""
+        intrinsics, _ = usable_lens(self.camera.intrinsics)
+        return all(one is None or one.intrinsics == intrinsics for one in self.shared)
+
     def without(self, reasons: Mapping[int, str]) -> "_Seen":
         """With why some images are not used."""
         return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
@@ -227,6 +243,11 @@ class _Member:
     def camera(self) -> CellCamera:
         return self.seen.camera
 
+    @property
+    def used(self) -> list[tuple[int, Shared]]:
+        """The images that are used, with their numbers."""
+        return [(k, one) for k, one in enumerate(self.seen.shared) if one is not None and self.rig[k] >= 0]
+
 
 class _Rigs:
     """What moves as one: the capture's own camera at each used image, then what other cameras add."""
@@ -255,7 +276,7 @@ class _Rigs:
         apart = step_between(places[:, None], places[None])
         metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
         most_m, most_rad = SAME_PLACE
-        if seen.camera.intrinsics is None:
+        if not seen.agrees_with_given:
             most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
         if metres.max() > most_m or radians.max() > most_rad:
             a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
@@ -300,7 +321,11 @@ class _Rigs:
         taken = np.flatnonzero(rig >= 0)
         if not len(taken):
             return seen.refused(Kind.NO_COMMON_POSE, "images")
-        on_rig = inverse(np.stack(self.poses)[rig[taken]]) @ seen.places[np.isin(seen.rows, taken)]
+        wrist = np.stack(self.poses)[rig[taken]]
+        if not _differ(wrist):
+            names = tuple(seen.camera.images[k] for k in taken)
+            return seen.refused(Kind.ONE_GRIPPER_POSE, "images", names)
+        on_rig = inverse(wrist) @ seen.places[np.isin(seen.rows, taken)]
         between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
         middle = int(np.median(between, axis=1).argmin())
         off = step_between(on_rig[middle], on_rig)
@@ -341,9 +366,12 @@ class _Rigs:
         """The arms, the capture's own first."""
         robot = robot_errors(self._capture, options).of(self._rows)
         hand_eye = self._hand_eye
+        poses = self._capture.base_from_gripper[self._rows]
+        bent = [one.kind for one in hand_eye.findings if one.kind in BENT]
         first = ArmPoses(
             rigs=np.arange(len(self._rows)),
-            base_from_gripper=self._capture.base_from_gripper[self._rows],
+            base_from_gripper=poses,
+            bent=bends(bent, poses) if bent else None,
             systematic=robot.systematic,
             start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
         )
@@ -359,7 +387,14 @@ class _Rigs:
         return [first, *others]
 
 
-def _adjusted(
+def _differ(places: Float[ndarray, "k 4 4"]) -> bool:
+    """Whether two of them are farther apart than SAME_PLACE."""
+    apart = step_between(places[:, None], places[None])
+    metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
+    return bool((metres > SAME_PLACE[0]).any() or (radians > SAME_PLACE[1]).any())
+
+
+def _images_of(
     capture: Capture,
     reconstruction: Reconstruction,
     hand_eye: HandEye,
@@ -367,24 +402,21 @@ def _adjusted(
     members: Sequence[_Member],
     rigs: _Rigs,
     options: CalibrateOptions,
-) -> tuple[Adjusted, dict[tuple[str, int], float]]:
-    """All images adjusted together, and the median reprojection error (px) of each camera's by their number."""
+) -> CellImages:
+    """All images; those of the further cameras follow the own camera's, camera by camera, as they are used."""
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     prior = None
     # Where bundle adjustment did not decide the calibration, the images' own geometry is not believed here either.
     if hand_eye.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
-    rig, camera, number = list(range(m)), [0] * m, dict[tuple[str, int], int]()
+    rig, camera = list(range(m)), [0] * m
     image, x_px, point = [own.image], [own.x_px], [own.point]
     std_px = [np.full(len(own.image), KEYPOINT_STD_PX) if own.std_px is None else own.std_px]
     points = [hand_eye.scale * own.points_in_recon.astype(float)]
     count = len(own.points_in_recon)
     for c, member in enumerate(members, start=1):
-        for k, one in enumerate(member.seen.shared):
-            if one is None or member.rig[k] < 0:
-                continue
-            number[member.camera.name, k] = len(rig)
+        for k, one in member.used:
             n = len(one.x_px)
             image += [np.full(n, len(rig)), one.row]
             x_px += [one.x_px, one.row_x_px]
@@ -396,14 +428,14 @@ def _adjusted(
             camera.append(c)
     mounts = [np.eye(4) if one.rig_from_camera is None else one.rig_from_camera for one in members]
     cameras = (reconstruction.intrinsics, *(member.seen.intrinsics for member in members))
-    adjusted = adjust(
-        Scene(
+    return CellImages(
+        scene=Scene(
             world_from_rig=np.stack(rigs.poses),
             rig_from_camera=np.stack([np.eye(4), *mounts]),
             cameras=cameras,
             points_in_world=np.concatenate(points),
         ),
-        Observations(
+        observations=Observations(
             rig=np.array(rig),
             camera=np.array(camera),
             image=np.concatenate(image),
@@ -411,24 +443,32 @@ def _adjusted(
             point=np.concatenate(point),
             std_px=np.concatenate(std_px),
         ),
-        _freedom(capture, members, cameras, len(rig)),
-        rigs.arm_poses(options),
-        options.robot_noise_m_rad,
-        prior,
+        freedom=_freedom(capture, hand_eye, members, cameras, len(rig)),
+        arms=rigs.arm_poses(options),
+        noise=options.robot_noise_m_rad,
+        prior=prior,
     )
-    evidence = adjusted.given.evidence
-    medians = median_reprojection_px(evidence.view, evidence.problem)
-    return adjusted, {key: float(medians[row]) for key, row in number.items()}
 
 
 def _freedom(
-    capture: Capture, members: Sequence[_Member], cameras: Sequence[Intrinsics], images: int
+    capture: Capture,
+    hand_eye: HandEye,
+    members: Sequence[_Member],
+    cameras: Sequence[Intrinsics],
+    images: int,
 ) -> Freedom:
-    """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig."""
-    sources = (capture, *(member.camera for member in members))
+    """Intrinsics free about what was given or found of each camera; a mount only beside another camera on its rig.
+
+    Those that the own camera's images contradict were found, not given.
+    """
+    contradicted = any(one.kind is Kind.INTRINSICS and one.shift is None for one in hand_eye.findings)
+    own = prior_about(cameras[0], capture.intrinsics is not None and not contradicted, capture.intrinsics_std)
     priors = [
-        prior_about(start, source.intrinsics is not None, source.intrinsics_std)
-        for start, source in zip(cameras, sources, strict=True)
+        own,
+        *(
+            prior_about(start, member.camera.intrinsics is not None, member.camera.intrinsics_std)
+            for start, member in zip(cameras[1:], members, strict=True)
+        ),
     ]
     return Freedom.of(
         cameras, priors, images, [False, *(member.rig_from_camera is not None for member in members)]
@@ -459,19 +499,76 @@ def _place_of(member: _Member, c: int) -> Callable[[Placed], Float[ndarray, "4 4
     return parent_from_camera
 
 
+def _examined(
+    images: CellImages,
+    members: Sequence[_Member],
+    places: Sequence[Callable[[Placed], Float[ndarray, "4 4"]]],
+    hand_eye: HandEye,
+) -> tuple[Adjusted, list[tuple[Finding, ...]]]:
+    """All images adjusted, and what those of each camera show against it (calibration/checks/camera.py).
+
+    Where they contradict intrinsics that were given, or leave doubt of them, the images are adjusted as if none had
+    been: of one image the given ones would weigh more than what it shows, and the answer be wrong by many sigmas.
+    """
+    answer, found = images.adjusted(), list[tuple[Finding, ...]]()
+    for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
+        if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is held against itself
+            found.append(())
+            continue
+        is_given = member.camera.intrinsics is not None
+        imaged = _imaged(images, answer, _found(member, c, answer, place, hand_eye), c, place, is_given)
+        faults = camera_faults(imaged)
+        contradiction = None
+        if is_given and all(one.kind is Kind.INTRINSICS for one in faults):
+            contradiction = contradicted_by(imaged, SURE_OF_INTRINSICS)
+        if contradiction is not None:
+            answer, contradicted = contradiction
+            images = images.with_freed(prior_of(imaged.start, ESTIMATED), c)
+            faults = with_contradiction(faults, (contradicted,))
+        found.append(faults)
+    return answer, found
+
+
+def _imaged(
+    images: CellImages,
+    answer: Adjusted,
+    found: CameraFound,
+    c: int,
+    place: Callable[[Placed], Float[ndarray, "4 4"]],
+    is_given: bool,
+) -> Imaged:
+    """A further camera, the c-th, as its checks take it."""
+    assert found.covariance is not None
+    return Imaged(
+        adjusted=answer,
+        adjust=lambda prior, combinations: images.with_freed(prior, c, combinations).adjusted(),
+        names=[image.image for image in found.images if image.used],
+        start=images.freedom.start[c],
+        is_given=is_given,
+        prior=images.freedom.intrinsics[c],
+        std=np.sqrt(np.diag(found.covariance)) * found.converged,
+        answer=lambda adjusted: (place(adjusted.placed), adjusted.placed.scale),
+        camera=c,
+        place=place,
+    )
+
+
 def _found(
     member: _Member,
     c: int,
     answer: Adjusted,
     parent_from_camera: Callable[[Placed], Float[ndarray, "4 4"]],
-    medians: dict[tuple[str, int], float],
     hand_eye: HandEye,
 ) -> CameraFound:
-    camera = member.camera
+    """Where the camera, the c-th, is, and what its place says against it."""
+    camera, evidence = member.camera, answer.given.evidence
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)
+    of_all = median_reprojection_px(evidence.view, evidence.problem)
+    medians = of_all[evidence.problem.observations.camera == c].tolist()
+    px = dict(zip((k for k, _ in member.used), medians, strict=True))
     images = tuple(
-        ImageFound(image, reason is None, count, medians.get((camera.name, k)), reason)
+        ImageFound(image, reason is None, count, px.get(k), reason)
         for k, (image, count, reason) in enumerate(
             zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
         )
@@ -489,9 +586,22 @@ def _found(
     )
     # An image that contradicts the place also makes it uncertain.
     doubt = _misses(found, member) or _uncertain(found, member)
-    checked = (doubt, *member.findings, _crowded(member))
-    findings = [finding for finding in checked if finding is not None]
-    return replace(found, findings=strongest_first(findings))
+    checked = (doubt, *member.findings, _crowded(member), far_from_gripper(found))
+    return found.with_findings(*(finding for finding in checked if finding is not None))
+
+
+def _with_faults(found: CameraFound, member: _Member, faults: tuple[Finding, ...]) -> CameraFound:
+    """A camera with what its images show against it, and with the shifts of that in its covariance.
+
+    Such a fault explains a rejection, and rejects where its shift makes the place too uncertain.
+    """
+    assert found.covariance is not None
+    for fault in faults:
+        found = replace(found, covariance=found.covariance + fault.covariance[:6, :6])
+        if not found.converged or _uncertain(found, member) is not None:
+            fault = replace(fault, severity="rejects")
+        found = found.with_findings(fault)
+    return found
 
 
 def _by_faults(
@@ -549,3 +659,12 @@ def _crowded(member: _Member) -> Finding | None:
     if widest >= LEAST_SPREAD:
         return None
     return Finding(kind=Kind.POINTS_CROWDED, severity="warns", mend="images", value=widest)
+
+
+def far_from_gripper(found: CameraFound) -> Finding | None:
+    """That a camera said to be on a gripper is far from it."""
+    assert found.parent_from_camera is not None
+    away = float(np.linalg.norm(found.parent_from_camera[:3, 3]))
+    if found.mount == "base" or away <= FAR_FROM_GRIPPER:
+        return None
+    return Finding(kind=Kind.FAR_FROM_GRIPPER, severity="warns", mend="mount", value=away)

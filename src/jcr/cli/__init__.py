@@ -3,7 +3,7 @@
 A command's module has a frozen dataclass `Arguments`, whose docstring is the help (with examples) and whose
 field docstrings are the help of its options, and a function `main(Arguments) -> int` that gives the exit
 status: 0 done, 2 the user's input is wrong, 3 rejected, 1 a bug. Each has an `output` (output.py): with
---json its result is one JSON object on stdout, with --quiet nothing but an error comes on stderr.
+--json its result is one JSON object on stdout, with --quiet nothing but errors and warnings comes on stderr.
 """
 
 import contextlib
@@ -17,6 +17,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from jcr.cli.output import Quiet
 from jcr.errors import InputError, NotTrustedError, did_you_mean, printable
 from jcr.memory import MORE_MEMORY, require_address_space
 
@@ -224,8 +225,9 @@ def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
     require_address_space()
     with contextlib.ExitStack() as silence:
         if parsed.output.quiet:
-            nowhere = silence.enter_context(open(os.devnull, "w", encoding="utf-8"))
-            silence.enter_context(contextlib.redirect_stderr(nowhere))
+            nowhere = silence.enter_context(open(os.devnull, "wb"))
+            quiet = silence.enter_context(Quiet(nowhere, sys.stderr))
+            silence.enter_context(contextlib.redirect_stderr(quiet))
         return command.main(parsed)
 
 

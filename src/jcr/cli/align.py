@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from jcr.cli.output import Output
+from jcr.cli.output import Output, warn
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 
 
@@ -57,7 +57,7 @@ def main(arguments: Arguments) -> int:
             pair_residual=alignment.pair_residual,
         )
     for warning in alignment.warnings:
-        sys.stderr.write(f"warning: {warning}\n")
+        warn(warning)
     for note in alignment.notes:
         sys.stderr.write(f"note: {note}\n")
     residual = float(np.median(alignment.pair_residual))

@@ -92,9 +92,10 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
         _as_read(capture),
         f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {turn:.0f}°",
     ]
-    if found.expected is not None:
+    # Of what disagrees, what was expected of it and how well the rest agrees are no comfort.
+    if found.expected is not None and not found.faults:
         lines += _expected(found.expected, len(found.counted), found.hand_eye is not None)
-    if found.hand_eye is not None:
+    if found.hand_eye is not None and not found.faults:
         noise = found.hand_eye.robot_noise
         looked = len(found.hand_eye.inliers)
         agreement = f"{1e3 * noise.translation:.2f} mm and {np.degrees(noise.rotation):.3f}°"

@@ -7,7 +7,7 @@ from typing import Annotated, get_args
 
 import tyro
 
-from jcr.cli.output import Output
+from jcr.cli.output import Output, warn
 from jcr.export.options import ExportOptions, FormatName
 
 
@@ -61,5 +61,5 @@ def main(arguments: Arguments) -> int:
         facts["line"] = line
     arguments.output.result(line and line + "\n", facts)
     if run.doubt is not None:
-        sys.stderr.write(f"warning: the calibration is rejected, as the file says too: {run.doubt}\n")
+        warn(f"the calibration is rejected, as the file says too: {run.doubt}")
     return 0

@@ -1,9 +1,11 @@
 """What every command says and where: its result on stdout, all else on stderr."""
 
+import io
 import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -13,9 +15,23 @@ class Output:
     json: bool = False
     """Print the result as one JSON object."""
     quiet: bool = False
-    """Print only errors on stderr: no progress, notes or warnings."""
+    """Print only errors and warnings on stderr: no progress, no notes."""
 
     def result(self, text: str, facts: Mapping[str, object]) -> None:
         """Print the result at once: `facts` with --json, else the text for people."""
         sys.stdout.write(json.dumps(facts) + "\n" if self.json else text)
         sys.stdout.flush()
+
+
+class Quiet(io.TextIOWrapper):
+    """Stderr with --quiet: what is written to it is not seen, but for warnings, which go where all went before."""
+
+    def __init__(self, nowhere: io.BufferedWriter, before: Any) -> None:
+        super().__init__(nowhere, encoding="utf-8")
+        self.before = before
+
+
+def warn(text: str) -> None:
+    """Print what asks the user to act on stderr, with --quiet too."""
+    stream = sys.stderr.before if isinstance(sys.stderr, Quiet) else sys.stderr
+    stream.write(f"warning: {text}\n")

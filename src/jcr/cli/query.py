@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.capture.plain_files import read_npy
@@ -55,7 +55,7 @@ def main(arguments: Arguments) -> int:
     columns = (*columns, red, green, blue, sample.label)
     rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
     unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(rows) else "none"
-    told = f"{len(rows)} points, {unseen}\n"
+    told = f"{len(rows)} points, {unseen}{labelled(sample.label, scene.label_names)}\n"
     answers: dict[str, object] = {"label_names": list(scene.label_names)}
     if arguments.output.json:
         answers |= {name: _finite(rows[name]) for name in _COLUMNS.split(",")}
@@ -65,6 +65,13 @@ def main(arguments: Arguments) -> int:
         told = f"wrote {path}: {told}"
     arguments.output.result(told, answers)
     return 0
+
+
+def labelled(label: Int[ndarray, " n"], names: tuple[str, ...]) -> str:
+    """How many points lie on what; nothing where the map has no labels but that of none."""
+    count = np.bincount(label, minlength=len(names))
+    parts = [f"{names[k]} {count[k]}" for k in range(1, len(names)) if count[k]]
+    return f"; by label: {', '.join(parts)}" if parts else ""
 
 
 def _write(path: Path, rows: "np.recarray[Any, Any]") -> None:

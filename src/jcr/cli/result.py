@@ -4,7 +4,7 @@ import shlex
 import sys
 from typing import TYPE_CHECKING
 
-from jcr.cli.output import Output
+from jcr.cli.output import Output, warn
 from jcr.errors import NotTrustedError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
     text += f"{verdict_in_words(content)}\n"
     output.result(text + after + _next_commands(result), facts)
     for remark in content.remarks:
-        sys.stderr.write(f"warning: {remark}\n")
+        warn(remark)
     # Notes on poses that were given are the reader's, which has printed them.
     for note in () if isinstance(result, PosesResult) else content.notes:
         sys.stderr.write(f"note: {note}\n")
@@ -48,7 +48,7 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
         if camera.doubt is not None:
             raise NotTrustedError(f"camera {camera.name} is rejected: {camera.doubt}")
     if content.short is not None:
-        sys.stderr.write(f"warning: {sentence(content.short)}\n")
+        warn(sentence(content.short))
     return 0
 
 

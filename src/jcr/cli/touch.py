@@ -14,8 +14,9 @@ class Arguments:
     """Measure the error in task space: touch points with a calibrated tip and compare them with the map.
 
     OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the
-    run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). Use three or more
-    points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
+    run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). report.html shows
+    the pixel under the pointer in an image that is opened large, and a click copies it as image,x_px,y_px. Use three or
+    more points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
     than the reported uncertainty explains.
 
     examples:

@@ -1,6 +1,5 @@
 """`jcr verify`: has the camera moved since it was calibrated?"""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +8,7 @@ import numpy as np
 import tyro
 
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output
+from jcr.cli.output import Output, warn
 from jcr.cli.source import looked_at
 from jcr.verify import VerifyOptions
 
@@ -74,7 +73,7 @@ def _told(found: "Verification", output: Output) -> int:
 
     output.result(_as_text(found), _as_json(found))
     for note in found.notes:
-        sys.stderr.write(f"warning: {note}\n")
+        warn(note)
     if found.moved:
         raise NotTrustedError(found.advice)
     return 0

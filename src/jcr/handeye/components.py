@@ -80,6 +80,8 @@ class Equations:
     """Covariance of the systematic part where σ_s is 1 rad; None: there is none."""
     given: tuple[float, float] | None = None
     """σ_t and σ_r as the user gave them (m, rad): no less is counted."""
+    bent: Float[ndarray, "s s"] | None = None
+    """Covariance of errors that were found beside (bent.py), whatever the sizes of the others are."""
 
     @property
     def least(self) -> Float[ndarray, "2"]:
@@ -135,8 +137,9 @@ class Equations:
         covariance = np.zeros((*random.shape, random.shape[-1]))
         if self.systematic is not None:
             covariance += self.variances(log_sizes)[..., 2, None, None] * self.systematic
-        if self.known is not None:
-            covariance += self.known
+        for part in (self.known, self.bent):
+            if part is not None:
+                covariance += part
         diagonal = np.arange(random.shape[-1])
         covariance[..., diagonal, diagonal] += random
         return covariance
@@ -545,6 +548,8 @@ def _budget(
     systematic = np.zeros_like(random)
     if exact.systematic is not None:
         systematic = exact.variances(log_sizes)[2] * gain @ exact.systematic @ gain.T
+    if exact.bent is not None:
+        systematic = systematic + gain @ exact.bent @ gain.T
     # What neither robot nor cameras show.
     images = solution.covariance @ exact.prior_information @ solution.covariance
     if exact.known is not None:

@@ -128,6 +128,8 @@ class Backend:
     """Whether its scale is metres already; None: its input says."""
     auto: bool = False
     """Whether `auto` may take it, where its package and its weights are on this machine."""
+    tests_camera: bool = True
+    """Whether its calibrations are tested for a camera that is not as given: by points found in the images alone."""
     options: tuple[str, ...] = ()
     """Fields of ReconstructOptions that it uses and not every back end does."""
     selected_by: str = ""
@@ -182,6 +184,7 @@ BACKENDS: dict[str, Backend] = {
             f"{CC_BY_NC_SA}, and the licences of its training data (its CHECKPOINTS_NOTICE)",
             metric=True,
             auto=True,
+            tests_camera=False,
             options=("weights", "pair_graph"),
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
             package="torch",
@@ -195,6 +198,7 @@ BACKENDS: dict[str, Backend] = {
             _dust3r,
             CC_BY_NC_SA,
             auto=True,
+            tests_camera=False,
             options=("weights", "pair_graph"),
             selected_by="weights",
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
@@ -218,6 +222,7 @@ BACKENDS: dict[str, Backend] = {
             _views_at_once,
             "Apache-2.0",
             auto=True,
+            tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-BASE",
             package="depth_anything_3",
@@ -232,6 +237,7 @@ BACKENDS: dict[str, Backend] = {
             _views_at_once,
             "Apache-2.0",
             auto=True,
+            tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-SMALL",
             package="depth_anything_3",
@@ -247,6 +253,7 @@ BACKENDS: dict[str, Backend] = {
             "Apache-2.0",
             metric=True,
             auto=True,
+            tests_camera=False,
             options=("weights",),
             hub_id="facebook/map-anything-apache",
             package="mapanything",
@@ -259,6 +266,7 @@ BACKENDS: dict[str, Backend] = {
             _direct,
             "Apache-2.0",
             auto=True,
+            tests_camera=False,
             accuracy="0.10 mm and 0.012° on printed, 0.29 mm and 0.023° on plain simulated tables "
             "(jcr docs plain-tables)",
         ),
@@ -289,6 +297,7 @@ BACKENDS: dict[str, Backend] = {
             _predictions,
             "your network's",
             metric=None,
+            tests_camera=False,
             options=("predictions",),
             selected_by="predictions",
             keeps_order=True,

@@ -466,6 +466,7 @@ def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstructio
         f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images ({reason})",
         "put textured objects or a newspaper on the table, let the views overlap more, or use a foundation-model back "
         "end or a marker",
+        despite_texture=features >= _FEW_FEATURES,
     )
 
 

@@ -4,6 +4,7 @@ Frames: `base`, `gripper`, `camera` (OpenCV optical: x right, y down, z forward)
 and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Metres and radians.
 """
 
+from jcr.records.assessed import Assessed
 from jcr.records.calibration import (
     COVARIANCE_ORDER,
     AngleRatio,
@@ -46,16 +47,20 @@ from jcr.records.capture import (
 )
 from jcr.records.cloud import PointCloud
 from jcr.records.findings import (
+    BENT,
     CAMERA,
     CAUSES,
+    LASTING,
     Finding,
     Kind,
     Mend,
     Severity,
     Verdict,
+    is_explained,
     no_reconstruction,
     strongest_first,
     verdict_of,
+    without_consequences,
 )
 from jcr.records.reconstruction import (
     BOTH,
@@ -70,11 +75,14 @@ from jcr.records.reconstruction import (
 
 __all__ = [
     "AngleRatio",
+    "Assessed",
     "Attempt",
+    "BENT",
     "BOTH",
     "Budget",
     "CAMERA",
     "CAUSES",
+    "LASTING",
     "COVARIANCE_ORDER",
     "CameraEvidence",
     "COEFFICIENTS",
@@ -122,7 +130,9 @@ __all__ = [
     "WithGivenIntrinsics",
     "WithGivenIntrinsics",
     "coefficients_of",
+    "is_explained",
     "no_reconstruction",
     "strongest_first",
     "verdict_of",
+    "without_consequences",
 ]

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
-from jcr.records.findings import Finding, Kind, Verdict, strongest_first, verdict_of
-from jcr.records.words import doubt_of, remedy, unobservable, warnings_of
+from jcr.records.findings import Finding, Kind, verdict_of
+from jcr.records.words import remedy, unobservable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,12 +311,27 @@ class Estimate:
         known = self.intrinsics_covariance
         return None if known is None else np.sqrt(np.diag(known))
 
-    def with_fault(self, covariance: Float[ndarray, "7 7"]) -> "Estimate":
-        """The same, as uncertain as a fault with this covariance makes it."""
-        budget = self.budget
+    def with_fault(
+        self,
+        covariance: Float[ndarray, "7 7"],
+        shifts: tuple[Float[ndarray, "7"], Float[ndarray, " q"]] | None = None,
+    ) -> "Estimate":
+        """The same, as uncertain as a fault with this covariance makes it.
+
+        `shifts` are those of COVARIANCE_ORDER and of camera.parameters together, where the intrinsics move with it.
+        """
+        budget, cross, known = self.budget, self.intrinsics_cross, self.intrinsics_covariance
         if budget is not None:
             budget = replace(budget, faults=budget.faults + covariance)
-        return replace(self, covariance=self.covariance + covariance, budget=budget)
+        if shifts is not None and cross is not None and known is not None:
+            cross, known = cross + np.outer(*shifts), known + np.outer(shifts[1], shifts[1])
+        return replace(
+            self,
+            covariance=self.covariance + covariance,
+            budget=budget,
+            intrinsics_cross=cross,
+            intrinsics_covariance=known,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -386,7 +402,7 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandEye:
+class HandEye(Assessed):
     """The calibration: where the camera sits on the gripper, the metric scale, and how far to trust both."""
 
     estimate: Estimate
@@ -400,14 +416,8 @@ class HandEye:
     """How exactly it places points; None where the solver was asked and not the calibration stage."""
     with_given_intrinsics: WithGivenIntrinsics | None = None
     """None where no intrinsics were given, or they were not estimated beside that."""
-    findings: tuple[Finding, ...] = ()
-    """Strongest first; of the same severity causes before consequences."""
     before: "HandEye | None" = None
     """The fit to camera poses alone; None where that decided."""
-
-    def with_findings(self, *findings: Finding) -> "HandEye":
-        """The same with more findings, each in its place."""
-        return replace(self, findings=strongest_first((*self.findings, *findings)))
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -465,29 +475,9 @@ class HandEye:
         return Observability(tuple(one for one in self.findings if one.kind is Kind.UNOBSERVABLE))
 
     @property
-    def verdict(self) -> Verdict:
-        """That of the worst finding."""
-        return verdict_of(self.findings)
-
-    @property
-    def converged(self) -> bool:
-        """Whether it is accepted."""
-        return self.verdict != "rejected"
-
-    @property
     def is_sound(self) -> bool:
         """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
         return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
-
-    @property
-    def doubt(self) -> str | None:
-        """Why it is rejected, in words; None when it is not."""
-        return doubt_of(self.findings)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for each finding that rejects or warns."""
-        return warnings_of(self.findings)
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,8 @@ class Capture:
     """Of the arm, where it was given."""
     orientation: int = 1
     """EXIF's, of all images: 1 as the sensor has them; others were rotated upright, and the camera frame is theirs."""
+    pose_convention: str | None = None
+    """How its robot writes poses, a name of capture.robot_poses.CONVENTIONS; None where its file does not tell."""
     depths: tuple[str | None, ...] | None = None
     """Of a depth camera, an image each or None: 16-bit PNG in mm, aligned with the images, relative to `folder`."""
     camera_name: str = "wrist"

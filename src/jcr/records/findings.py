@@ -1,6 +1,6 @@
 """What was found to speak against a calibration, or to be worth knowing: data, from which `words.py` makes sentences."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -35,6 +35,8 @@ class Kind(StrEnum):
     ZOOM = "focal length changed once"
     ROLLING_SHUTTER = "images sheared alike"
     ROLLING_SHUTTER_BY_IMAGE = "images sheared each by itself"
+    THIN_PRISM = "thin prism"
+    CENTRE_SAGS = "principal point moves with gravity"
     INTRINSICS = "intrinsics contradict the images"
     SLIP = "camera moved on the gripper"
     DRIFT = "camera drifts on the gripper"
@@ -43,6 +45,9 @@ class Kind(StrEnum):
     ROBOT_UNUSED = "robot not used"
     SYSTEMATIC_ERRORS = "systematic robot errors"
     JOINT_OFFSETS = "joint offsets"
+    LENGTHS = "robot lengths differ by direction"
+    BASE_LEANS = "robot base leans with reach"
+    TOOL_SAGS = "tool sags"
     ANGLE_RATIO = "camera and gripper angles differ"
     BOARD_SIZE = "board size contradicts the robot"
     NETWORK_SCALE = "a network's metre contradicts the robot"
@@ -57,15 +62,19 @@ class Kind(StrEnum):
     FEW_POINTS_SHARED = "few points shared with the scene"
     FEW_LOCALISED = "few images localised"
     NO_COMMON_POSE = "no image taken with one that is used"
+    ONE_GRIPPER_POSE = "camera seen at one gripper pose"
     SECOND_ON_ARM = "second camera on another arm"
     NOT_FIXED = "camera not fixed"
     NOT_RIGID = "camera not rigid on the gripper"
+    FAR_FROM_GRIPPER = "camera far from the gripper"
     IMAGE_MISSES = "image contradicts the camera's place"
     PLACE_UNCERTAIN = "camera's place too uncertain"
     AT_ANOTHER_CAMERA = "camera stands where another was"
     POINTS_CROWDED = "points crowded"
     ANOTHER_SCENE = "camera sees another scene"
     STATIC_IMAGES = "images show no motion"
+    BLURRED = "images blurred"
+    FEW_USED = "few images used"
     POSES_SWAPPED = "gripper poses exchanged"
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image"
 
@@ -90,6 +99,9 @@ class Finding:
     shift: tuple[float, ...] | None = None
     """How far the calibration would move if this were allowed for, in COVARIANCE_ORDER; its outer product is part of
     the covariance. None where it adds nothing."""
+    intrinsics_shift: tuple[float, ...] | None = None
+    """How far the intrinsics would move with it, in the order of camera.parameters: what they make good of `shift` harms
+    nobody who uses both. None where it is of X alone."""
     details: Mapping[str, float | str] = field(default_factory=dict)
     """Further numbers (m, rad, px, shares) and names that the sentence needs."""
 
@@ -117,28 +129,74 @@ CAMERA = frozenset(
         Kind.ZOOM,
         Kind.ROLLING_SHUTTER,
         Kind.ROLLING_SHUTTER_BY_IMAGE,
+        Kind.THIN_PRISM,
+        Kind.CENTRE_SAGS,
         Kind.INTRINSICS,
     }
 )
 """Kinds that say that the camera is not one with these intrinsics."""
-CAUSES = CAMERA | {
-    Kind.BOARD_SIZE,
-    Kind.SLIP,
-    Kind.DRIFT,
-    Kind.DELAY,
-    Kind.POSE_CONVENTION,
-    Kind.WRONG_MOUNT,
-    Kind.STATIC_IMAGES,
-    Kind.POSES_SWAPPED,
-}
+BENT = frozenset({Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
+"""Kinds that say that the robot's poses are bent by where the gripper is."""
+LASTING = (
+    CAMERA
+    | BENT
+    | {
+        Kind.BOARD_SIZE,
+        Kind.SLIP,
+        Kind.DRIFT,
+        Kind.DELAY,
+        Kind.POSE_CONVENTION,
+        Kind.WRONG_MOUNT,
+        Kind.STATIC_IMAGES,
+        Kind.BLURRED,
+        Kind.POSES_SWAPPED,
+    }
+)
+"""Kinds about camera, robot, mount and order: they hold for every reconstruction of the same images."""
+CAUSES = LASTING | {Kind.FEW_USED}
 """Kinds that explain others: what is uncertain, or does not fit, is so because of them."""
+OF_IMAGES = frozenset({Kind.STATIC_IMAGES, Kind.BLURRED})
+"""Kinds that the images show without any pose; they explain other causes, too."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
 
 def strongest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What rejects, then what warns, then what informs; of the same severity causes, then their consequences, each in
-    the order given."""
-    return tuple(sorted(findings, key=lambda finding: (RANK[finding.severity], finding.kind not in CAUSES)))
+    """What rejects, then what warns, then what informs; of the same severity causes, those of the images first, then
+    their consequences, each in the order given."""
+
+    def place(finding: Finding) -> tuple[int, bool, bool]:
+        return RANK[finding.severity], finding.kind not in OF_IMAGES, finding.kind not in CAUSES
+
+    return tuple(sorted(findings, key=place))
+
+
+CONSEQUENCES = frozenset(
+    {
+        Kind.FEW_AGREE,
+        Kind.POSES_CONTRADICT_IMAGES,
+        Kind.NOISE_ABOVE_GIVEN,
+        Kind.UNCERTAIN,
+        Kind.LEAVE_ONE_OUT,
+    }
+)
+"""Kinds that are so because of what rejects a calibration, where that is a cause."""
+OF_FEW_IMAGES = frozenset({Kind.UNOBSERVABLE, Kind.SLIP, Kind.DRIFT, Kind.DELAY})
+"""Those that are so, too, where too few of the images could be used."""
+
+
+def is_explained(findings: Sequence[Finding]) -> bool:
+    """Whether what rejects a calibration is a cause, against which neither more images nor other motions help."""
+    return bool(findings) and findings[0].severity == "rejects" and findings[0].kind in CAUSES
+
+
+def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings, strongest first, without those that the first one explains: their remedies are none."""
+    if not is_explained(findings):
+        return tuple(findings)
+    first, *others = findings
+    few = first.kind in OF_IMAGES or first.kind is Kind.FEW_USED
+    explained = CONSEQUENCES | (OF_FEW_IMAGES if few else frozenset())
+    return (first, *(one for one in others if one.kind not in explained))
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:

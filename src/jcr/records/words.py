@@ -141,6 +141,9 @@ def unobservable(finding: Finding) -> str:
 
 
 def _to_observe(finding: Finding) -> str:
+    # Of images that are missing the motions would do: moving otherwise is no remedy.
+    if finding.mend != "motion":
+        return ""
     return _UNSEEN[str(finding.details["motion"])][1].format(**_of_axis(finding))
 
 
@@ -246,6 +249,14 @@ def _left_out(finding: Finding) -> str:
     return f"{_said(much, finding)} ({typical}): too few images for this motion"
 
 
+def _blurred(finding: Finding) -> str:
+    edges = _said("edges {value:.0f} px wide", finding)
+    if len(finding.images) == 1:
+        return f"{finding.images[0]} is blurred ({edges})"
+    count = f"{len(finding.images)} of {_number(finding, 'of'):.0f}"
+    return f"{count} images are blurred, such as {finding.images[0]} ({edges})"
+
+
 # The camera.
 
 
@@ -342,6 +353,28 @@ def _joints_off(finding: Finding) -> str:
     )
     named = f"joint{'s' * (len(finding.joints) > 1)} {joined(str(k) for k in finding.joints)}"
     return f"robot: {named} seem off by {sizes} ({_said('{rough_chance}', finding)})"
+
+
+def _lengths(finding: Finding) -> str:
+    value, std = _value_and_std(finding)
+    size = f"{100 * abs(value):.1f} ± {significant(100 * std)} % too {'long' if value > 0 else 'short'}"
+    return (
+        f"along {_of_axis(finding)['axis']} the robot's positions are {size} beside those across it "
+        f"({_said('{chance}', finding)})"
+    )
+
+
+def _leans(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    which = "leans towards the gripper" if size > 0 else "leans away from the gripper"
+    by = f"{abs(size):.1f} ± {significant(std)}° per metre of reach"
+    return f"the robot's base {which} by {by}, which its poses do not say ({_said('{chance}', finding)})"
+
+
+def _sags(finding: Finding) -> str:
+    size, std = (np.degrees(number) for number in _value_and_std(finding))
+    by = f"{size:.2f} ± {significant(std)}° where it is level"
+    return f"the gripper rotates by {by}, as a tool does that sags under its weight ({_said('{chance}', finding)})"
 
 
 def _angles_differ(finding: Finding) -> str:
@@ -441,6 +474,14 @@ _TEXT: dict[Kind, Words] = {
         "each image is sheared by itself, {value:.1f} px from top to bottom (rms, {chance}), as by the rolling shutter "
         "of a moving camera"
     ),
+    Kind.THIN_PRISM: (
+        "the images show a thin-prism distortion of up to {value:.1f} ± {std} px ({chance}), for which the intrinsics "
+        "have no coefficients: the sensor is tilted, or the optics are decentred"
+    ),
+    Kind.CENTRE_SAGS: (
+        "the principal point moves with gravity, by {value:.1f} ± {std} px when it lies in the image ({chance}): the "
+        "optics are image-stabilised or loose"
+    ),
     Kind.INTRINSICS: _intrinsics,
     Kind.SLIP: (
         "the camera seems to have moved on the gripper by {mm:.1f} mm and {deg:.2f}° after {images[0]} ({chance})"
@@ -457,6 +498,9 @@ _TEXT: dict[Kind, Words] = {
         "offsets or link errors"
     ),
     Kind.JOINT_OFFSETS: _joints_off,
+    Kind.LENGTHS: _lengths,
+    Kind.BASE_LEANS: _leans,
+    Kind.TOOL_SAGS: _sags,
     Kind.ANGLE_RATIO: _angles_differ,
     Kind.BOARD_SIZE: _board_size,
     Kind.NETWORK_SCALE: lambda f: network_scale(*(100 * x for x in _value_and_std(f))),
@@ -477,6 +521,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.FEW_POINTS_SHARED: "{images[0]} shares {value:.0f} points with the mapped scene, too few",
     Kind.FEW_LOCALISED: "{value:.0f} of its images share enough of the mapped scene; {needed:.0f} are needed",
     Kind.NO_COMMON_POSE: "none of its images was taken with an image that is used",
+    Kind.ONE_GRIPPER_POSE: (
+        "its images show one gripper pose only: whether it is on the gripper, and at which frame each image was taken, "
+        "cannot be tested"
+    ),
     Kind.SECOND_ON_ARM: "a second camera on arm {arm}: one each is supported",
     Kind.NOT_FIXED: (
         "{images[0]} and {images[1]} were taken from places {mm:.0f} mm and {deg:.1f}° apart: it is not fixed"
@@ -485,6 +533,7 @@ _TEXT: dict[Kind, Words] = {
         "its place beside the {camera} camera differs by up to {mm:.0f} mm between images: the two are not rigid, or "
         "the images are not of the frames that they stand for"
     ),
+    Kind.FAR_FROM_GRIPPER: "it is {value:.2f} m from the gripper's frame",
     Kind.IMAGE_MISSES: _misses,
     Kind.PLACE_UNCERTAIN: _place_uncertain,
     Kind.AT_ANOTHER_CAMERA: (
@@ -494,6 +543,10 @@ _TEXT: dict[Kind, Words] = {
     Kind.ANOTHER_SCENE: _another_scene,
     Kind.STATIC_IMAGES: (
         "all images show the same view but for noise, while the gripper moves by {mm:.0f} mm and rotates by {deg:.0f}°"
+    ),
+    Kind.BLURRED: _blurred,
+    Kind.FEW_USED: (
+        "only {value:.0f} of {of:.0f} images are used, and their motions alone are degenerate, those of all are not"
     ),
     Kind.POSES_SWAPPED: "{images[0]} and {images[1]} have each other's gripper pose",
     Kind.POSE_CONTRADICTS_IMAGE: (
@@ -514,11 +567,18 @@ _REMEDY: dict[Kind, Words] = {
     Kind.ZOOM: "calibrate the images before or after it, or --focus varies",
     Kind.ROLLING_SHUTTER: AT_REST,
     Kind.ROLLING_SHUTTER_BY_IMAGE: AT_REST,
+    Kind.THIN_PRISM: (
+        "undistort the images with OpenCV's thin prism model (CALIB_THIN_PRISM_MODEL) and give the intrinsics of these"
+    ),
+    Kind.CENTRE_SAGS: "switch image stabilisation off, or fix the optics",
     Kind.INTRINSICS: CALIBRATE_INTRINSICS,
     Kind.SLIP: _one_part,
     Kind.DRIFT: "tighten its mount, let it warm up, and take the images again",
     Kind.DELAY: "stop the arm at each image, or read pose and image by the same clock",
     Kind.WRONG_MOUNT: "write mount gripper for {camera}",
+    Kind.LENGTHS: "check that axis (a lift, a rail, a gantry): its gear ratio, its unit",
+    Kind.BASE_LEANS: "bolt the stand to the floor, or brace it",
+    Kind.TOOL_SAGS: "stiffen its mount, and check the zero of the wrist's joints, which looks like it",
     Kind.BOARD_SIZE: _to_size,
     Kind.NETWORK_SCALE: "check the unit of the gripper poses",
     Kind.SCALE_FROM_ROBOT: "the size of a board or --known-length would show it",
@@ -532,12 +592,16 @@ _REMEDY: dict[Kind, Words] = {
     Kind.EARLIER_VERSION: _given_remedy,
     Kind.FEW_POINTS_SHARED: "it must see the same scene, unchanged, from a direction not too different",
     Kind.FEW_LOCALISED: "add images of the mapped scene",
+    Kind.ONE_GRIPPER_POSE: ("add an image at another gripper pose, or write mount base for a fixed camera"),
+    Kind.FAR_FROM_GRIPPER: "check that it is on the gripper, and that the images are of the frames that they stand for",
     Kind.NOT_FIXED: "of a camera on the gripper write mount gripper, of several cameras give each its own name",
     Kind.PLACE_UNCERTAIN: _to_place,
     Kind.POINTS_CROWDED: "more of the scene in view would help",
     Kind.STATIC_IMAGES: (
         "check that the camera is on the gripper and its stream is live, and take each image at its own pose"
     ),
+    Kind.BLURRED: "take them again at rest, in focus and with more light",
+    Kind.FEW_USED: "let the views overlap more and show more texture, or use a board (jcr docs markers)",
     Kind.POSES_SWAPPED: "exchange the two poses",
     Kind.POSE_CONTRADICTS_IMAGE: "correct that pose, or drop the image",
 }

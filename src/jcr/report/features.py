@@ -37,8 +37,8 @@ def features_section(result: RunResult) -> str:
         "features.html",
         say=f"{len(tracks.image)} observations of {len(tracks.points_in_recon)} points lie in {covered:.0f} % of the "
         f"cells of the frame; half of the 3D points fall within {half} px of them.{low}",
-        coverage=grid_figure("Features over the frame, all images", count),
-        errors=bars_figure("Reprojection errors, px", *histogram(errors), "observations"),
+        coverage=grid_figure("Features over the frame, all images", count, "features in a cell"),
+        errors=bars_figure("Reprojection errors", *histogram(errors), "observations", "px"),
     )
 
 

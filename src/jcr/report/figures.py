@@ -78,8 +78,8 @@ def camera_figure(
     return _svg(parts, title)
 
 
-def grid_figure(title: str, count: Int[ndarray, "rows columns"]) -> str:
-    """Cells of an image, the fuller the darker; empty ones are hatched."""
+def grid_figure(title: str, count: Int[ndarray, "rows columns"], what: str) -> str:
+    """Cells of an image, the fuller the darker; empty ones are hatched. The legend says of what they are full."""
     rows, columns = count.shape
     side = WIDTH / columns
     full = max(float(np.percentile(count[count > 0], 95)), 1.0) if (count > 0).any() else 1.0
@@ -94,13 +94,23 @@ def grid_figure(title: str, count: Int[ndarray, "rows columns"]) -> str:
             f'<rect x="{column * side:.1f}" y="{26 + row * side:.1f}" width="{side - 1:.1f}" height="{side - 1:.1f}" '
             f"{kind}><title>{number} features</title></rect>"
         )
-    return _svg(parts, title, 26 + rows * side)
+    below = 26 + rows * side + 8
+    legend = [("0", 'class="unknown"'), ("1", 'class="cell" fill-opacity="0.15"')]
+    legend.append((f"{full:.0f} or more", 'class="cell" fill-opacity="1"'))
+    for k, (text, kind) in enumerate(legend):
+        x = 60.0 * k
+        parts.append(f'<rect x="{x:.1f}" y="{below:.1f}" width="12" height="12" {kind}></rect>')
+        parts.append(_text(x + 17, below + 11, f"{text} {what}" if k == len(legend) - 1 else text, "small"))
+    return _svg(parts, title, below + 16)
 
 
-def bars_figure(title: str, count: Int[ndarray, " b"], edge: Float[ndarray, " c"], what: str) -> str:
-    """A histogram, its first and last edge named."""
-    high, width = HEIGHT - 60, WIDTH / len(count)
+def bars_figure(
+    title: str, count: Int[ndarray, " b"], edge: Float[ndarray, " c"], what: str, unit: str
+) -> str:
+    """A histogram, its first and last edge and its highest bar named."""
+    high, width = HEIGHT - 78, WIDTH / len(count)
     parts = [_text(0.0, 16.0, title, "title")]
+    parts.append(_text(WIDTH, 28.0, f"highest: {int(count.max())} {what}", "small end"))
     for k, number in enumerate(count.tolist()):
         tall = high * number / max(int(count.max()), 1)
         parts.append(
@@ -111,7 +121,8 @@ def bars_figure(title: str, count: Int[ndarray, " b"], edge: Float[ndarray, " c"
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         kind = "small" if share == 0 else "small end" if share == 1 else "small middle"
         more = " and more" if share == 1 else ""
-        parts.append(_text(share * WIDTH, HEIGHT - 14, f"{share * float(edge[-1]):.2g}{more}", kind))
+        parts.append(_text(share * WIDTH, HEIGHT - 32, f"{share * float(edge[-1]):.2g}{more}", kind))
+    parts.append(_text(WIDTH / 2, HEIGHT - 14, unit, "small middle"))
     return _svg(parts, title)
 
 

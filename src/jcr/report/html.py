@@ -3,6 +3,7 @@
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from html import escape
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +20,8 @@ from jcr.calibration.words import (
     missed,
     pixels,
 )
+from jcr.capture.capture_json import origin
+from jcr.capture.table import TABLES
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, Kind, verdict_of
@@ -31,7 +34,7 @@ from jcr.report.map_samples import sample_surface
 from jcr.report.markup import PAGE, filled
 from jcr.report.motion import motion_section
 from jcr.report.object_table import objects_section
-from jcr.report.pictures import images_section, thumbnails
+from jcr.report.pictures import images_section, pixels_of_file, thumbnails
 from jcr.report.residual_bars import residuals_section
 from jcr.report.scene3d import scene_section
 from jcr.report.seen import seen_section
@@ -45,6 +48,10 @@ SURFACE_POINTS = 80_000
 MAIN = ("A seen point", "Translation, 1 σ", "Rotation, 1 σ")
 """The tiles with the largest numbers."""
 
+UNNAMED = {
+    Path(name).stem for name in (*TABLES, "capture.json", "cal_data.yaml", "transforms.json", "metadata.yaml")
+}
+"""Files that are called so in every capture."""
 ANY_LENS = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
 """Of the cameras that are drawn where nobody says what they saw."""
 LINKS = {
@@ -86,7 +93,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
             residuals_section(result),
             _details(calibration, options or {}),
         ]
-        return _page(capture.folder, calibration, sections)
+        return _page(_heading(capture, options or {}), origin(capture.folder), calibration, sections)
     base_from_camera = hand_eye.base_from_recon @ scale_translation(
         reconstruction.recon_from_camera, hand_eye.scale
     )
@@ -115,7 +122,7 @@ def report_html(result: RunResult, options: Options | None = None) -> str:
         else objects_section(result.measured, result.scene.label_names),
         _details(calibration, options or {}, {} if result.scene is None else result.scene.history),
     ]
-    return _page(capture.folder, calibration, sections)
+    return _page(_heading(capture, options or {}), origin(capture.folder), calibration, sections)
 
 
 def poses_report_html(result: PosesResult, options: Options | None = None) -> str:
@@ -134,7 +141,7 @@ def poses_report_html(result: PosesResult, options: Options | None = None) -> st
         _before_after(pairs.base_from_gripper, *cameras, result.image_index, ANY_LENS),
         _details(calibration, options or {}),
     ]
-    return _page(pairs.source, calibration, sections)
+    return _page("poses given, no images", pairs.source, calibration, sections)
 
 
 def failed_report_html(capture: Capture, calibration: CalibrationFile, options: Options | None = None) -> str:
@@ -147,10 +154,16 @@ def failed_report_html(capture: Capture, calibration: CalibrationFile, options: 
     say = "What the camera saw. Without texture, overlap or light no features are found in them."
     sections = [
         _failure(calibration),
-        filled("images.html", say=say, about="", cards=cards),
+        filled(
+            "images.html",
+            say=say,
+            about="",
+            cards=cards,
+            pixels=pixels_of_file(capture.intrinsics, capture.image_size),
+        ),
         _details(calibration, options or {}),
     ]
-    return _page(capture.folder, calibration, sections)
+    return _page(_heading(capture, options or {}), origin(capture.folder), calibration, sections)
 
 
 def _failure(calibration: CalibrationFile) -> str:
@@ -173,11 +186,25 @@ def _failure(calibration: CalibrationFile) -> str:
     )
 
 
-def _page(source: Path, calibration: CalibrationFile, sections: Sequence[str]) -> str:
+def _heading(capture: Capture, options: Options) -> str:
+    """The arm and the camera of a capture, as far as it says."""
+    width, height = capture.image_size
+    given = "given" if capture.intrinsics is not None else "estimated"
+    robot = options.get("calibrate", {}).get("robot") or capture.robot
+    arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
+    return f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
+
+
+def _page(heading: str, source: Path, calibration: CalibrationFile, sections: Sequence[str]) -> str:
+    """`heading` says of what the calibration is, `source` is the capture as the user named it."""
+    # The table or the bag's metadata are called alike in every capture: their folder has the name.
+    named = source.parent if source.stem in UNNAMED else source
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    about = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
     return filled(
         "page.html",
-        name=escape(source.resolve().name),
-        about=f"{len(calibration.images)} images · back end {escape(calibration.backend)} · jcr {calibration.version}",
+        name=escape(named.resolve().name),
+        about=f"{escape(heading)}<br>{escape(about)}<br>{escape(str(source))}",
         style=(PAGE / "page.css").read_text("utf-8"),
         sections="\n".join(sections),
         links=_links(sections),
@@ -295,7 +322,7 @@ def _details(
     for k, attempt in enumerate(calibration.attempts if found else [], start=1):
         blocks["Time"][f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
     if (lens := calibration.intrinsics) is not None:
-        blocks["Lens"] = {
+        blocks["Intrinsics"] = {
             "size": f"{lens.width} × {lens.height} px",
             "focal length": f"{lens.fx:.2f}, {lens.fy:.2f}{_plus_minus(lens.std, 0)} px",
             "principal point": f"{lens.cx:.2f}, {lens.cy:.2f}{_plus_minus(lens.std, 2)} px",

@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 
+from jcr.capture.robot_poses import CONVENTIONS, OF_ARM, numbers_from_poses, units_of
 from jcr.handeye.observability import WEAK
 from jcr.records import Excitation, NextPose
 from jcr.report.markup import filled
@@ -13,6 +14,7 @@ from jcr.report.transform import copy_button
 from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
+ANY_CONVENTION = "quat-xyzw"
 PARTS = ("translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale")
 """Of a direction, in records.COVARIANCE_ORDER."""
 NAMED = 0.4
@@ -28,7 +30,10 @@ def motion_section(result: RunResult | PosesResult) -> str:
     says = "<p>The motions show every direction of the calibration: offset, orientation and scale.</p>"
     if not observed.observable:
         pairs = zip(observed.unobservable, observed.advice, strict=False)
-        items = "".join(f"<li><b>{escape(name)}</b>; remedy: {escape(cure)}</li>" for name, cure in pairs)
+        items = "".join(
+            f"<li><b>{escape(name)}</b>{'; remedy: ' if remedy else ''}{escape(remedy)}</li>"
+            for name, remedy in pairs
+        )
         says = f"<p>The motions leave unseen:</p><ul>{items}</ul>"
     spreads = ""
     if uncertainty is not None:
@@ -82,24 +87,44 @@ def _next_poses(result: RunResult | PosesResult) -> str:
     poses, told = result.hand_eye.next_poses, result.calibration.next_poses
     if not poses:
         return ""
+    convention = _convention(result)
     rows = "".join(
-        _next_pose(number, pose, like.like)
+        _next_pose(number, pose, like.like, convention)
         for number, (pose, like) in enumerate(zip(poses, told, strict=True), 1)
     )
+    columns = ", ".join(CONVENTIONS[convention].columns)
+    matrix = convention in ("franka", "matrix")
+    written = f"the matrix by {'columns' if convention == 'franka' else 'rows'}" if matrix else columns
+    notation = f"{written} ({units_of(convention)}), as {convention} writes poses"
     green = " The 3D view shows them in green." if isinstance(result, RunResult) else ""
     return (
         '<h3>Poses to add</h3><p class="soft">Gripper poses that would make a seen point most exact, one after the '
-        f"other, in reach of those of the capture; look that the arm is free to go there.{green}</p>"
-        '<div class="scroll"><table><thead><tr><th></th><th>from</th><th>by</th><th>then a seen point, 95\u00a0%</th>'
+        f"other, in reach of those of the capture; look that the arm is free to go there.{green} Numbers: "
+        f"{escape(notation)}; matrix copies base_from_gripper (m).</p>"
+        '<div class="scroll"><table><thead><tr><th></th><th>pose</th><th>from</th><th>by</th><th>then a seen point, '
+        "95\u00a0%</th>"
         f"<th>the camera, 1\u00a0σ</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )
 
 
-def _next_pose(number: int, pose: NextPose, near: str) -> str:
+def _convention(result: RunResult | PosesResult) -> str:
+    """How the capture's robot writes poses; a quaternion where neither its file nor its arm tells."""
+    if not isinstance(result, RunResult):
+        return ANY_CONVENTION
+    capture = result.capture
+    return capture.pose_convention or OF_ARM.get(capture.robot or "") or ANY_CONVENTION
+
+
+def _next_pose(number: int, pose: NextPose, near: str, convention: str) -> str:
     std = pose.expected_std
-    copy = copy_button(json.dumps(pose.base_from_gripper.round(6).tolist()), f"pose {number}")
+    numbers = numbers_from_poses(pose.base_from_gripper[None], convention)[0]
+    written = ", ".join(f"{value:.4f}" for value in numbers)
+    matrix = json.dumps(pose.base_from_gripper.round(6).tolist())
+    shown = "" if len(numbers) == 16 else f"<code>{written}</code> "
     cells = (
-        f"{escape(near)} {copy}",
+        f"{shown}{copy_button(written, f'pose {number}')} "
+        f"{copy_button(matrix, f'pose {number} as a matrix').replace('>copy<', '>matrix<')}",
+        escape(near),
         f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.turned_rad):.0f}°",
         f"{significant(pose.within_95_mm)}\u00a0mm, {significant(pose.rotation_95_deg)}°",
         f"±{significant(1e3 * float(std[:3].max()))}\u00a0mm, "

@@ -1,5 +1,6 @@
 """The section that goes through the images: what each shows, and how well its features fit."""
 
+import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
@@ -21,6 +22,10 @@ LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
 """Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""
 MARKS, MAGNIFIED = 120, 20
 """Features drawn over each image, and how many times their reprojection errors are drawn longer."""
+
+
+GRID = 17
+"""Points to a side at which the pixels of an image's file are given; between them they are interpolated."""
 
 
 def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
@@ -65,7 +70,18 @@ def images_section(result: RunResult) -> str:
         "distance between its features and their 3D points (pixels). Marks are features that other images show too, "
         f"each with the way to where its 3D point falls, {MAGNIFIED} times as long."
     )
-    return filled("images.html", say=say, about=about, cards="".join(cards))
+    pixels = pixels_of_file(result.lens, result.capture.image_size)
+    return filled("images.html", say=say, about=about, cards="".join(cards), pixels=pixels)
+
+
+def pixels_of_file(lens: Intrinsics | None, size: tuple[int, int]) -> str:
+    """JSON: x and y, in the image file, of a grid of points over an image as it is shown, which is undistorted."""
+    u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
+    shown = np.stack(np.meshgrid(u, v), axis=-1)
+    if lens is not None and is_distorted(lens):
+        shown = project(lens, unproject(without_distortion(lens), shown))
+    x, y = np.moveaxis(shown.round(1), -1, 0).tolist()
+    return json.dumps({"x": x, "y": y})
 
 
 def _reprojections(result: RunResult) -> dict[int, str]:

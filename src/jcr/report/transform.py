@@ -3,6 +3,8 @@
 import json
 from html import escape
 
+import numpy as np
+
 from jcr.export.ros import (
     BASE,
     CHILD,
@@ -12,10 +14,10 @@ from jcr.export.ros import (
     static_transform_publisher,
     urdf_origin,
 )
-from jcr.records import HandEye, Mount
+from jcr.records import COVARIANCE_ORDER, HandEye, Mount
 from jcr.report.markup import filled
 from jcr.report.notations import Notation, matrix_json, notations
-from jcr.rounding import significant
+from jcr.rounding import decimals_of, significant
 
 
 def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> str:
@@ -25,9 +27,19 @@ def transform_section(hand_eye: HandEye, mount: Mount = "gripper") -> str:
     """
     x, parent = hand_eye.gripper_from_camera, PARENT if mount == "gripper" else BASE
     ros, urdf = static_transform_publisher(parent, CHILD, x), urdf_origin(x)
+    std = np.sqrt(np.diag(hand_eye.covariance))
+    turn, along = decimals_of(float(std[3:6].max())), decimals_of(float(std[:3].max()))
+    rows = [
+        "".join(f"{value:>{turn + 5}.{turn}f}" for value in row[:3]) + f"{row[3]:>{along + 5}.{along}f}"
+        for row in x
+    ]
+    covariance = json.dumps({"order": COVARIANCE_ORDER, "covariance": hand_eye.covariance.tolist()})
     return filled(
         "transform.html",
-        matrix="\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in x),
+        matrix="\n".join(rows),
+        copy_covariance=copy_button(covariance, "the covariance"),
+        covariance="\n".join(" ".join(f"{value:>10.2e}" for value in row) for row in hand_eye.covariance),
+        order=", ".join(COVARIANCE_ORDER),
         copy_matrix=copy_button(matrix_json(x), "the matrix"),
         notations="\n".join(_notation(part) for part in notations(x, hand_eye.covariance)),
         ros=escape(ros),
@@ -63,9 +75,9 @@ def _camera_info(hand_eye: HandEye) -> str:
 
 def _notation(part: Notation) -> str:
     unit = {"": "", "deg": "°"}.get(part.unit, f" {part.unit}")
-    decimals = 4 if part.unit == "deg" else 6
     rows = []
     for name, value, std in zip(part.components, part.value, part.std, strict=True):
+        decimals = decimals_of(float(std))
         spread = f"{significant(1e3 * std)} mm" if part.unit == "m" else f"{significant(std)}{unit}"
         rows.append(
             f'<tr><td>{name}</td><td class="value">{value:.{decimals}f}{unit}</td>'

@@ -1,8 +1,9 @@
 """Is it one camera in all images? A focus that moves, a zoom, a rolling shutter, intrinsics that are a little wrong.
 
 Each is a hypothesis of adjust/score_test.py, tested beside a focal length that is wrong by one factor in all images. The
-images are adjusted with the one of least p free, which shows its value and what it does to the calibration; then the
-next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last.
+images are adjusted with the one of least p free, which shows its value and what it does to the camera's place; then the
+next is tested beside it. Whether intrinsics that were given can be those of the images at all is asked last. A capture's
+own camera and a further one of a cell are tested alike (imaged.py).
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.adjust.model_error import TYPICAL
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import (
     Alternatives,
@@ -21,16 +23,18 @@ from jcr.adjust.score_test import (
     alternatives,
     beyond_prior,
     differences,
+    nuisances_of,
     spanned,
     tested,
 )
-from jcr.calibration.adjust import adjust_case, estimate_of, focal_of_each
+from jcr.calibration.adjust import adjust_case, focal_of_each
 from jcr.calibration.case import Case, of_points
 from jcr.calibration.checks.checked import Checked
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
+from jcr.calibration.checks.imaged import Combinations, Imaged, of_case
 from jcr.camera import parameter_names, parameters
 from jcr.geometry import step_between
-from jcr.records import Finding, Intrinsics, Kind, Tracks
+from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
 
 LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
@@ -42,13 +46,20 @@ AT_ONCE = 2
 """Faults named of one capture."""
 MOST_POINTS, WELL_SEEN = 800, 3
 """Points that take part, first those in this many images: more tell a fault no better, and take time."""
-LEAST_SHEAR_PX = 3.0
-"""From top to bottom; less of it than this is what a distortion model leaves over."""
+LEAST_PX = {
+    Kind.ROLLING_SHUTTER: 3.0,
+    Kind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
+    Kind.CENTRE_SAGS: 3.0,
+    Kind.THIN_PRISM: 1.0,
+}
+"""What is measured in pixels and smaller is what a distortion model leaves over."""
 MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
 """Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
+MENDS: dict[Kind, Mend] = {Kind.THIN_PRISM: "intrinsics", Kind.CENTRE_SAGS: "mount"}
+"""What would help where other images would not."""
 FOCUS = {"distance", "scatter", "zoom"}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
@@ -61,20 +72,30 @@ def check_camera(case: Case) -> Checked:
 
     With `focus` "varies" a focal length of each image is free already and is no finding.
     """
-    faults = _faults(case)
-    if case.capture.intrinsics is None:
+    imaged = of_case(_of_fewer_points(case))
+    faults = camera_faults(imaged)
+    if not imaged.is_given:
         return Checked(faults)
-    of_intrinsics = next((one for one in faults if one.kind is Kind.INTRINSICS), None)
-    if faults and of_intrinsics is None:
+    if faults and not any(one.kind is Kind.INTRINSICS for one in faults):
         return Checked(faults)
     checked = intrinsics_contradiction(case)
-    if not checked.findings:
-        return Checked(faults)
-    (contradiction,) = checked.findings
-    if of_intrinsics is not None:
-        contradiction = replace(of_intrinsics, shift=contradiction.shift)
-    others = [one for one in faults if one.kind is not Kind.INTRINSICS]
-    return replace(checked, findings=(*others, contradiction))
+    return replace(checked, findings=with_contradiction(faults, checked.findings))
+
+
+def with_contradiction(
+    faults: tuple[Finding, ...], contradiction: tuple[Finding, ...]
+) -> tuple[Finding, ...]:
+    """What was found of one camera, where its given intrinsics are contradicted as a whole: with the parameters that a
+    test of these named, if it did."""
+    if not contradiction:
+        return faults
+    (whole,) = contradiction
+    named = [
+        replace(one, shift=whole.shift, intrinsics_shift=None)
+        for one in faults
+        if one.kind is Kind.INTRINSICS
+    ]
+    return (*(one for one in faults if one.kind is not Kind.INTRINSICS), *(named or [whole]))
 
 
 @dataclass(frozen=True)
@@ -104,48 +125,53 @@ class _Hypothesis:
 class _State:
     """The images adjusted with some hypotheses free."""
 
-    case: Case
-    """With the tracks that take part."""
+    imaged: Imaged
     found: tuple[_Hypothesis, ...]
     adjusted: Adjusted
 
     @staticmethod
-    def of(case: Case, found: tuple[_Hypothesis, ...]) -> "_State":
+    def of(imaged: Imaged, found: tuple[_Hypothesis, ...]) -> "_State":
         """Adjusted again: while what was found distorted the images, the robot pose noise was another one."""
-        combinations = np.concatenate([one.both for one in found], axis=1) if found else None
-        return _State(case, found, adjust_case(case, combinations=combinations))
+        combinations = np.concatenate([one.both for one in found], axis=1)
+        return _State(imaged, found, imaged.adjust(imaged.prior, combinations))
 
     @cached_property
     def equations(self) -> Alternatives:
         """Of what may be freed beside."""
-        return alternatives(self.adjusted, self.case.intrinsics_prior)
+        imaged = self.imaged
+        return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place)
+
+    @cached_property
+    def equations_of_a_good_camera(self) -> Alternatives:
+        """The same where its model may leave as little as that of a good camera: the rest needs another explanation."""
+        imaged = self.imaged
+        return alternatives(self.adjusted, imaged.prior, imaged.camera, imaged.place, TYPICAL)
 
     @property
     def camera(self) -> Intrinsics:
         """As adjusted."""
-        return self.adjusted.given.evidence.scene.cameras[0]
+        return self.adjusted.given.evidence.scene.cameras[self.imaged.camera]
 
     @property
     def total(self) -> Float[ndarray, " e"]:
         """How far the columns that may be freed are from where they start."""
-        evidence = self.adjusted.given.evidence
-        of_camera = beyond_prior(self.adjusted, self.case.intrinsics_prior) / self.equations.units
-        return np.r_[of_camera, evidence.scene.nuisances(evidence.problem.freedom).ravel()]
+        evidence, imaged = self.adjusted.given.evidence, self.imaged
+        of_camera = beyond_prior(self.adjusted, imaged.prior, imaged.camera) / self.equations.units
+        of_all = evidence.scene.nuisances(evidence.problem.freedom)
+        return np.r_[of_camera, of_all[nuisances_of(imaged.images, len(evidence.problem.observations.rig))]]
 
     def shift_from(self, before: "_State") -> Float[ndarray, "7"]:
-        """How far the calibration is from what it was, in records.COVARIANCE_ORDER."""
-        then, now = (estimate_of(one.adjusted, one.case.tracks) for one in (before, self))
-        step = step_between(then.gripper_from_camera, now.gripper_from_camera)
-        return np.r_[step, np.log(now.scale / then.scale)]
+        """How far the camera's place is from what it was, in records.COVARIANCE_ORDER."""
+        (then, scale), (now, new_scale) = (self.imaged.answer(one.adjusted) for one in (before, self))
+        return np.r_[step_between(then, now), np.log(new_scale / scale)]
 
 
-def _faults(case: Case) -> tuple[Finding, ...]:
-    """What speaks against one camera, at most AT_ONCE of it."""
-    if len(case.used) < MIN_IMAGES:
+def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
+    """What speaks against one camera in all its images, at most AT_ONCE of it."""
+    if len(imaged.names) < MIN_IMAGES:
         return ()
-    # A calibration that is rejected has no uncertainty beside which a fault could be small.
-    std = np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged
-    state = _begun(case)
+    found = () if imaged.free is None else (_freed_before(imaged.free),)
+    state = _State(imaged, found, imaged.adjusted)
     named: list[Finding] = []
     dismissed: list[_Hypothesis] = []
     while len(named) < AT_ONCE:
@@ -154,58 +180,65 @@ def _faults(case: Case) -> tuple[Finding, ...]:
             break
         alone = tested(state.equations, best.both, _all(state))
         after = None
-        if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * std).any():
+        if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * imaged.std).any():
             after = _with(state, best)
-        if after is None or not _is_material(after, state, std):
+        found = None if after is None else _finding(after, state, alone)
+        if after is None or found is None or not _is_material(found, imaged.std):
             dismissed.append(best)
             continue
-        named.append(_finding(after, state, alone))
+        named.append(found)
         state = after
     return tuple(named)
 
 
-def _begun(case: Case) -> _State:
-    """The images as adjusted, of no more points than are needed."""
-    assert case.adjusted is not None
+def _freed_before(free: Combinations) -> _Hypothesis:
+    """A focal length of each image that is free as the user asked."""
+    return _Hypothesis("scatter", free, np.zeros((len(free), 0)))
+
+
+def _of_fewer_points(case: Case) -> Case:
+    """The case as adjusted, of no more points than are needed."""
     tracks = case.tracks
-    found: tuple[_Hypothesis, ...] = ()
-    if case.options.focus == "varies":
-        found = (_Hypothesis("scatter", focal_of_each(case), np.zeros((len(focal_of_each(case)), 0))),)
-    if len(np.unique(tracks.point)) <= MOST_POINTS:
-        return _State(case, found, case.adjusted)
-    return _State.of(case.with_tracks(_some(tracks)), found)
+    if len(case.used) < MIN_IMAGES or len(np.unique(tracks.point)) <= MOST_POINTS:
+        return case
+    fewer = case.with_tracks(_some(tracks))
+    varies = case.options.focus == "varies"
+    return replace(fewer, adjusted=adjust_case(fewer, combinations=focal_of_each(case) if varies else None))
 
 
 def _with(state: _State, best: _Hypothesis) -> _State | None:
     """Adjusted with one more hypothesis free, or with the simpler one that explains nearly the same; None where the
     images then show nothing any more."""
     try:
-        after = _State.of(state.case, (*state.found, best))
+        after = _State.of(state.imaged, (*state.found, best))
         simple = _simpler(after) if best.kind == "scatter" else None
-        return after if simple is None else _State.of(state.case, (*state.found, simple))
+        return after if simple is None else _State.of(state.imaged, (*state.found, simple))
     except np.linalg.LinAlgError:
         return None
 
 
-def _is_material(after: _State, before: _State, std: Float[ndarray, "6"]) -> bool:
+def _is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     """Whether what was freed is large enough to be a fault, and moves the calibration."""
-    m = after.equations.images
-    shear = after.total[-m:]
-    small = np.sqrt(np.mean(shear**2)) * after.camera.fx < LEAST_SHEAR_PX
-    if after.found[-1].kind.startswith("shear") and small:
+    if found.value is not None and found.value < LEAST_PX.get(found.kind, -np.inf):
         return False
-    return bool((np.abs(after.shift_from(before)[:6]) > MATERIAL * std).any())
+    assert found.shift is not None
+    return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
 
 
 def _finding(after: _State, before: _State, alone: Tested) -> Finding:
     """The last hypothesis that was freed, as a finding."""
-    best, equations = after.found[-1], after.equations
-    last = tested(equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
+    best = after.found[-1]
+    last = tested(after.equations, best.free, np.concatenate([_all(before), best.beside], axis=1))
     p = float(np.exp(max(alone.log_p + np.log(best.places), -700)))
-    names = [after.case.names[row] for row in after.case.used]
-    given = after.case.reconstruction.intrinsics
-    size = _size(best, after.total, last, equations, given, after.camera, names)
-    return Finding(severity="warns", p=p, shift=tuple(after.shift_from(before).tolist()), **size)
+    size = _of_intrinsics(after, last) if best.of_intrinsics else _size(after, last)
+    moved = parameters(after.camera) - parameters(before.camera)
+    return Finding(
+        severity="warns",
+        p=p,
+        shift=tuple(after.shift_from(before).tolist()),
+        intrinsics_shift=tuple(moved.tolist()),
+        **size,
+    )
 
 
 def _some(tracks: Tracks, seed: int = 0) -> Tracks:
@@ -225,16 +258,25 @@ def _all(state: _State) -> Float[ndarray, "e r"]:
 
 
 def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis | None:
-    """The hypothesis of least p, if that is little enough to be believed."""
-    before, result = _all(state), None
-    for candidate in _hypotheses(state):
-        if any(_alike(candidate, one) for one in (*state.found, *dismissed)):
-            continue
-        beside = np.concatenate([before, candidate.beside], axis=1)
-        log_p = tested(state.equations, candidate.free, beside).log_p + np.log(candidate.places)
-        if result is None or log_p < result[0]:
-            result = log_p, candidate
-    return None if result is None or result[0] > LOG_P else result[1]
+    """Of the hypotheses whose p is little enough to be believed the one that explains most.
+
+    What the camera's model leaves grows with whatever is wrong, until every explanation gains as little. Which of them
+    is the right one shows where it may not.
+    """
+    believed = [
+        one
+        for one in _hypotheses(state)
+        if not any(_alike(one, other) for other in (*state.found, *dismissed))
+        and _log_p(one, state, state.equations) <= LOG_P
+    ]
+    if len(believed) < 2:
+        return believed[0] if believed else None
+    return min(believed, key=lambda one: _log_p(one, state, state.equations_of_a_good_camera))
+
+
+def _log_p(one: _Hypothesis, state: _State, equations: Alternatives) -> float:
+    beside = np.concatenate([_all(state), one.beside], axis=1)
+    return tested(equations, one.free, beside).log_p + float(np.log(one.places))
 
 
 def _alike(one: _Hypothesis, other: _Hypothesis) -> bool:
@@ -277,47 +319,69 @@ def _hypotheses(state: _State) -> list[_Hypothesis]:
         after = (np.arange(m) >= k) - (m - k) / m
         free = equations.focal_of_images(after[:, None])
         found.append(_Hypothesis("zoom", free, common, len(steps), int(k) - 1))
+    of_centre = np.concatenate([common, equations.of_camera(("cx", "cy"))], axis=1)
+    found.append(_Hypothesis("sag", equations.offset_by_gravity(), of_centre))
+    if len(state.adjusted.given.evidence.scene.cameras) == 1:  # all images share the glass
+        found.append(_Hypothesis("prism", equations.prism(), of_centre))
     # Intrinsics that are wrong in all images include the focal length that shows nothing in the others.
-    kind = "aspect" if state.case.capture.intrinsics is None else "intrinsics"
+    kind = "intrinsics" if state.imaged.is_given else "aspect"
     found.append(_Hypothesis(kind, equations.of_camera(_freed(kind, equations)), nothing))
     return found
 
 
-def _size(
-    fault: _Hypothesis,
-    total: Float[ndarray, " e"],
-    last: Tested,
-    equations: Alternatives,
-    given: Intrinsics,
-    now: Intrinsics,
-    images: Sequence[str],
-) -> dict[str, Any]:
-    """The fields of a finding that say what and how large the fault is."""
-    value = _value(fault, total)
+def _of_intrinsics(after: _State, last: Tested) -> dict[str, Any]:
+    """The fields of a finding that say which intrinsics the images show."""
+    equations, kind = after.equations, after.found[-1].kind
+    units = dict(zip(equations.names, equations.units, strict=True))
     std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
-    if fault.of_intrinsics:
-        units = dict(zip(equations.names, equations.units, strict=True))
-        names = _freed(fault.kind, equations)
-        details = _parameters({name: std[k] * units[name] for k, name in enumerate(names)}, given, now)
-        return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
-    kind, size, error = {
-        "distance": (Kind.FOCUS_BY_DISTANCE, value[0], std[0]),
-        "scatter": (Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), np.median(std)),
-        "zoom": (Kind.ZOOM, value[0], std[0]),
-        "shear": (Kind.ROLLING_SHUTTER, abs(value[0]), std[0]),
-        "shear of each": (Kind.ROLLING_SHUTTER_BY_IMAGE, np.sqrt(np.mean(value**2)), np.median(std)),
-    }[fault.kind]
-    unit = float(np.ptp(np.log(equations.distance))) if fault.kind == "distance" else 1.0
-    if fault.kind.startswith("shear"):
-        unit = given.fx
-    between = images[fault.after : fault.after + 2] if fault.kind == "zoom" else ()
+    names = _freed(kind, equations)
+    shown = {name: std[k] * units[name] for k, name in enumerate(names)}
+    details = _parameters(shown, after.imaged.start, after.camera)
+    return {"kind": Kind.INTRINSICS, "mend": "intrinsics", "details": details}
+
+
+def _size(after: _State, last: Tested) -> dict[str, Any]:
+    """The fields of a finding that say what and how large the fault is."""
+    fault, equations = after.found[-1], after.equations
+    value = _value(fault, after.total)
+    std = np.sqrt(np.maximum(np.diag(last.covariance), 0.0))
+    typical, each = float(np.sqrt(np.mean(value**2))), float(np.median(std))
+    spread = float(np.ptp(np.log(equations.distance)))
+    focal_px, width = after.imaged.start.fx, after.camera.width
+    changed = tuple(after.imaged.names[fault.after : fault.after + 2])
+    match fault.kind:
+        case "distance":
+            kind, size, error = Kind.FOCUS_BY_DISTANCE, spread * value[0], spread * std[0]
+        case "scatter":
+            kind, size, error = Kind.FOCUS_BY_IMAGE, np.sqrt(value @ value / equations.images), each
+        case "zoom":
+            kind, size, error = Kind.ZOOM, value[0], std[0]
+        case "shear":
+            kind, size, error = Kind.ROLLING_SHUTTER, focal_px * typical, focal_px * each
+        case "shear of each":
+            kind, size, error = Kind.ROLLING_SHUTTER_BY_IMAGE, focal_px * typical, focal_px * each
+        case "prism":
+            kind, (size, error) = Kind.THIN_PRISM, _largest_px(after, value, last.covariance)
+        case _:
+            kind, size, error = Kind.CENTRE_SAGS, width * typical, width * each / np.sqrt(2)
     return {
         "kind": kind,
-        "mend": "images",
-        "value": unit * float(size),
-        "std": unit * float(error),
-        "images": tuple(between),
+        "mend": MENDS.get(kind, "images"),
+        "value": float(size),
+        "std": float(error),
+        "images": changed if fault.kind == "zoom" else (),
     }
+
+
+def _largest_px(
+    after: _State, value: Float[ndarray, "4"], covariance: Float[ndarray, "4 4"]
+) -> tuple[float, float]:
+    """The displacement by a thin prism where it is largest among the points, and its standard deviation."""
+    by = after.adjusted.given.evidence.problem.prism
+    moved = np.linalg.norm(by @ value, axis=1)
+    k = int(moved.argmax())
+    along = (by[k] @ value / max(float(moved[k]), 1e-12)) @ by[k]
+    return float(moved[k]), float(np.sqrt(along @ covariance @ along))
 
 
 def _freed(kind: str, equations: Alternatives) -> tuple[str, ...]:

@@ -17,14 +17,17 @@ from jcr.adjust.score_test import freed_intrinsics
 from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
+from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
 from jcr.handeye.solve import judged
-from jcr.records import Estimate, Finding, Intrinsics, Kind, Tracks
+from jcr.records import Estimate, Finding, Kind
 
 SURE = 5.0
 """Standard deviations, widened for an estimated robot noise. Of 48 simulated webcam captures of 5 to 15 images with the
 true intrinsics, freed focal lengths were 1.03 of them off (rms), at most 2.9."""
+DOUBT = 2.0, 0.5
+"""Standard deviations and share of what matters that leave doubt."""
 OFF = 0.01
 """Relative. Intrinsics stored with real captures are up to 1.2 % from those of a board (jcr docs results/real)."""
 OFF_CENTRE = ESTIMATED["cx"]
@@ -36,20 +39,14 @@ CX, CY, K1, K2 = (PARAMETERS.index(name) for name in ("cx", "cy", "k1", "k2"))
 def intrinsics_contradiction(case: Case) -> Checked:
     """What the used images show against the intrinsics that were given; nothing where they agree.
 
-    Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt are the
-    intrinsics adjusted until they settle. The calibration is then the one with the intrinsics that the images show,
-    which those that were given are no part of; one that was rejected stays, and the finding says by how much they move
-    it.
+    The calibration is then the one with the intrinsics that the images show, which those that were given are no part of;
+    one that was rejected stays, and the finding says by how much they move it.
     """
     held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
-    assert case.adjusted is not None
-    if case.hand_eye.converged and not _found_off(case.adjusted, held, case.tracks, SURE / 2, 0.5):
+    contradiction = contradicted_by(of_case(case))
+    if contradiction is None or contradiction[1].severity == "informs":
         return Checked()
-    freed = adjust_case(case, prior=prior_of(held, ESTIMATED))
-    found = _found_off(freed, held, case.tracks, SURE, 1.0)
-    if not found:
-        return Checked()
-    contradicted = Finding(kind=Kind.INTRINSICS, severity="warns", mend="intrinsics", details=found)
+    freed, contradicted = contradiction
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
         return Checked((contradicted,), refined, freed)
     with_found, as_given = (
@@ -65,23 +62,40 @@ def intrinsics_contradiction(case: Case) -> Checked:
     return Checked((replace(contradicted, shift=tuple(shift.tolist())),), case.hand_eye.before)
 
 
+def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Finding] | None:
+    """The images adjusted as if no intrinsics had been given for one camera, and what they show against those that were;
+    None where that is nothing. A finding of less than `sure` standard deviations only informs: it leaves doubt.
+
+    Only when one Gauss-Newton step from the adjustment with these, the intrinsics freed, leaves some doubt, or the
+    camera is rejected, are the intrinsics adjusted until they settle.
+    """
+    if imaged.std.any() and not _found_off(imaged, imaged.adjusted, *DOUBT):
+        return None
+    freed = imaged.adjust(prior_of(imaged.start, ESTIMATED), None)
+    surely = _found_off(imaged, freed, sure, 1.0)
+    found = surely or _found_off(imaged, freed, *DOUBT)
+    if not found:
+        return None
+    severity = "warns" if surely else "informs"
+    return freed, Finding(kind=Kind.INTRINSICS, severity=severity, mend="intrinsics", details=found)
+
+
 def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
     """From one estimate to another, in records.COVARIANCE_ORDER."""
     step = step_between(start.gripper_from_camera, end.gripper_from_camera)
     return np.append(step, np.log(end.scale / start.scale))
 
 
-def _found_off(
-    adjusted: Adjusted, held: Intrinsics, tracks: Tracks, sure: float, share: float
-) -> dict[str, float]:
+def _found_off(imaged: Imaged, adjusted: Adjusted, sure: float, share: float) -> dict[str, float]:
     """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters (px)."""
-    camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED))
+    held = imaged.start
+    camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED), imaged.camera)
     by = camera - parameters(held)
     std = np.sqrt(np.diag(covariance))
     off: dict[str, float] = {}
     if abs(by[0]) > max(sure * std[0], share * OFF * held.fx):
         off |= {"focal": float(camera[0]), "focal_std": float(std[0]), "focal_given": held.fx}
-    used_radius = np.linalg.norm(unproject(held, tracks.x_px)[:, :2], axis=1)
+    used_radius = np.linalg.norm(unproject(held, imaged.x_px)[:, :2], axis=1)
     radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
     ray = np.stack([radius, 0 * radius, np.ones(9)], axis=1)
     bends = by_parameters(held, ray)[:, 0, [K1, K2]]

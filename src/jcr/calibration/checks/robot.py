@@ -9,7 +9,7 @@ from jcr.calibration.checks.checked import Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.residuals import angle_ratio
-from jcr.records import AngleRatio, Finding, Kind, RobotExamined
+from jcr.records import CAMERA, AngleRatio, Finding, Kind, RobotExamined
 
 MIN_EXAMINED = 4
 """Images from which something may be said of the robot's own errors."""
@@ -33,8 +33,11 @@ def check_robot(case: Case) -> Checked:
     offsets = None if arm is None or joints is None else joint_offsets(*fit, arm, joints[used])
     ratio = AngleRatio(*angle_ratio(gripper, camera))
     examined = RobotExamined(hand_eye.robot_noise, systematic_p_value(*fit), offsets, ratio)
-    found = filter(None, (_systematic_finding(examined), angle_finding(ratio.ratio, ratio.std)))
-    return Checked(tuple(found), replace(hand_eye, robot=examined))
+    found = [_systematic_finding(examined), angle_finding(ratio.ratio, ratio.std)]
+    # A camera that is not as it was taken for changes the cameras' poses: that is no fault of the robot.
+    if any(finding.kind in CAMERA for finding in hand_eye.findings):
+        found = []
+    return Checked(tuple(filter(None, found)), replace(hand_eye, robot=examined))
 
 
 def angle_finding(ratio: float, std: float) -> Finding | None:

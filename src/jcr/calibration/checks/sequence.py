@@ -39,6 +39,8 @@ MANY_PLACES = 60
 @dataclass(frozen=True)
 class _Found:
     log_p: float
+    base: Float[ndarray, "13"]
+    """Step of the calibration beside it."""
     value: Float[ndarray, " p"]
     covariance: Float[ndarray, "p p"]
     shift: Float[ndarray, "7"]
@@ -81,8 +83,8 @@ def sequence_fault(
         fit.gripper_from_camera, fit.scale, fit.base_from_recon, base_from_gripper, recon_from_camera
     )
     robot = fit.robot_noise
-    white = np.diag(np.tile(np.repeat((robot.translation, robot.rotation), 3), m) ** 2)
-    problem = _Problem(residual, by, white + robot.systematic**2 * systematic)
+    noise = robot.translation, robot.rotation
+    problem = _Problem(residual, by, robot.systematic**2 * systematic, noise)
     # An image that is rejected between others that agree is wrong by itself; after a slip several in a row are.
     rejected = np.pad(~hand_eye.inliers, 1)
     in_order = problem.of(np.flatnonzero(hand_eye.inliers | rejected[:-2] | rejected[2:]))
@@ -168,13 +170,16 @@ class _Problem:
 
     residual: Float[ndarray, "m 6"]
     by: Float[ndarray, "m 6 13"]
-    covariance: Float[ndarray, "r r"]
+    systematic: Float[ndarray, "r r"]
+    """Covariance of the systematic errors."""
+    noise: tuple[float, float]
+    """m, rad per axis: random errors, as they are without a fault."""
 
     def of(self, images: Int[ndarray, " k"]) -> "_Equations":
-        """Those of some images, in units of their noise."""
+        """Those of some images."""
         rows = (6 * images[:, None] + np.arange(6)).ravel()
-        factor = np.linalg.cholesky(self.covariance[np.ix_(rows, rows)])
-        return _Equations(images, self.residual[images], self.by[images], factor)
+        systematic = self.systematic[np.ix_(rows, rows)]
+        return _Equations(images, self.residual[images], self.by[images], systematic, self.noise)
 
 
 @dataclass(frozen=True)
@@ -182,12 +187,34 @@ class _Equations:
     images: Int[ndarray, " k"]
     residual: Float[ndarray, "k 6"]
     by: Float[ndarray, "k 6 13"]
-    factor: Float[ndarray, "r r"]
+    systematic: Float[ndarray, "r r"]
+    noise: tuple[float, float]
 
     def tested(self, columns: Float[ndarray, "m 6 p"]) -> _Found:
-        """What columns, given for all images, explain."""
-        flat = self._whitened(self.residual[..., None])[:, 0]
-        return _tested(flat, self._whitened(self.by), self._whitened(columns[self.images]))
+        """What columns, given for all images, explain, in units of the noise that they leave.
+
+        A fault in translation alone is counted as noise of translations by a fit that does not know it, and beside the
+        noise of rotations, which it is not, no such fault could be large.
+        """
+        columns = columns[self.images]
+        return self._tested(columns, self._noise_left(columns))
+
+    def _tested(self, columns: Float[ndarray, "k 6 p"], noise: tuple[float, float]) -> _Found:
+        white = np.diag(np.tile(np.repeat(noise, 3), len(self.images)) ** 2)
+        factor = np.linalg.cholesky(white + self.systematic)
+
+        def whitened(rows: Float[ndarray, "k 6 q"]) -> Float[ndarray, "r q"]:
+            return solve_triangular(factor, rows.reshape(len(factor), -1), lower=True)
+
+        return _tested(whitened(self.residual[..., None])[:, 0], whitened(self.by), whitened(columns))
+
+    def _noise_left(self, columns: Float[ndarray, "k 6 p"]) -> tuple[float, float]:
+        """m, rad per axis: what the equations leave with the columns free, where that is less than without."""
+        found = self._tested(columns, self.noise)
+        left = self.residual + self.by @ found.base + columns @ found.value
+        freedom = 1 - (self.by.shape[2] + columns.shape[2]) / left.size
+        metres, radians = np.sqrt((left.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)) / freedom).tolist()
+        return min(metres, self.noise[0]), min(radians, self.noise[1])
 
     def moved_by(self, share: Float[ndarray, " m"]) -> _Found:
         """An X that moves by a share at each image."""
@@ -199,14 +226,20 @@ class _Equations:
     def is_of_the_order(self, share: Float[ndarray, " m"], found: _Found) -> bool:
         """Whether the same shares in other orders explain less: a permutation test."""
         rng, shuffled = np.random.default_rng(0), share.copy()
-        as_much = 0
+        as_much = others = 0
         for _ in range(GROUPINGS):
             shuffled[self.images] = rng.permutation(share[self.images])
+            if _same_groups(shuffled[self.images], share[self.images]):
+                continue  # of 8 images one order in 35 has the same halves
+            others += 1
             as_much += self.moved_by(shuffled).log_p <= found.log_p + 1e-9
-        return as_much <= BY_CHANCE * GROUPINGS
+        return as_much <= BY_CHANCE * others
 
-    def _whitened(self, columns: Float[ndarray, "k 6 p"]) -> Float[ndarray, "r p"]:
-        return solve_triangular(self.factor, columns.reshape(len(self.factor), -1), lower=True)
+
+def _same_groups(one: Float[ndarray, " k"], other: Float[ndarray, " k"]) -> bool:
+    """Whether shares differ by no more than a constant and a sign, which a calibration takes up."""
+    one, other = one - one.mean(), other - other.mean()
+    return bool(np.allclose(one, other) or np.allclose(one, -other))
 
 
 def _tested(
@@ -225,7 +258,8 @@ def _tested(
     ratio = (most - least) / p / max(least / freedom, 1e-12)
     inverse = np.linalg.pinv(both.T @ both) * least / freedom
     shift = found[:7] - without[:7]
-    return _Found(float(f_distribution.logsf(ratio, p, freedom)), found[13:], inverse[13:, 13:], shift)
+    log_p = float(f_distribution.logsf(ratio, p, freedom))
+    return _Found(log_p, found[:13], found[13:], inverse[13:, 13:], shift)
 
 
 def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:

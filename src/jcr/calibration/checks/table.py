@@ -1,22 +1,24 @@
 """The checks of a calibration, a row each, in the order in which they are made.
 
 Causes before consequences. Poses of another convention fit nothing, so they come first where the fit was rejected. What
-is wrong with the camera looks like a slip too: the camera is tested before the order of the images, and that only where
-the camera is sound. These are tests of rejected calibrations as well, for they explain the rejection.
+is wrong with the camera looks like a bent robot or a slip too: the camera is tested first, then the robot, then the
+order of the images, each only where what comes before is sound. These are tests of rejected calibrations as well, for
+they explain the rejection.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from jcr.calibration.case import Case
+from jcr.calibration.checks.bent import check_bent
 from jcr.calibration.checks.camera import check_camera
-from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction
+from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction, check_registered
 from jcr.calibration.checks.checked import Checked
 from jcr.calibration.checks.convention import check_convention
 from jcr.calibration.checks.robot import check_robot
 from jcr.calibration.checks.scale import check_depth_camera, check_network_scale, check_scale_source
 from jcr.calibration.checks.sequence import MIN_IMAGES, check_sequence
-from jcr.records import CAMERA, Kind
+from jcr.records import BENT, CAMERA, Kind
 
 
 @dataclass(frozen=True)
@@ -33,22 +35,27 @@ def _is_observable(case: Case) -> bool:
 
 def _fit_was_rejected(case: Case) -> bool:
     """By the poses themselves, and not because a board contradicts them."""
-    sized = any(finding.kind is Kind.BOARD_SIZE for finding in case.hand_eye.findings)
+    sized = _has(case, {Kind.BOARD_SIZE})
     return not case.hand_eye.converged and case.hand_eye.before is None and not sized
 
 
+def _has(case: Case, kinds: Collection[Kind]) -> bool:
+    return any(finding.kind in kinds for finding in case.hand_eye.findings)
+
+
 CHECKS = (
+    Check(check_registered),
     Check(check_convention, _fit_was_rejected),
     Check(check_camera, lambda case: case.shows_camera and case.adjusted is not None),
+    Check(
+        check_bent,
+        lambda case: case.shows_camera and case.adjusted is not None and not _has(case, CAMERA),
+    ),
     Check(check_robot, _is_observable),
     Check(check_arm),
     Check(
         check_sequence,
-        lambda case: (
-            _is_observable(case)
-            and len(case.names) >= MIN_IMAGES
-            and not any(finding.kind in CAMERA for finding in case.hand_eye.findings)
-        ),
+        lambda case: _is_observable(case) and len(case.names) >= MIN_IMAGES and not _has(case, CAMERA | BENT),
     ),
     Check(check_images),
     # A unit that somebody vouches for was used for the scale, and is no check of it.

@@ -1,18 +1,21 @@
 // Copy buttons: each carries what it copies.
 "use strict";
+async function copyText(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    // Pages opened from a mail or an old browser may not use the clipboard: select a copy and ask the browser.
+    const area = (document.querySelector("dialog[open]") || document.body).appendChild(document.createElement("textarea"));
+    area.value = text;
+    area.select();
+    document.execCommand("copy");
+    area.remove();
+  }
+}
 document.querySelectorAll("button[data-copy]").forEach((button) => {
   const label = button.textContent;
   button.addEventListener("click", async () => {
-    try {
-      await navigator.clipboard.writeText(button.dataset.copy);
-    } catch {
-      // Pages opened from a mail or an old browser may not use the clipboard: select a copy and ask the browser.
-      const area = document.body.appendChild(document.createElement("textarea"));
-      area.value = button.dataset.copy;
-      area.select();
-      document.execCommand("copy");
-      area.remove();
-    }
+    await copyText(button.dataset.copy);
     button.textContent = "copied";
     setTimeout(() => { button.textContent = label; }, 1500);
   });

@@ -1,0 +1,75 @@
+"""One camera among those of an adjustment, as the checks of a camera take it: that of a capture, or a further one."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.robots import Adjusted, Placed
+from jcr.adjust.score_test import first_x
+from jcr.calibration.adjust import adjust_case, estimate_of, focal_of_each
+from jcr.calibration.case import Case
+from jcr.records import Intrinsics
+
+Combinations = Float[ndarray, "e p"]
+"""Of the columns of score_test.Alternatives."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaged:
+    """One camera, and how its images are adjusted again with more of it free."""
+
+    adjusted: Adjusted
+    adjust: Callable[[IntrinsicsPrior, Combinations | None], Adjusted]
+    """All images, with another prior of this camera's intrinsics, and with combinations of its columns free."""
+    names: Sequence[str]
+    """Of its images."""
+    start: Intrinsics
+    """Those that were given, or that the reconstruction found."""
+    is_given: bool
+    prior: IntrinsicsPrior
+    std: Float[ndarray, "6"]
+    """Of the camera's place; 0 where it is rejected, for then no fault is small."""
+    answer: Callable[[Adjusted], tuple[Float[ndarray, "4 4"], float]]
+    """That place as an adjustment has it, and the scale."""
+    camera: int = 0
+    """Its number among the adjusted."""
+    place: Callable[[Placed], Float[ndarray, "4 4"]] = first_x
+    """Where it is on its parent."""
+    free: Combinations | None = None
+    """That `adjusted` has free."""
+
+    @property
+    def images(self) -> Int[ndarray, " m"]:
+        """Rows of its images among the adjusted."""
+        return np.flatnonzero(self.adjusted.given.evidence.problem.observations.camera == self.camera)
+
+    @property
+    def x_px(self) -> Float[ndarray, "k 2"]:
+        """Of the points that were observed in its images."""
+        problem = self.adjusted.given.evidence.problem
+        return problem.observations.x_px[problem.layout.camera == self.camera]
+
+
+def of_case(case: Case) -> Imaged:
+    """A capture's own camera."""
+    assert case.adjusted is not None
+
+    def answer(adjusted: Adjusted) -> tuple[Float[ndarray, "4 4"], float]:
+        estimate = estimate_of(adjusted, case.tracks)
+        return estimate.gripper_from_camera, estimate.scale
+
+    return Imaged(
+        adjusted=case.adjusted,
+        adjust=lambda prior, combinations: adjust_case(case, prior=prior, combinations=combinations),
+        names=[case.names[row] for row in case.used],
+        start=case.reconstruction.intrinsics,
+        is_given=case.capture.intrinsics is not None,
+        prior=case.intrinsics_prior,
+        std=np.sqrt(np.diag(case.hand_eye.covariance)[:6]) * case.hand_eye.converged,
+        answer=answer,
+        free=focal_of_each(case) if case.options.focus == "varies" else None,
+    )

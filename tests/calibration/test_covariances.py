@@ -1,0 +1,65 @@
+"""Covariances in files: what cannot be one is refused by every command that would compute with it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jcr.cli import dispatch
+from places import ROOT
+
+GOLDEN = ROOT / "tests" / "golden" / "calibration_accepted.json"
+CHANGES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "zeroed": (np.zeros_like, "has no variance"),
+    "one error zeroed": (lambda c: c * np.outer(np.arange(7) != 2, np.arange(7) != 2), "has no variance"),
+    "negative": (lambda c: -c, "more than each by itself"),
+    # Each pair of errors by itself could be; three that are all opposite to one another cannot.
+    "not positive": (lambda c: _std(c) * (np.eye(7) - 0.8 * (1 - np.eye(7))), "negative variance"),
+    "one combination without variance": (lambda c: _std(c), "has no variance"),
+}
+
+
+def _std(covariance: np.ndarray) -> np.ndarray:
+    std = np.sqrt(np.diag(covariance))
+    return np.outer(std, std)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    made, words = CHANGES[change]
+    content = json.loads(GOLDEN.read_text())
+    covariance = np.array(content["uncertainty"]["covariance"])
+    content["uncertainty"]["covariance"] = made(covariance).tolist()
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    for command in (
+        ["compare", tmp_path, GOLDEN],
+        ["compare", GOLDEN, tmp_path],
+        ["export", tmp_path, "urdf"],
+    ):
+        assert dispatch([str(word) for word in command]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "calibration.json" in line and words in line
+
+
+def test_parts_that_are_not_the_whole_decide_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The whole is the covariance; what its parts leave has no name."""
+    content = json.loads(GOLDEN.read_text())
+    for part in content["uncertainty"]["budget"].values():
+        part["covariance"] = np.zeros((7, 7)).tolist()
+    content["gripper_from_camera"][0][3] += 1e-3
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    assert dispatch(["compare", str(tmp_path), str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["chi2"] == 0
+    assert dispatch(["compare", str(tmp_path), str(GOLDEN), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["chi2"] > 0 and found["explained_by"]["reference"] == pytest.approx(0.5, abs=0.01)
+    assert sum(found["explained_by"].values()) == pytest.approx(1.0)
+
+
+def test_references_that_are_both_exact_have_a_difference_and_no_verdict(tmp_path: Path, capsys):
+    exact = {"gripper_from_camera": np.eye(4).tolist(), "std_mm": [0, 0, 0], "std_deg": [0, 0, 0]}
+    (tmp_path / "reference.json").write_text(json.dumps(exact))
+    assert dispatch(["compare", str(tmp_path), str(tmp_path)]) == 0
+    assert capsys.readouterr().out == "0.000 mm, 0.0000°\n"
