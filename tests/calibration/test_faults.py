@@ -14,6 +14,7 @@ from benchmarks.simulated.observations import LENS as OBSERVED_BY
 from benchmarks.simulated.observations import observed
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
+from jcr.calibration.checks.camera import of_some
 from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
@@ -207,3 +208,12 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     metric = calibrate(capture, replace(reconstruction, is_metric=True, metric_std=0.002))
     assert "4.8 ± 0.2 % larger than given" in metric.warnings[0]
     assert alone not in calibration_file(capture, reconstruction, metric, {}, "").notes
+
+
+def test_of_many_images_the_camera_is_tested_by_as_many_observations_as_memory_has_room_for():
+    problem = hand_eye_problem(np.random.default_rng(0), 40)
+    tracks = observed(problem, np.random.default_rng(0), 900, 0.1)
+    few = of_some(tracks, 5000)
+    assert 4000 < len(few.image) <= 5000
+    assert np.bincount(few.point)[np.unique(few.point)].min() >= 2
+    assert len(np.unique(of_some(tracks, 10**9).point)) == 800

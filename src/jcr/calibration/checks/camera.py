@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from jcr.adjust.model_error import TYPICAL
 from jcr.adjust.robots import Adjusted
+from jcr.adjust.scene import OF_IMAGE
 from jcr.adjust.score_test import (
     Alternatives,
     Tested,
@@ -46,6 +47,9 @@ AT_ONCE = 2
 """Faults named of one capture."""
 MOST_POINTS, WELL_SEEN = 800, 3
 """Points that take part, first those in this many images: more tell a fault no better, and take time."""
+MOST_BYTES, BYTES_PER_IMAGE = 100_000_000, 16 * OF_IMAGE
+"""Of the derivatives of all observations by the nuisances of each image: of 58 000 observations by 200 images they were
+740 MB, and the equations several times that."""
 LEAST_PX = {
     Kind.ROLLING_SHUTTER: 3.0,
     Kind.ROLLING_SHUTTER_BY_IMAGE: 3.0,
@@ -198,10 +202,11 @@ def _freed_before(free: Combinations) -> _Hypothesis:
 
 def _of_fewer_points(case: Case) -> Case:
     """The case as adjusted, of no more points than are needed."""
-    tracks = case.tracks
-    if len(case.used) < MIN_IMAGES or len(np.unique(tracks.point)) <= MOST_POINTS:
+    tracks, most = case.tracks, MOST_BYTES // (BYTES_PER_IMAGE * len(case.used))
+    few = len(np.unique(tracks.point)) <= MOST_POINTS and len(tracks.image) <= most
+    if len(case.used) < MIN_IMAGES or few:
         return case
-    fewer = case.with_tracks(_some(tracks))
+    fewer = case.with_tracks(of_some(tracks, most))
     varies = case.options.focus == "varies"
     return replace(fewer, adjusted=adjust_case(fewer, combinations=focal_of_each(case) if varies else None))
 
@@ -241,13 +246,14 @@ def _finding(after: _State, before: _State, alone: Tested) -> Finding:
     )
 
 
-def _some(tracks: Tracks, seed: int = 0) -> Tracks:
-    """The observations of a random choice of the points that most images see."""
+def of_some(tracks: Tracks, most: int, seed: int = 0) -> Tracks:
+    """A random choice of the points that most images see, with no more than `most` observations."""
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(seed).permutation(len(count))
     enough = order[np.argsort(count[order] < WELL_SEEN, kind="stable")]
     chosen = np.zeros(len(count), bool)
-    chosen[enough[count[enough] >= 2][:MOST_POINTS]] = True
+    shown = enough[count[enough] >= 2][:MOST_POINTS]
+    chosen[shown[np.cumsum(count[shown]) <= most]] = True
     return of_points(tracks, chosen)
 
 
