@@ -551,9 +551,9 @@ def test_a_state_never_vouches_for_a_reconstruction_that_it_does_not_know(
 
 
 ARRAYS = {
-    "jcr.reconstruction/6": {
+    "jcr.reconstruction/7": {
         "about", "image_index", "recon_from_camera", "track_image", "track_point", "track_points_in_recon",
-        "track_x_px", "tracks_from_board", "tracks_from_pointmaps",
+        "track_std_px", "track_x_px", "tracks_from_board", "tracks_from_pointmaps",
     },
     "jcr.depth/1": {"about", "colors", "confidence", "depth_std", "points_in_recon", "reason"},
 }  # fmt: skip
@@ -579,7 +579,7 @@ def test_a_reconstruction_of_another_version_is_told_apart(
     np.savez(out / "reconstruction.npz", **arrays | {"about": np.array(old)})
     assert dispatch(["map", str(out), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/6'; delete it and run again" in said
+    assert "'jcr.reconstruction/1', not 'jcr.reconstruction/7'; delete it and run again" in said
 
 
 def in_degrees(pose: np.ndarray) -> np.ndarray:

@@ -17,8 +17,10 @@ from jcr.geometry import require_rigid
 from jcr.intrinsics_json import IntrinsicsJson, Positive
 from jcr.records import CameraEvidence, Pointmaps, Reconstruction, Tracks
 
-FORMAT = "jcr.reconstruction/6"
+FORMAT = "jcr.reconstruction/7"
 """Changes with what the file holds."""
+WITHOUT_STD = "jcr.reconstruction/6"
+"""Read as well: it says nothing of how sure the observations are."""
 WITH_DEPTH = "jcr.reconstruction/5"
 """The last in which the pointmaps were in the file whoever made them, without confidence where nobody had."""
 OLD = ("jcr.reconstruction/3", "jcr.reconstruction/4", WITH_DEPTH)
@@ -133,7 +135,7 @@ def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
-    with read_npz(path, (FORMAT, *OLD)) as (text, file):
+    with read_npz(path, (FORMAT, WITHOUT_STD, *OLD)) as (text, file):
         about = About.model_validate_json(text, strict=True)
         found = Reconstruction(
             image_index=file["image_index"],

@@ -22,6 +22,7 @@ from jcr.calibration.words import (
 )
 from jcr.capture.capture_json import origin
 from jcr.capture.table import TABLES
+from jcr.errors import printable
 from jcr.extras import is_installed
 from jcr.geometry import scale_translation
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, Kind, verdict_of
@@ -203,8 +204,8 @@ def _page(heading: str, source: Path, calibration: CalibrationFile, sections: Se
     about = f"{len(calibration.images)} images · back end {calibration.backend} · {made} · jcr {calibration.version}"
     return filled(
         "page.html",
-        name=escape(named.resolve().name),
-        about=f"{escape(heading)}<br>{escape(about)}<br>{escape(str(source))}",
+        name=escape(printable(named.resolve().name)),
+        about=f"{escape(heading)}<br>{escape(about)}<br>{escape(printable(str(source)))}",
         style=(PAGE / "page.css").read_text("utf-8"),
         sections="\n".join(sections),
         links=_links(sections),
