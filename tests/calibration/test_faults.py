@@ -14,7 +14,7 @@ from benchmarks.simulated.observations import LENS as OBSERVED_BY
 from benchmarks.simulated.observations import observed
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
-from jcr.calibration.checks.camera import of_some
+from jcr.calibration.checks.camera import is_material, of_some
 from jcr.calibration.checks.sequence import sequence_fault
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
@@ -23,7 +23,7 @@ from jcr.geometry import inverse, retract, step_between
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
-from jcr.records import BENT, Capture, Kind, Reconstruction
+from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
 from jcr.simulate.robots import PresetName
 
@@ -217,3 +217,14 @@ def test_of_many_images_the_camera_is_tested_by_as_many_observations_as_memory_h
     assert 4000 < len(few.image) <= 5000
     assert np.bincount(few.point)[np.unique(few.point)].min() >= 2
     assert len(np.unique(of_some(tracks, 10**9).point)) == 800
+
+
+def test_what_differs_from_image_to_image_is_a_fault_where_it_is_surely_larger_than_its_noise():
+    """Of 200 images a scatter of 1.4 standard deviations has a chance of 1e-7 if the noise is exactly as estimated."""
+    std = np.full(6, 1e-5)
+    found = Finding(
+        kind=Kind.FOCUS_BY_IMAGE, severity="warns", mend="images", value=4.8e-4, std=3.4e-4, shift=(1e-4,) * 7
+    )
+    assert not is_material(found, std)
+    assert is_material(replace(found, value=1e-2), std)
+    assert is_material(replace(found, kind=Kind.FOCUS_BY_DISTANCE), std)

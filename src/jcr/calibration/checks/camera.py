@@ -57,6 +57,10 @@ LEAST_PX = {
     Kind.THIN_PRISM: 1.0,
 }
 """What is measured in pixels and smaller is what a distortion model leaves over."""
+OF_EACH = {Kind.FOCUS_BY_IMAGE, Kind.ROLLING_SHUTTER_BY_IMAGE}
+SURE = 2.0
+"""Standard deviations of what differs from image to image: of hundreds of images the chance of less is small for any
+noise that is estimated a little too small. Of a dozen images what is that improbable is larger."""
 MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
@@ -187,7 +191,7 @@ def camera_faults(imaged: Imaged) -> tuple[Finding, ...]:
         if (np.abs(alone.shift) > OF_FIRST_STEP * MATERIAL * imaged.std).any():
             after = _with(state, best)
         found = None if after is None else _finding(after, state, alone)
-        if after is None or found is None or not _is_material(found, imaged.std):
+        if after is None or found is None or not is_material(found, imaged.std):
             dismissed.append(best)
             continue
         named.append(found)
@@ -222,9 +226,16 @@ def _with(state: _State, best: _Hypothesis) -> _State | None:
         return None
 
 
-def _is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
+def is_material(found: Finding, std: Float[ndarray, "6"]) -> bool:
     """Whether what was freed is large enough to be a fault, and moves the calibration."""
     if found.value is not None and found.value < LEAST_PX.get(found.kind, -np.inf):
+        return False
+    if (
+        found.kind in OF_EACH
+        and found.value is not None
+        and found.std is not None
+        and found.value < SURE * found.std
+    ):
         return False
     assert found.shift is not None
     return bool((np.abs(found.shift[:6]) > MATERIAL * std).any())
