@@ -144,6 +144,23 @@ def test_pages_are_printed_and_listed(capsys: pytest.CaptureFixture[str]):
     assert "results/run" in capsys.readouterr().out
     with pytest.raises(InputError, match="no such page; there are: .*captures"):
         page_named("nonsense")
+    with pytest.raises(InputError, match="did you mean troubleshooting?"):
+        page_named("troubleshoot")
+
+
+def test_symptoms_are_in_the_words_of_messages():
+    page = (ROOT / "docs" / "how-to" / "troubleshooting.md").read_text()
+    constants = (
+        node.value
+        for file in SOURCE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+    said = "\n".join(constants)
+    quotes = re.findall(r'"([^"\n]+)"', page)
+    pieces = [piece.strip() for quote in quotes for piece in re.split(r"…|\d+(?:\.png)?|ur5e", quote)]
+    long_enough = [piece for piece in pieces if len(piece) > 8]
+    assert len(long_enough) > 10 and [piece for piece in long_enough if piece not in said] == []
 
 
 def test_every_page_that_a_checkout_has_is_installed():

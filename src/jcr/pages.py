@@ -3,7 +3,7 @@
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
-from jcr.errors import InputError
+from jcr.errors import InputError, did_you_mean
 from jcr.extras import DISTRIBUTION
 
 CHECKOUT = Path(__file__).parents[2] / "docs"
@@ -38,7 +38,7 @@ def page(name: str) -> str:
     found = pages()
     if name not in found:
         there = ", ".join(other for other in found if "/" not in other) or "none on this machine"
-        raise InputError(f"jcr docs {name}: no such page; there are: {there}")
+        raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; there are: {there}")
     return found[name].read_text(encoding="utf-8")
 
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 import jcr
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.help import MANY
+from jcr.cli.help import COMMON, MANY, groups
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.options import MapOptions
 
@@ -191,6 +192,12 @@ def test_every_command_has_help_with_examples(capsys: pytest.CaptureFixture[str]
         text = capsys.readouterr().out
         assert "examples:" in text and not re.search(r"[│╭╰]", text), name
         assert len(re.findall(r"^  --", text, re.MULTILINE)) <= MANY, name
+
+
+def test_every_option_that_help_puts_first_is_one_of_some_command():
+    records = [import_module(f"jcr.cli.{name.replace('-', '_')}").Arguments for name in COMMANDS]
+    known = {one.flag for record in records for group in groups(record, "jcr") for one in group.arguments}
+    assert set(COMMON) <= known
 
 
 def test_help_lists_what_users_set_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]):

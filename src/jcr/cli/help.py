@@ -34,7 +34,6 @@ COMMON = (
     "--poses",
     "--camera-size",
     "--intrinsics-from",
-    "--until-accurate",
     "--scene",
     "--images",
     "--joint-offsets",
