@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PRESETS, PresetName
 from benchmarks.simulated.observations import LENS
 from benchmarks.simulated.problem import disturbed
 from jcr.adjust.robots import ArmPoses
@@ -32,9 +33,7 @@ from jcr.simulate.poses import looking_at, random_hand_eye
 from jcr.simulate.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
-    PRESETS,
     BentArm,
-    PresetName,
     about_posture,
     bend,
     effective_exchanged,

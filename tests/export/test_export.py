@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import jcr
 from benchmarks.simulated.surface import solid_labels
+from benchmarks.simulated.truth import read_truth
 from jcr.calibration.calibration_json import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
@@ -35,7 +36,6 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
 from jcr.simulate.scenes import make_scene
-from jcr.simulate.truth import read_truth
 from places import ROOT
 
 if TYPE_CHECKING:
