@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jcr.capture.checks import checked_lens
+from jcr.capture.checks import checked_intrinsics
 from jcr.capture.plain_files import read_yaml, shown
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Intrinsics, LensModel
@@ -34,10 +34,10 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
         ) from None
     if not isinstance(matrix, list) or not isinstance(coefficients, list):
         raise InputError(f"{file}: the camera matrix and the distortion must be lists of numbers")
-    return lens_of_ros(matrix, model, coefficients, calibrated, size, str(file))
+    return intrinsics_of_ros(matrix, model, coefficients, calibrated, size, str(file))
 
 
-def lens_of_ros(
+def intrinsics_of_ros(
     matrix: Sequence[Any],
     model: Any,
     coefficients: Sequence[Any],
@@ -73,4 +73,4 @@ def lens_of_ros(
         known = "pinhole"
     count = len(COEFFICIENTS[known])
     padded = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
-    return checked_lens(focal_and_centre, padded, size, where, known)
+    return checked_intrinsics(focal_and_centre, padded, size, where, known)

@@ -92,7 +92,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
         )
 
 
-def checked_lens(
+def checked_intrinsics(
     focal_and_centre: Sequence[Any],
     distortion: Sequence[Any],
     size: tuple[int, int],
@@ -191,7 +191,7 @@ def _common_orientation(folder: Path, images: Sequence[str]) -> int:
     return first
 
 
-def how_turned(capture: Capture) -> Finding | None:
+def how_rotated(capture: Capture) -> Finding | None:
     """What a user must know of a capture whose images are rotated to be shown."""
     if capture.orientation == 1:
         return None

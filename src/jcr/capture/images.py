@@ -60,10 +60,10 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
             warnings.simplefilter("ignore")
             with Image.open(path) as opened:
                 _refuse_size(path, opened.size)
-                # Phones write MPO: a JPEG with previews behind it, whose first picture is the photograph.
-                pictures = getattr(opened, "n_frames", 1)
-                if opened.format != "MPO" and pictures > 1:
-                    raise InputError(f"{path}: holds {pictures} images; save one as PNG or JPEG")
+                # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
+                count = getattr(opened, "n_frames", 1)
+                if opened.format != "MPO" and count > 1:
+                    raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
                 opened.load()
                 if (deep := _sixteen_bit(path, opened)) is not None:
                     eight = np.minimum(deep >> (_bits(deep) - 8), 255)
@@ -224,9 +224,9 @@ def _uncompressed_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"
     )
 
 
-def sharpness(picture: bytes | UInt8[ndarray, "h w 3"]) -> float:
+def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
     """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
-    if not isinstance(picture, bytes):
-        return brightness_and_sharpness(picture)[1]
-    bgr = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    if not isinstance(image, bytes):
+        return brightness_and_sharpness(image)[1]
+    bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     return 0.0 if bgr is None else brightness_and_sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))[1]

@@ -44,7 +44,7 @@ ConventionName = Literal[
 UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-deg"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReadOptions:
     """How the capture is read; a capture.json needs none of these."""
 

@@ -153,13 +153,13 @@ def _shown(columns: dict[str, tuple[str, ...]], where: str) -> ConventionName:
     )
 
 
-def _units(convention: str, said: frozenset[str], options: ReadOptions) -> UnitsName:
-    """Units that were asked for, or else those that the columns' names say beside those of the convention."""
-    if options.pose_units != "auto" or not said:
+def _units(convention: str, named: frozenset[str], options: ReadOptions) -> UnitsName:
+    """Units that were asked for, or else those that the names of the columns give, and for the rest the convention."""
+    if options.pose_units != "auto" or not named:
         return options.pose_units
-    form = CONVENTIONS[convention]
-    length = next((unit for unit in ("mm", "cm", "m") if unit in said), "mm" if form.millimetres else "m")
-    angle = next((unit for unit in ("deg", "rad") if unit in said), "deg" if form.degrees else "rad")
+    length, angle = CONVENTIONS[convention].units()
+    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
+    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
     return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
 
 

@@ -29,7 +29,7 @@ _TO_RGB = {
 }
 
 
-def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
+def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """An encoded file's bytes as they are, or RGB pixels; and the file's ending.
 
     Raises InputError for encodings that are no image (depth) or that jcr does not know.

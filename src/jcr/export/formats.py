@@ -172,11 +172,11 @@ class Run:
         base = self.options.base_frame
         return mounts + [
             ros.CameraMount(
-                base,
-                f"{arm.name}_{base}",
-                np.array(arm.base_from_other_base),
-                np.array(arm.uncertainty.covariance),
-                base,
+                parent=base,
+                child=f"{arm.name}_{base}",
+                parent_from_child=np.array(arm.base_from_other_base),
+                covariance=np.array(arm.uncertainty.covariance),
+                base=base,
             )
             for arm in cameras.arms
         ]

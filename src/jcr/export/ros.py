@@ -29,7 +29,7 @@ ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matr
 _FRAME_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraMount:
     """A frame of the camera, fixed on the gripper, under its names in ROS."""
 
@@ -63,7 +63,15 @@ def camera_mount(
         require_frame_name(name)
     if parent == child:
         raise InputError(f"parent and child frame are both {parent!r}; name two different frames")
-    return CameraMount(parent, child, gripper_from_camera, covariance[:6, :6], base, doubt, intrinsics)
+    return CameraMount(
+        parent=parent,
+        child=child,
+        parent_from_child=gripper_from_camera,
+        covariance=covariance[:6, :6],
+        base=base,
+        doubt=doubt,
+        intrinsics=intrinsics,
+    )
 
 
 def on_root(

@@ -61,14 +61,12 @@ def pose_lines(
 def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
     """The pose's numbers, each with its name, and the units."""
     form = CONVENTIONS[convention]
-    length, angle = "mm" if form.millimetres else "m", "°" if form.degrees else "rad"
-    if units != "auto":
-        length, _, angle = units.replace("deg", "°").partition("-")
+    length, angle = form.units(units)
     row = numbers_from_poses(pose[None], convention, units)[0]
-    digits = [1 if length == "mm" else 4] * 3 + [5 if form.quaternion else 2 if angle == "°" else 4] * 4
+    digits = [1 if length == "mm" else 4] * 3 + [5 if not form.has_angles else 2 if angle == "deg" else 4] * 4
     text = [f"{name} {value:.{k}f}" for name, value, k in zip(form.columns, row, digits, strict=False)]
-    turn = " ".join(text[3:]) + ("" if form.quaternion else f" {angle}")
-    return f"{' '.join(text[:3])} {length}, {turn}"
+    unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
+    return f"{' '.join(text[:3])} {length}, {' '.join(text[3:])}{unit}"
 
 
 def joints_at(arm: Arm, path: Path, goal: Float[ndarray, "4 4"]) -> Float[ndarray, " dof"] | None:

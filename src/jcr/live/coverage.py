@@ -16,7 +16,7 @@ from jcr.calibration.expected import (
     typical_camera,
 )
 from jcr.calibration.robot_errors import RobotErrors, errors_of, of_poses
-from jcr.capture.lens_json import read_lens
+from jcr.capture.camera_json import read_intrinsics
 from jcr.errors import InputError
 from jcr.handeye.observability import observability
 from jcr.live.arm_words import ArmWords, Path, joints_at, pose_lines
@@ -29,7 +29,7 @@ ALTERNATIVES = 6
 """Proposals; the first that the arm reaches is taken."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
     """How far a capture is."""
 
@@ -38,10 +38,10 @@ class Coverage:
     """What the motions do not show yet, in words."""
     expected: tuple[Expectation, ...]
     """With the first 3, 4, … images, if all register; of a usual robot and usual images."""
-    next_pose: NextPose | None
-    next_joints: Float[ndarray, " dof"] | None
+    next_pose: NextPose | None = None
+    next_joints: Float[ndarray, " dof"] | None = None
     """rad; None where the arm is not known."""
-    like: str | None
+    like: str | None = None
     """The image nearest to the next pose."""
     words: ArmWords
 
@@ -60,7 +60,7 @@ def coverage(
     """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
     if len(live.poses) < 2:
-        return Coverage(len(live.poses), (), (), None, None, None, words)
+        return Coverage(pictures=len(live.poses), unseen=(), expected=(), words=words)
     poses, joints = np.stack(live.poses), live.all_joints()
     assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
@@ -71,19 +71,19 @@ def coverage(
     more = [expected(assumptions, poses[some], of_poses(robot.systematic, some)) for some in rows]
     next_pose = chosen.next_pose(1, chosen.expected(1))
     return Coverage(
-        len(poses),
-        observability(poses).unobservable,
-        (*known, *more),
-        next_pose,
-        next_joints,
-        live.names[next_pose.like],
-        words,
+        pictures=len(poses),
+        unseen=observability(poses).unobservable,
+        expected=(*known, *more),
+        next_pose=next_pose,
+        next_joints=next_joints,
+        like=live.names[next_pose.like],
+        words=words,
     )
 
 
 def _camera(live: LiveFolder) -> ForeseenCamera:
     assert live.size is not None
-    return typical_camera(read_lens(live.lens, live.size, live.folder), live.size)
+    return typical_camera(read_intrinsics(live.lens, live.size, live.folder), live.size)
 
 
 def _errors(

@@ -46,6 +46,5 @@ def _wanted(convention: ConventionName, units: UnitsName) -> str:
         unit = "m, rad" if units == "auto" else units.replace("-", ", ")
         return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
     form = CONVENTIONS[convention]
-    unit = f"{'mm' if form.millimetres else 'm'}, {'deg' if form.degrees else 'rad'}"
     names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
-    return f"{names}; {unit if units == 'auto' else units.replace('-', ', ')}"
+    return f"{names}; {', '.join(form.units(units))}"

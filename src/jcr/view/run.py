@@ -23,7 +23,7 @@ GREY = 128
 """Of images that are not to be had."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewedRun:
     """Cameras, grippers, points and map of a run, in the base frame."""
 
