@@ -30,7 +30,7 @@ PxFromPx = Callable[[Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
 """Where the pinhole camera that the user believes in has what the real camera shows at a pixel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rendered:
     """A scene as it is seen from POSES places, and what is true there."""
 

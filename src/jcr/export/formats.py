@@ -306,7 +306,7 @@ def _ply(run: Run, path: Path) -> None:
 
 def _glb(run: Run, path: Path) -> None:
     scene = run.scene
-    from jcr.export.mesh import write_glb
+    from jcr.export.volume import write_glb
 
     write_glb(path, scene, run.provenance)
 
@@ -322,8 +322,7 @@ def _esdf(run: Run, path: Path) -> None:
     scene = run.scene
     from jcr.export.volume import write_esdf
 
-    unknown = run.options.unknown or "occupied"
-    write_esdf(path, scene, run.provenance, unknown, run.options.voxel_size)
+    write_esdf(path, scene, run.provenance, run.options.unknown or "occupied", run.options.voxel_size)
 
 
 def _spheres(run: Run, path: Path) -> None:
