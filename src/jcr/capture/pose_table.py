@@ -17,16 +17,8 @@ from jcr.capture.table_cells import Cells, is_number, read_cells
 from jcr.errors import InputError
 
 _IMAGE = (
-    "image",
-    "image_name",
-    "image_path",
-    "file",
-    "filename",
-    "file_name",
-    "file_path",
-    "name",
-    "picture",
-)
+    "image", "image_name", "image_path", "file", "filename", "file_name", "file_path", "name", "picture",
+)  # fmt: skip
 _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""

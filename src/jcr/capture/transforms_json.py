@@ -23,8 +23,13 @@ from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
 FILE = "transforms.json"
+MODELS = (
+    "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "OPENCV_FISHEYE",
+)  # fmt: skip
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x")
+_KEYS = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x",
+)  # fmt: skip
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
@@ -101,15 +106,7 @@ def _intrinsics(content: dict[str, Any], file: Path, size: tuple[int, int]) -> I
     if any(one != first for one in of_frames):
         raise InputError(f"{file}: its frames have different intrinsics; jcr needs images of one camera")
     model = content.get("camera_model", "OPENCV")
-    if model not in (
-        "OPENCV",
-        "PINHOLE",
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "PERSPECTIVE",
-        "OPENCV_FISHEYE",
-    ):
+    if model not in MODELS:
         raise InputError(f"{file}: camera_model {model}; undistort the images to a pinhole or OPENCV camera")
     distortion_model: LensModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
     if first.get("k4") and distortion_model == "pinhole":
