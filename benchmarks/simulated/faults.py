@@ -53,7 +53,7 @@ class Faults:
     lengths: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """By which the reported positions are too long along each axis of the base, relative: a lift, a rail, a gantry."""
     tilt_by_reach: float = 0.0
-    """rad per m: a stand leans towards a gripper as far away as it is, horizontally, and no pose says so."""
+    """rad per m: a stand leans towards a gripper as far away as it is, horizontally, which no reported pose shows."""
     sag: float = 0.0
     """rad by which a level tool rotates towards the floor; of one that points down nothing."""
     delay_s: float = 0.0

@@ -24,7 +24,7 @@ POSES = 14
 PUSHED, BY_M = 3, (0.04, 0.045, 0.0)
 """How many objects are pushed, and by how much."""
 ARMS: tuple[RobotName | None, ...] = (None, "ur5e", None, "panda", None)
-"""Of the scenes in turn; None: a gripper whose poses have no systematic errors."""
+"""Of the scenes one after the other; None: a gripper whose poses have no systematic errors."""
 
 PxFromPx = Callable[[Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
 """Where the pinhole camera that the user believes in has what the real camera shows at a pixel."""
@@ -60,7 +60,9 @@ class Rendered:
 
 def rendered(seed: int) -> Rendered:
     """The table top scene of that seed."""
-    hand_eye, motion, errors, elsewhere, lens = (np.random.default_rng([seed, 20 + k]) for k in range(5))
+    hand_eye, motion, errors, elsewhere, intrinsics = (
+        np.random.default_rng([seed, 20 + k]) for k in range(5)
+    )
     scene = make_scene("tabletop", seed)
     name = ARMS[seed % len(ARMS)]
     if name is None:
@@ -76,7 +78,7 @@ def rendered(seed: int) -> Rendered:
         joints = patterned(arm, "varied", POSES, target, x, motion)
         effective = effective_about(bent, x, POSES, elsewhere, target).gripper_from_camera
         true, reported, white = bent.true(joints), bent.reported(joints), preset.white
-    focal_px = float(lens.uniform(*FOCAL_PX))
+    focal_px = float(intrinsics.uniform(*FOCAL_PX))
     (width, height), (wide, high) = SIZE, WIDE
     wide_camera = Intrinsics(focal_px, focal_px, (wide - 1) / 2, (high - 1) / 2, wide, high)
     first, second = (

@@ -245,7 +245,7 @@ def _over_pool(tasks: list[Task], processes: int):
 
 
 def _dies_on_interrupt() -> None:
-    """Ctrl-C reaches every process of the terminal; only the first one has something to say about it."""
+    """Ctrl-C reaches every process of the terminal; only the first one reports it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -278,8 +278,8 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
             raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
     try:
         cpus, gpus = options.cpus_per_task, options.gpus_per_task
-        room = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in room):
+        resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in resources):
             # Ray would wait for such a node without end.
             raise InputError(
                 f"--ray {options.ray}: no node has the {cpus} cores and {gpus:g} GPUs that a capture takes; "

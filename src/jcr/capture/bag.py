@@ -46,7 +46,7 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """The best frames of a bag in the folder `into`; the bag is streamed, never held.
+    """The best frames of a bag in the folder `into`; the bag is streamed and never in memory whole.
 
     Raises InputError with the topics or frames that there are where those of the options are not, and for images
     whose poses are stale.

@@ -21,7 +21,7 @@ _MODELS: dict[Any, LensModel] = {
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """The intrinsics in a camera_info YAML, for images of `size`; None where it says "not calibrated"."""
+    """The intrinsics in a camera_info YAML, for images of `size`; None of a camera not calibrated."""
     content = read_yaml(file)
     try:
         matrix, model = content["camera_matrix"]["data"], content["distortion_model"]

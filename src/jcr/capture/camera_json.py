@@ -47,7 +47,7 @@ def intrinsics_as_json(intrinsics: Intrinsics) -> dict[str, Any]:
 def read_intrinsics_of_size(intrinsics: Any, size: tuple[int, int], where: Path | str) -> Intrinsics | None:
     """The same of a camera whose intrinsics come from elsewhere: InputError where they are of another resolution.
 
-    They may say it themselves, as "width" and "height"; else the principal point does.
+    By their own "width" and "height" where they have these, else by the principal point.
     """
     found = read_intrinsics(intrinsics, size, where)
     if found is None:
@@ -55,11 +55,7 @@ def read_intrinsics_of_size(intrinsics: Any, size: tuple[int, int], where: Path 
     stated = intrinsics.get("width", size[0]), intrinsics.get("height", size[1])
     off = abs(found.cx / size[0] - 0.5), abs(found.cy / size[1] - 0.5)
     if stated != size or max(off) > FAR_OFF_CENTRE:
-        sign = (
-            f"they say {stated[0]}x{stated[1]}"
-            if stated != size
-            else f"centre ({found.cx:.4g}, {found.cy:.4g})"
-        )
+        sign = f"of {stated[0]}x{stated[1]}" if stated != size else f"centre ({found.cx:.4g}, {found.cy:.4g})"
         raise InputError(
             f"{where}: intrinsics of another resolution ({sign}) than its {size[0]}x{size[1]} images; give those of "
             "this resolution, or null to estimate them"

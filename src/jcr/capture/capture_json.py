@@ -24,7 +24,7 @@ from jcr.records import Capture
 FILE, URDF = "capture.json", "robot.urdf"
 MAX_BYTES = 32_000_000
 """More takes long to read, and is no capture."""
-MOST_TURNS = 6 * np.pi + 0.01
+MOST_ROTATION = 6 * np.pi + 0.01
 """rad: no joint rotates farther to either side."""
 
 
@@ -152,7 +152,7 @@ def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
         raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
     if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
         raise InputError(f"{where}: must be a list of finite angles in radians")
-    if np.abs(row).max() > MOST_TURNS:
+    if np.abs(row).max() > MOST_ROTATION:
         raise InputError(f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them")
     return row
 

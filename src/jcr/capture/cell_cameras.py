@@ -2,7 +2,7 @@
 
 A camera bolted to the gripper or watching it has one image for each frame, or null; a fixed one that sees the scene
 has any number; one on another arm has frames of its own. The entry without images names the camera of the capture's
-own frames and says what it is bolted to.
+own frames and what it is bolted to.
 """
 
 import re
@@ -27,7 +27,7 @@ MOUNTS: tuple[Mount, ...] = ("gripper", "base")
 
 
 def with_cameras(capture: Capture, cameras: Any, file: Path) -> Capture:
-    """The capture with what "cameras" says; InputError where that cannot be."""
+    """The capture with the cameras of "cameras"; InputError where they cannot be."""
     if cameras is None:
         return capture
     if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):

@@ -30,7 +30,7 @@ _LATEST_NS = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class PoseTable:
-    """What a table says, row by row."""
+    """The rows of a table."""
 
     base_from_gripper: Float[ndarray, "n 4 4"]
     images: tuple[str, ...] | None

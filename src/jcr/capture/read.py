@@ -102,8 +102,8 @@ def read_source(
             return found
         require_frames(len(found), str(path), at_least)
         require_motion(found.base_from_gripper, str(path))
-        turned = how_rotated(found)
-        remarks = (None if turned is None else sentence(turned), how_scaled(found))
+        rotated = how_rotated(found)
+        remarks = (None if rotated is None else sentence(rotated), how_scaled(found))
         return replace(found, notes=(*found.notes, *filter(None, remarks)))
     if into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")

@@ -25,7 +25,7 @@ from jcr.represent.cloud_ply import write_cloud
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112
-"""The EXIF tag that says how an image is to be rotated."""
+"""The EXIF tag of the rotation in which an image is shown."""
 
 
 @dataclass(frozen=True, kw_only=True)

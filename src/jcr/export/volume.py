@@ -28,7 +28,7 @@ def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: fl
     """Write a binary OctoMap (.bt) with voxels of side `voxel` m, by default the map's cell.
 
     A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
-    neither a surface nor anything unseen; all others are left out, which is how OctoMap says unknown.
+    neither a surface nor anything unseen; all others are left out, which are unknown to OctoMap.
     Raises InputError without pyoctomap, and where the voxels would be too many.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")

@@ -33,7 +33,7 @@ ALTERNATIVES = 6
 class Coverage:
     """How far a capture is."""
 
-    pictures: int
+    images: int
     unseen: tuple[str, ...]
     """What the motions do not show yet, in words."""
     expected: tuple[Expectation, ...]
@@ -60,7 +60,7 @@ def coverage(
     """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
     if len(live.poses) < 2:
-        return Coverage(pictures=len(live.poses), unseen=(), expected=(), words=words)
+        return Coverage(images=len(live.poses), unseen=(), expected=(), words=words)
     poses, joints = np.stack(live.poses), live.all_joints()
     assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
@@ -71,7 +71,7 @@ def coverage(
     more = [expected(assumptions, poses[some], of_poses(robot.systematic, some)) for some in rows]
     next_pose = chosen.next_pose(1, chosen.expected(1))
     return Coverage(
-        pictures=len(poses),
+        images=len(poses),
         unseen=observability(poses).unobservable,
         expected=(*known, *more),
         next_pose=next_pose,
@@ -110,19 +110,19 @@ def _reachable(
 def in_words(found: Coverage) -> list[str]:
     """A line on what is covered, and lines with the next pose."""
     if found.next_pose is None:
-        first = "one image; " if found.pictures else "no image yet; "
+        first = "one image; " if found.images else "no image yet; "
         return [first + "rotate the wrist by 20° or more, and move, between images"]
     pose = found.next_pose
-    lines = [f"{found.pictures} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
+    lines = [f"{found.images} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
     if (now := found.now) is not None and not found.unseen:
         mm, deg = (significant(value) for value in now.reached("seen"))
         far = significant(1e-3 * now.seen.distance_mm)
         lines[0] += (
             f"; a point seen at {far} m is expected within {mm} mm and {deg}° (95 % of errors, usual robot)"
         )
-    moved, turned = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
     then = f", then {significant(pose.within_95_mm)} mm" if now is not None else ""
-    lines.append(f"best next: {moved:.0f} mm and {turned:.0f}° from {found.like}{then}")
+    lines.append(f"best next: {moved:.0f} mm and {rotated:.0f}° from {found.like}{then}")
     return lines + [f"  {line}" for line in next_lines(found)]
 
 
@@ -140,7 +140,7 @@ def as_answer(found: Coverage) -> Answer:
     """The same for a program."""
     pose, now = found.next_pose, found.now
     return {
-        "pictures": found.pictures,
+        "pictures": found.images,
         "unobservable": list(found.unseen),
         "expected_std": None if now is None else now.std.tolist(),
         "expected_seen": None if now is None else vars(now.seen),

@@ -1,7 +1,7 @@
 """Gripper poses over TCP, one JSON object a line, from any program that can open a socket (jcr docs capture).
 
-A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) says that the arm rests there now;
-the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.
+A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) means that the arm rests there now;
+the answer, a line too, has the result and the pose to go to next. `{"done": true}` ends the capture.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ class Listen:
 def served_poses(server: socket.socket, listen: Listen) -> Iterator[Ask]:
     """A request per good line, from one client at a time; a bad line is answered, a bad client dropped.
 
-    Raises InputError when nobody says anything for `timeout_s`.
+    Raises InputError when no line comes for `timeout_s`.
     """
     while True:
         try:

@@ -128,9 +128,9 @@ def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | Non
     librealsense has distortions of its own ("Projection in Intel RealSense SDK 2.0"), among them an inverse one. Its
     own deprojection gives the ray of each pixel, and the coefficients are linear in where rays go.
     """
-    lens = {"fx": stored.fx, "fy": stored.fy, "cx": stored.ppx, "cy": stored.ppy}
+    intrinsics = {"fx": stored.fx, "fy": stored.fy, "cx": stored.ppx, "cy": stored.ppy}
     if not any(stored.coeffs):
-        return lens | {"distortion": [0.0] * 5}
+        return intrinsics | {"distortion": [0.0] * 5}
     u, v = np.meshgrid(np.linspace(0, stored.width - 1, 25), np.linspace(0, stored.height - 1, 19))
     x_px = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = np.array([rs.rs2_deproject_pixel_to_point(stored, pixel.tolist(), 1.0) for pixel in x_px])
@@ -141,4 +141,4 @@ def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | Non
     matrix, goal = np.vstack([by_x, by_y]), np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
     coefficients = np.linalg.lstsq(matrix, goal, rcond=None)[0]
     off_px = max(stored.fx, stored.fy) * np.abs(matrix @ coefficients - goal).max()
-    return lens | {"distortion": coefficients.tolist()} if off_px < FITTED_PX else None
+    return intrinsics | {"distortion": coefficients.tolist()} if off_px < FITTED_PX else None
