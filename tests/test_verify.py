@@ -307,6 +307,7 @@ def test_a_new_image_of_a_fixed_camera_shows_whether_it_rotated(
     content = json.loads((capture.folder / "capture.json").read_text())
     (tmp_path / "camera.json").write_text(json.dumps(content["intrinsics"]))
     image = cv2.imread(str(capture.folder / capture.images[10]))
+    assert image is not None
     cv2.imwrite(str(tmp_path / "overhead.png"), image)
     given = ["--name", "overhead", "--intrinsics", str(tmp_path / "camera.json")]
     assert dispatch(["add-camera", str(run), str(tmp_path / "overhead.png"), *given, "--quiet"]) == 0
