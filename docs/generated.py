@@ -28,21 +28,8 @@ from jcr.run_folder import State
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
-RESULTS_OF_CALLS = (
-    "jcr.results:RunResult",
-    "jcr.results:SavedRun",
-    "jcr.calibration.difference:Difference",
-    "jcr.verify:Verification",
-    "jcr.touch_test:Touched",
-    "jcr.records:Requirement",
-    "jcr.records:Capture",
-    "jcr.records:HandEye",
-    "jcr.records:Reconstruction",
-    "jcr.records:Pointmaps",
-    "jcr.represent.scene:SceneMap",
-    "jcr.represent.sample:Sample",
-)
-"""What the functions of the package return, and a user reads."""
+RESULTS_OF_CALLS = ("jcr.records:Pointmaps",)
+"""What is in a record of the package, is no name of its own, and a user reads."""
 FORMATS = {
     "calibration.json": (
         CalibrationFile,

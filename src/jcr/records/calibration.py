@@ -10,6 +10,7 @@ from numpy import ndarray
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, verdict_of
+from jcr.records.notebook import hand_eye_table
 from jcr.records.words import remedy, unobservable
 
 
@@ -478,6 +479,10 @@ class HandEye(Assessed):
     def is_sound(self) -> bool:
         """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
         return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        return hand_eye_table(self)
 
 
 @dataclass(frozen=True)
