@@ -39,7 +39,7 @@ FORMATS = {
     "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
     "reconstruction.npz": (
         About,
-        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#reconstruction).",
+        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#jcrreconstruction).",
     ),
     "depth.npz": (
         DepthAbout,
@@ -115,7 +115,7 @@ def api_page() -> str:
     ]
     for name in jcr.__all__:
         parts += _entry(f"jcr.{name}", getattr(jcr, name))
-    parts += ["## What functions return", ""]
+    parts += ["## Parts of these", ""]
     for place in RESULTS_OF_CALLS:
         module, _, name = place.partition(":")
         parts += _entry(name, getattr(import_module(module), name), "###")

@@ -88,6 +88,4 @@ def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
     sigmas, share = CONTRADICTED
     if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
         return None
-    return Finding(
-        kind=Kind.BOARD_SIZE, severity="rejects", mend="poses", value=float(np.expm1(off)), std=std
-    )
+    return Finding.of(Kind.BOARD_SIZE, "rejects", "poses", value=float(np.expm1(off)), std=std)

@@ -49,7 +49,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
             gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
-            return hand_eye.with_findings(Finding(kind=Kind.SCALE_ASSUMED, severity="warns", mend="motion"))
+            return hand_eye.with_findings(Finding.of(Kind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
         found = better_reading(gripper, camera)
         if found is None:
@@ -59,13 +59,13 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
         return hand_eye.with_findings(convention_finding(found, severity))
     if pairs.is_metric and not is_one(hand_eye):
         return hand_eye.with_findings(
-            Finding(
-                kind=Kind.BOARD_SIZE,
-                severity="warns",
-                mend="intrinsics",
+            Finding.of(
+                Kind.BOARD_SIZE,
+                "warns",
+                "intrinsics",
                 value=hand_eye.scale - 1,
                 std=hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6])),
-                details={"marker": 1.0},
+                marker=1.0,
             )
         )
     return hand_eye

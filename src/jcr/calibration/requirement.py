@@ -75,12 +75,12 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
         for name, value in vars(required).items()
         if value is not None
     }
-    return Finding(
-        kind=Kind.NOT_EXACT_ENOUGH,
-        severity="rejects" if required.asked else "warns",
-        mend=mend,
+    return Finding.of(
+        Kind.NOT_EXACT_ENOUGH,
+        "rejects" if required.asked else "warns",
+        mend,
         value=1e-3 * required.reached_mm,
-        details=numbers,
+        **numbers,
     )
 
 

@@ -65,7 +65,7 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None
-        unused = Finding(kind=Kind.ROBOT_UNUSED, severity="warns", mend="robot", details={"text": str(error)})
+        unused = Finding.of(Kind.ROBOT_UNUSED, "warns", "robot", text=str(error))
         return replace(errors_of(gripper), unused=unused)
 
 

@@ -70,7 +70,7 @@ def calibrated_elsewhere(
 ) -> CameraFound:
     """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those said of it."""
     own = of_camera(capture, camera)
-    other_scene = Finding(kind=Kind.ANOTHER_SCENE, severity="warns", details={"camera": capture.camera_name})
+    other_scene = Finding.of(Kind.ANOTHER_SCENE, "warns", camera=capture.camera_name)
     try:
         reconstruction = reconstruct(own, replace(reconstruct_options, backend="auto"), progress)
         found = calibrate(own, reconstruction, options)

@@ -108,7 +108,5 @@ def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye)
     on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
     if not on_gripper.converged:
         return found
-    why = Finding(
-        kind=Kind.WRONG_MOUNT, severity="rejects", mend="mount", details={"camera": capture.camera_name}
-    )
+    why = Finding.of(Kind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
     return found.with_findings(why)

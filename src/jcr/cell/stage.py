@@ -211,7 +211,7 @@ class _Seen:
         **details: float | str,
     ) -> CameraFound:
         """The camera is not placed, for this finding."""
-        why = Finding(kind=kind, severity="rejects", mend=mend, images=images, value=value, details=details)
+        why = Finding.of(kind, "rejects", mend, *images, value=value, **details)
         return self.not_placed(why)
 
     def not_placed(self, *why: Finding) -> CameraFound:
@@ -298,12 +298,12 @@ class _Rigs:
         if not len(near):
             return ()
         return (
-            Finding(
-                kind=Kind.AT_ANOTHER_CAMERA,
-                severity="warns",
-                mend="mount",
-                images=(self._capture.images[self._rows[near[0]]],),
-                details={"camera": self._capture.camera_name},
+            Finding.of(
+                Kind.AT_ANOTHER_CAMERA,
+                "warns",
+                "mount",
+                self._capture.images[self._rows[near[0]]],
+                camera=self._capture.camera_name,
             ),
         )
 
@@ -625,14 +625,7 @@ def _misses(found: CameraFound, member: _Member) -> Finding | None:
     px = worst.reprojection_px or 0.0
     if px <= MEDIAN_PX * max(1.0, member.camera.image_size[0] / 1600):
         return None
-    return Finding(
-        kind=Kind.IMAGE_MISSES,
-        severity="rejects",
-        mend="mount",
-        images=(worst.image,),
-        value=px,
-        details={"mount": found.mount},
-    )
+    return Finding.of(Kind.IMAGE_MISSES, "rejects", "mount", worst.image, value=px, mount=found.mount)
 
 
 def _uncertain(found: CameraFound, member: _Member) -> Finding | None:
@@ -644,12 +637,8 @@ def _uncertain(found: CameraFound, member: _Member) -> Finding | None:
     details, unknown = {"rotation": radians}, member.camera.intrinsics is None
     if unknown:
         details["focal_std"] = float(found.intrinsics_std[0] / found.intrinsics.fx)
-    return Finding(
-        kind=Kind.PLACE_UNCERTAIN,
-        severity="rejects",
-        mend="intrinsics" if unknown else "images",
-        value=metres,
-        details=details,
+    return Finding.of(
+        Kind.PLACE_UNCERTAIN, "rejects", "intrinsics" if unknown else "images", value=metres, **details
     )
 
 
@@ -658,7 +647,7 @@ def _crowded(member: _Member) -> Finding | None:
     widest = max(spread(one) for one in member.seen.shared if one is not None)
     if widest >= LEAST_SPREAD:
         return None
-    return Finding(kind=Kind.POINTS_CROWDED, severity="warns", mend="images", value=widest)
+    return Finding.of(Kind.POINTS_CROWDED, "warns", "images", value=widest)
 
 
 def far_from_gripper(found: CameraFound) -> Finding | None:
@@ -667,4 +656,4 @@ def far_from_gripper(found: CameraFound) -> Finding | None:
     away = float(np.linalg.norm(found.parent_from_camera[:3, 3]))
     if found.mount == "base" or away <= FAR_FROM_GRIPPER:
         return None
-    return Finding(kind=Kind.FAR_FROM_GRIPPER, severity="warns", mend="mount", value=away)
+    return Finding.of(Kind.FAR_FROM_GRIPPER, "warns", "mount", value=away)

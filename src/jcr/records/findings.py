@@ -105,6 +105,30 @@ class Finding:
     details: Mapping[str, float | str] = field(default_factory=dict)
     """Further numbers (m, rad, px, shares) and names that the sentence needs."""
 
+    @classmethod
+    def of(
+        cls,
+        kind: Kind,
+        severity: Severity,
+        mend: Mend = "none",
+        *images: str,
+        value: float | None = None,
+        std: float | None = None,
+        p: float | None = None,
+        **details: float | str,
+    ) -> "Finding":
+        """A finding about these images, with further numbers and names as `details`."""
+        return cls(
+            kind=kind,
+            severity=severity,
+            mend=mend,
+            images=images,
+            value=value,
+            std=std,
+            p=p,
+            details=details,
+        )
+
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """What it adds to that of the calibration."""

@@ -18,12 +18,8 @@ def check_registered(case: Case) -> Checked:
     every = len(case.used) == len(capture)
     if every or hand_eye.observability.observable or not observability(capture.base_from_gripper).observable:
         return Checked()
-    few = Finding(
-        kind=Kind.FEW_USED,
-        severity="rejects",
-        mend="reconstruction",
-        value=float(len(case.used)),
-        details={"of": float(len(capture))},
+    few = Finding.of(
+        Kind.FEW_USED, "rejects", "reconstruction", value=float(len(case.used)), of=float(len(capture))
     )
     findings = tuple(
         replace(one, mend="reconstruction") if one.kind is Kind.UNOBSERVABLE else one
@@ -46,8 +42,5 @@ def check_images(case: Case) -> Checked:
 def check_reconstruction(case: Case) -> Checked:
     """What the back end warned of."""
     return Checked(
-        tuple(
-            Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text})
-            for text in case.reconstruction.warnings
-        )
+        tuple(Finding.of(Kind.RECONSTRUCTION, "warns", text=text) for text in case.reconstruction.warnings)
     )

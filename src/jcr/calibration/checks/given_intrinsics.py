@@ -77,7 +77,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     if not found:
         return None
     severity = "warns" if surely else "informs"
-    return freed, Finding(kind=Kind.INTRINSICS, severity=severity, mend="intrinsics", details=found)
+    return freed, Finding.of(Kind.INTRINSICS, severity, "intrinsics", **found)
 
 
 def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:

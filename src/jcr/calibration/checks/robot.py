@@ -44,7 +44,7 @@ def angle_finding(ratio: float, std: float) -> Finding | None:
     """Camera angles over gripper angles, where they are clearly not 1; which X it is does not matter."""
     if abs(ratio - 1) <= max(SURE * std, NOTABLE_RATIO):
         return None
-    return Finding(kind=Kind.ANGLE_RATIO, severity="informs", mend="robot", value=ratio, std=std)
+    return Finding.of(Kind.ANGLE_RATIO, "informs", "robot", value=ratio, std=std)
 
 
 def _systematic_finding(robot: RobotExamined) -> Finding | None:
@@ -55,14 +55,7 @@ def _systematic_finding(robot: RobotExamined) -> Finding | None:
     offsets = robot.joint_offsets
     off = [] if offsets is None else np.flatnonzero(np.abs(offsets.offset) > SURE * offsets.std).tolist()
     if offsets is None or not off:
-        return Finding(
-            kind=Kind.SYSTEMATIC_ERRORS,
-            severity="informs",
-            mend="robot",
-            value=left[0],
-            p=p,
-            details={"rotation": left[1]},
-        )
+        return Finding.of(Kind.SYSTEMATIC_ERRORS, "informs", "robot", value=left[0], p=p, rotation=left[1])
     sizes = {f"joint_{k + 1}": float(offsets.offset[k]) for k in off}
     stds = {f"joint_{k + 1}_std": float(offsets.std[k]) for k in off}
     return Finding(

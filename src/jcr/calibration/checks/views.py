@@ -32,21 +32,12 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
     findings = []
     if is_still:
         details = {"rotation": radians}
-        findings.append(
-            Finding(kind=Kind.STATIC_IMAGES, severity="rejects", mend="images", value=metres, details=details)
-        )
+        findings.append(Finding.of(Kind.STATIC_IMAGES, "rejects", "images", value=metres, **details))
     blurred = tuple(name for name, share in width.items() if share > BLURRED_EDGE)
     if blurred:
         edge_px = max(*capture.image_size, EDGES_AT) * float(np.median([width[name] for name in blurred]))
         findings.append(
-            Finding(
-                kind=Kind.BLURRED,
-                severity="warns",
-                mend="images",
-                images=blurred,
-                value=edge_px,
-                details={"of": float(len(capture))},
-            )
+            Finding.of(Kind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture)))
         )
     return tuple(findings)
 
