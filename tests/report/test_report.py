@@ -20,7 +20,7 @@ from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import log, worst_direction
+from jcr.calibration.words import log
 from jcr.capture.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
@@ -42,6 +42,7 @@ from jcr.records import (
     Tracks,
     no_reconstruction,
 )
+from jcr.records.words import worst_direction
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -451,7 +452,7 @@ def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
         covariance[:3, :3] = std**2 * np.outer(optical, optical)
-        told = worst_direction(replace(result.hand_eye.estimate, covariance=covariance))
+        told = worst_direction(result.hand_eye.estimate.gripper_from_camera, covariance)
         assert told == f"along the optical axis: {words}"
 
 

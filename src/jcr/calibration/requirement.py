@@ -18,7 +18,7 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.handeye.next_poses import assumed_camera
 from jcr.handeye.observability import excitation
-from jcr.records import BENT, Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
+from jcr.records import BENT, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -58,7 +58,7 @@ def advised(
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
-    short = not_exact_enough(required, mostly_systematic(hand_eye.budget))
+    short = not_exact_enough(required, hand_eye.budget is not None and hand_eye.budget.mostly_systematic)
     return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
 
 
@@ -82,14 +82,6 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
         value=1e-3 * required.reached_mm,
         **numbers,
     )
-
-
-def mostly_systematic(budget: Budget | None) -> bool:
-    """Whether most of the uncertainty is systematic errors of the robot, which images of the same region leave."""
-    if budget is None:
-        return False
-    others = budget.robot_random, budget.intrinsics, budget.images, budget.faults
-    return bool(np.trace(budget.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
 def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:

@@ -125,6 +125,13 @@ class Budget:
     faults: Float[ndarray, "7 7"]
     """What findings and their uncertainty add."""
 
+    @property
+    def mostly_systematic(self) -> bool:
+        """Whether most of the translation's variance is systematic errors of the robot, which images of the same region
+        leave."""
+        others = self.robot_random, self.intrinsics, self.images, self.faults
+        return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
+
 
 @dataclass(frozen=True)
 class HeldOut:
