@@ -46,7 +46,7 @@ class VerifyOptions:
     """MM DEG: drifts smaller than both raise no alarm, however significant."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Verification:
     """The verdict on a calibration, and what it rests on."""
 
@@ -342,16 +342,16 @@ def _judged(
         notes += ("the images disagree with one another; something else than the camera moved too, or the robot "
                   "is less exact than when it was calibrated",)  # fmt: skip
     return Verification(
-        _is_moved(found.offset, found.p_value, options),
-        found.cause,
-        found.offset,
-        np.sqrt(np.diag(found.covariance)),
-        found.p_value,
-        found.misfit_p_value,
-        found.detectable,
-        images,
-        notes,
-        how,
+        moved=_is_moved(found.offset, found.p_value, options),
+        cause=found.cause,
+        offset=found.offset,
+        std=np.sqrt(np.diag(found.covariance)),
+        p_value=found.p_value,
+        misfit_p_value=found.misfit_p_value,
+        detectable=found.detectable,
+        images=images,
+        notes=notes,
+        how=how,
     )
 
 
@@ -397,14 +397,14 @@ def _of_two(
     """The verdict on two places of the camera that are so far apart."""
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     return Verification(
-        _is_moved(offset, p_value, options),
-        "camera",
-        offset,
-        np.sqrt(np.diag(covariance)),
-        p_value,
-        None,
-        detectable(covariance, options.alpha),
-        images,
-        notes,
-        how,
+        moved=_is_moved(offset, p_value, options),
+        cause="camera",
+        offset=offset,
+        std=np.sqrt(np.diag(covariance)),
+        p_value=p_value,
+        misfit_p_value=None,
+        detectable=detectable(covariance, options.alpha),
+        images=images,
+        notes=notes,
+        how=how,
     )

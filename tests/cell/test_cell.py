@@ -354,7 +354,10 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         name="second",
         mount="gripper",
         arm=None,
-        images=tuple(ImageFound(i, False, 3, None, "few") for i in second.images),
+        images=tuple(
+            ImageFound(image=i, used=False, points=3, reprojection_px=None, reason="few")
+            for i in second.images
+        ),
         findings=(few,),
     )
     assert alone.sees_another_scene(second, nothing)

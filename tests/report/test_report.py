@@ -307,9 +307,27 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
             intrinsics=run.lens,
         )
         for name, kind, arm, images in (
-            ("top", "base", None, (ImageFound("t", True, 90, 0.3, None),)),
-            ("second", "gripper", None, tuple(ImageFound(i, i != "b", 90, 0.3, None) for i in "abc")),
-            ("other", "gripper", "right", (ImageFound("a", True, 90, 0.3, None),)),
+            (
+                "top",
+                "base",
+                None,
+                (ImageFound(image="t", used=True, points=90, reprojection_px=0.3, reason=None),),
+            ),
+            (
+                "second",
+                "gripper",
+                None,
+                tuple(
+                    ImageFound(image=i, used=i != "b", points=90, reprojection_px=0.3, reason=None)
+                    for i in "abc"
+                ),
+            ),
+            (
+                "other",
+                "gripper",
+                "right",
+                (ImageFound(image="a", used=True, points=90, reprojection_px=0.3, reason=None),),
+            ),
         )
     ]
     content = cameras_file(CellFound(tuple(found), (ArmFound("right", base, 1e-6 * np.eye(6)),), None), "0.0")

@@ -113,7 +113,12 @@ def robot_noise_of(found: Adjusted) -> RobotNoise:
     """The errors of the gripper poses, as an adjustment found them."""
     given = found.given.noise
     return RobotNoise(
-        *found.noise, exceeds(found.noise, given), given, found.systematic, found.systematic_left
+        translation=found.noise[0],
+        rotation=found.noise[1],
+        estimated=exceeds(found.noise, given),
+        given=given,
+        systematic=found.systematic,
+        systematic_left=found.systematic_left,
     )
 
 

@@ -42,7 +42,7 @@ NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Drift:
     """How far the camera seems to have moved on the gripper since the calibration."""
 
@@ -76,12 +76,12 @@ def drift(
     scene = _moved_by(calibrated, old, new, systematic, slice(7, 13))
     difference = camera.misfit - scene.misfit
     return Drift(
-        camera.offset,
-        camera.covariance,
-        camera.p_value,
-        camera.misfit_p_value,
-        "either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
-        detectable(camera.covariance, alpha),
+        offset=camera.offset,
+        covariance=camera.covariance,
+        p_value=camera.p_value,
+        misfit_p_value=camera.misfit_p_value,
+        cause="either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
+        detectable=detectable(camera.covariance, alpha),
     )
 
 
@@ -96,7 +96,7 @@ def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, 
     return float(length * worst[0]), float(length * worst[1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Moved:
     """One explanation of the new images: a motion of X, or of base_from_recon."""
 
@@ -203,11 +203,11 @@ def _averaged(
     off = steps - offset
     distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, steps[..., None])[..., 0])
     return _Moved(
-        offset,
-        np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
-        float(weight @ chi2.sf(distances, 6)),
-        float(weight @ misfits),
-        float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
+        offset=offset,
+        covariance=np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
+        p_value=float(weight @ chi2.sf(distances, 6)),
+        misfit=float(weight @ misfits),
+        misfit_p_value=float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
     )
 
 

@@ -187,7 +187,13 @@ def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
     metres, radians, systematic = TYPICAL
     if given is not None:
         metres, radians = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
-    return RobotNoise(float(metres), float(radians), False, given, float(systematic))
+    return RobotNoise(
+        translation=float(metres),
+        rotation=float(radians),
+        estimated=False,
+        given=given,
+        systematic=float(systematic),
+    )
 
 
 def worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:

@@ -98,8 +98,16 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
     if at == "scene" and found.scene is not None:
         reached_mm = 1e3 * found.scene.within_95_m
         reached_deg = float(np.degrees(within_95(found.scene.covariance[3:6, 3:6])))
-    asked = options.require is not None
-    return Requirement(*(options.require or GRASPING), asked, distance_mm, reached_mm, reached_deg, at=at)
+    translation_mm, rotation_deg = options.require or GRASPING
+    return Requirement(
+        translation_mm=translation_mm,
+        rotation_deg=rotation_deg,
+        asked=options.require is not None,
+        distance_mm=distance_mm,
+        reached_mm=reached_mm,
+        reached_deg=reached_deg,
+        at=at,
+    )
 
 
 def _worthwhile(

@@ -94,7 +94,13 @@ def found_alone(
         row = own.images.index(verdict.image)
         points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
         images.append(
-            ImageFound(verdict.image, verdict.used, points, verdict.reprojection_px, verdict.reason)
+            ImageFound(
+                image=verdict.image,
+                used=verdict.used,
+                points=points,
+                reprojection_px=verdict.reprojection_px,
+                reason=verdict.reason,
+            )
         )
     return CameraFound(
         name=camera.name,
@@ -116,6 +122,9 @@ def not_registered(camera: CellCamera, error: NotTrustedError) -> CameraFound:
         name=camera.name,
         mount=camera.mount,
         arm=camera.arm,
-        images=tuple(ImageFound(image, False, 0, None, "not registered") for image in camera.images),
+        images=tuple(
+            ImageFound(image=image, used=False, points=0, reprojection_px=None, reason="not registered")
+            for image in camera.images
+        ),
         findings=no_reconstruction(error),
     )

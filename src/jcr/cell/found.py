@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jcr.adjust.robots import Adjusted, Placed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageFound:
     """What became of one image."""
 

@@ -87,7 +87,7 @@ class Learned:
         return features.x_px[last], pairs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Shared:
     """The points that an image shares with images of known pose, and where it was taken from."""
 
@@ -205,13 +205,13 @@ def _located(
     number = np.zeros(count, int)
     number[agreed] = np.arange(len(agreed))
     return Shared(
-        recon_from_camera,
-        intrinsics,
-        points[agreed],
-        seen.x_px[agreed],
-        row[kept],
-        seen.row_x_px[kept],
-        number[feature[kept]],
+        recon_from_camera=recon_from_camera,
+        intrinsics=intrinsics,
+        points_in_recon=points[agreed],
+        x_px=seen.x_px[agreed],
+        row=row[kept],
+        row_x_px=seen.row_x_px[kept],
+        row_point=number[feature[kept]],
     )
 
 

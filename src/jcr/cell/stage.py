@@ -218,7 +218,13 @@ class _Seen:
         """The camera with why it is not placed."""
         camera = self.camera
         images = [
-            ImageFound(image, False, count, None, reason or "the camera was not placed")
+            ImageFound(
+                image=image,
+                used=False,
+                points=count,
+                reprojection_px=None,
+                reason=reason or "the camera was not placed",
+            )
             for image, count, reason in zip(camera.images, self.counts, self.reasons, strict=True)
         ]
         return CameraFound(
@@ -226,7 +232,7 @@ class _Seen:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Member:
     """A camera with the images that are used."""
 
@@ -286,7 +292,9 @@ class _Rigs:
         rig = np.full(len(seen.shared), -1)
         rig[seen.rows] = len(self.poses)
         self.poses.append(places[middle])
-        return _Member(seen, rig, None, None, self._at_own_camera(places[middle]))
+        return _Member(
+            seen=seen, rig=rig, rig_from_camera=None, arm=None, findings=self._at_own_camera(places[middle])
+        )
 
     def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
         """That a camera stands where the capture's own camera was at an image."""
@@ -338,7 +346,7 @@ class _Rigs:
         rig[taken[astray]] = -1
         why = "its place on the gripper is not that of its other images"
         seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
-        return _Member(seen, rig, on_rig[middle], 0)
+        return _Member(seen=seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
 
     def _on_other_arm(self, seen: _Seen, arm: str) -> _Member | CameraFound:
         assert seen.camera.base_from_gripper is not None
@@ -360,7 +368,7 @@ class _Rigs:
         self.poses += list(places[used])
         self.arms.append(arm)
         self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
-        return _Member(seen.without(why), rig, None, len(self.arms))
+        return _Member(seen=seen.without(why), rig=rig, rig_from_camera=None, arm=len(self.arms))
 
     def arm_poses(self, options: CalibrateOptions) -> list[ArmPoses]:
         """The arms, the capture's own first."""
@@ -568,7 +576,7 @@ def _found(
     medians = of_all[evidence.problem.observations.camera == c].tolist()
     px = dict(zip((k for k, _ in member.used), medians, strict=True))
     images = tuple(
-        ImageFound(image, reason is None, count, px.get(k), reason)
+        ImageFound(image=image, used=reason is None, points=count, reprojection_px=px.get(k), reason=reason)
         for k, (image, count, reason) in enumerate(
             zip(camera.images, member.seen.counts, member.seen.reasons, strict=True)
         )

@@ -80,7 +80,7 @@ class NextPose:
     turned_rad: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotNoise:
     """One-sigma noise of the gripper poses per axis."""
 
@@ -165,7 +165,7 @@ class ScaleCheck:
     """One-sigma uncertainty that the calibration leaves in that."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthCheck:
     """A depth camera's lengths against the robot's, at features whose depth the images and the robot give."""
 
@@ -257,7 +257,7 @@ Where = Literal["seen", "camera", "scene"]
 """What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Requirement:
     """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
 
@@ -492,7 +492,7 @@ class HandEye(Assessed):
         return hand_eye_table(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """What came of one back end that was tried."""
 

@@ -36,7 +36,7 @@ MANY_PLACES = 60
 """Of a longer capture changes are looked for at this many places."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Found:
     log_p: float
     base: Float[ndarray, "13"]
@@ -179,10 +179,16 @@ class _Problem:
         """Those of some images."""
         rows = (6 * images[:, None] + np.arange(6)).ravel()
         systematic = self.systematic[np.ix_(rows, rows)]
-        return _Equations(images, self.residual[images], self.by[images], systematic, self.noise)
+        return _Equations(
+            images=images,
+            residual=self.residual[images],
+            by=self.by[images],
+            systematic=systematic,
+            noise=self.noise,
+        )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Equations:
     images: Int[ndarray, " k"]
     residual: Float[ndarray, "k 6"]
@@ -259,7 +265,7 @@ def _tested(
     inverse = np.linalg.pinv(both.T @ both) * least / freedom
     shift = found[:7] - without[:7]
     log_p = float(f_distribution.logsf(ratio, p, freedom))
-    return _Found(log_p, found[:13], found[13:], inverse[13:, 13:], shift)
+    return _Found(log_p=log_p, base=found[:13], value=found[13:], covariance=inverse[13:, 13:], shift=shift)
 
 
 def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:
