@@ -28,7 +28,8 @@ from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras
 from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.cell.images import CellImages
-from jcr.cell.stage import far_from_gripper, place_cameras
+from jcr.cell.place_checks import far_from_gripper
+from jcr.cell.stage import place_cameras
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent

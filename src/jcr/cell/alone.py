@@ -118,13 +118,5 @@ def found_alone(
 
 def not_registered(camera: CellCamera, error: NotTrustedError) -> CameraFound:
     """Of a camera whose images could not be reconstructed."""
-    return CameraFound(
-        name=camera.name,
-        mount=camera.mount,
-        arm=camera.arm,
-        images=tuple(
-            ImageFound(image=image, used=False, points=0, reprojection_px=None, reason="not registered")
-            for image in camera.images
-        ),
-        findings=no_reconstruction(error),
-    )
+    count = len(camera.images)
+    return CameraFound.not_placed(camera, no_reconstruction(error), [0] * count, ["not registered"] * count)

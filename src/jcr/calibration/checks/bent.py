@@ -12,8 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.geometry import step_between
 from jcr.handeye.bent import STRAINS, WAYS, Bent, bends, by_scale, tested, to_straight
 from jcr.handeye.solve import judged

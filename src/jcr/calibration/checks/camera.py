@@ -29,8 +29,7 @@ from jcr.adjust.score_test import (
     tested,
 )
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, of_points
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked, of_points
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Combinations, Imaged, of_case
 from jcr.camera import parameter_names, parameters

@@ -15,8 +15,7 @@ from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import freed_intrinsics
 from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.residuals import angle_ratio

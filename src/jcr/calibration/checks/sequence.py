@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.linalg import solve_triangular
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.distributions import f as f_distribution
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind

@@ -9,12 +9,16 @@ they explain the rejection.
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from jcr.calibration.case import Case
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.bent import check_bent
 from jcr.calibration.checks.camera import check_camera
-from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction, check_registered
-from jcr.calibration.checks.checked import Checked
-from jcr.calibration.checks.convention import check_convention
+from jcr.calibration.checks.capture import (
+    check_arm,
+    check_convention,
+    check_images,
+    check_reconstruction,
+    check_registered,
+)
 from jcr.calibration.checks.robot import check_robot
 from jcr.calibration.checks.scale import check_depth_camera, check_network_scale, check_scale_source
 from jcr.calibration.checks.sequence import MIN_IMAGES, check_sequence
