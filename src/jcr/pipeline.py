@@ -174,7 +174,7 @@ def add_camera(
     writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
     if pictures is not None:
-        warnings.warn("add_camera: pictures is called images now", DeprecationWarning, stacklevel=2)
+        warnings.warn("add_camera: `pictures` is called `images` now", DeprecationWarning, stacklevel=2)
         images = pictures
     files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
     if not files:

@@ -160,7 +160,7 @@ class CalibrationFile(Part):
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
-    """What the stages did of their own accord, and findings in words that nobody need act on."""
+    """What the stages did of their own accord, and findings in words that require no action."""
     mount: Mount = "gripper"
     """base: the camera is fixed and watches what the gripper carries; gripper_from_camera and base_from_recon are then
     null, and uncertainty is that of base_from_camera, along axes of the base."""
@@ -282,7 +282,7 @@ def failed_file(
     version: str,
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
-    """The file of a capture whose images gave no camera poses at all; `findings` say why, strongest first."""
+    """The file of a capture whose images gave no camera poses at all; `findings` are the reasons, strongest first."""
     return CalibrationFile(
         mount=capture.mount,
         gripper_from_camera=None,

@@ -12,7 +12,7 @@ from jcr.distributions import chi2
 from jcr.geometry import step_between
 
 OTHER = "reference"
-"""Names the covariance of a calibration that does not say what it comes from."""
+"""Name of the covariance of a calibration whose file has no budget."""
 NOTHING = 1e-6
 """Share of a difference that is rounding."""
 
@@ -42,7 +42,7 @@ def compare(calibration: str | Path, reference: str | Path) -> Difference:
 
 
 def difference(ours: Known, other: Known) -> Difference:
-    """The difference of one calibration from another, held against the covariances that they state.
+    """The difference of one calibration from another, compared with the covariances that they state.
 
     A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
     """

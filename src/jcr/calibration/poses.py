@@ -15,7 +15,7 @@ from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
 METRIC_STD = 0.005
-"""Relative; a printed marker has the size that its maker says to half a percent."""
+"""Relative; a printed marker has its stated size to half a percent."""
 
 
 def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
@@ -43,7 +43,7 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
     hand_eye = free
-    # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve_hand_eye(
             gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale

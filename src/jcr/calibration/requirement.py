@@ -50,7 +50,7 @@ def advised(
         reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
     else:
-        # An X that is not trusted is not used, nor a robot that is worse than usual promised away.
+        # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
         noise = worse_of(hand_eye.robot_noise, typical_noise())
         assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
         ahead = Ahead.of(assumptions, used, robot, PROPOSED)

@@ -68,7 +68,7 @@ def calibrated_elsewhere(
     options: CalibrateOptions,
     progress: Progress,
 ) -> CameraFound:
-    """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those said of it."""
+    """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those showed of it."""
     own = of_camera(capture, camera)
     other_scene = Finding.of(Kind.ANOTHER_SCENE, "warns", camera=capture.camera_name)
     try:
@@ -88,7 +88,7 @@ def calibrated_elsewhere(
 def found_alone(
     own: Capture, camera: CellCamera, reconstruction: Reconstruction, found: HandEye, scene_distance: float
 ) -> CameraFound:
-    """What the calibration of a camera by its own images says of it."""
+    """A camera as the calibration by its own images places it."""
     images = []
     for verdict in image_verdicts(own, reconstruction, found):
         row = own.images.index(verdict.image)

@@ -73,7 +73,7 @@ def cell_images(
     m = len(known.recon_from_camera)
     own = of_images(reconstruction.tracks, hand_eye.inliers)
     prior = None
-    # Where bundle adjustment did not decide the calibration, the images' own geometry is not believed here either.
+    # Where bundle adjustment did not decide the calibration, the images' own geometry is not used here either.
     if hand_eye.before is None or own.from_pointmaps or len(own.image) < MIN_OBSERVATIONS:
         prior, own = _as_given(reconstruction, hand_eye, known), replace(own, **NOTHING)
     rig, camera = list(range(m)), [0] * m

@@ -137,7 +137,7 @@ def _examined(
     """
     answer, found = images.adjusted(), list[tuple[Finding, ...]]()
     for c, (member, place) in enumerate(zip(members, places, strict=True), start=1):
-        if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is held against itself
+        if not len(images.freedom.intrinsics[c].std):  # exact, as of a camera that is compared with itself
             found.append(())
             continue
         is_given = member.camera.intrinsics is not None
@@ -185,7 +185,7 @@ def _found(
     parent_from_camera: Callable[[Placed], Float[ndarray, "4 4"]],
     hand_eye: HandEye,
 ) -> CameraFound:
-    """Where the camera, the c-th, is, and what its place says against it."""
+    """Where the camera, the c-th, is, and what speaks against its place."""
     camera, evidence = member.camera, answer.given.evidence
     transform, covariance = answer.transform(parent_from_camera)
     covariance = covariance + _by_faults(answer, answer.derivative(parent_from_camera), hand_eye)

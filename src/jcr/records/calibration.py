@@ -88,7 +88,7 @@ class RobotNoise:
     rotation: float
     estimated: bool
     given: tuple[float, float] | None = None
-    """m, rad: what the user said of it; counted where the residuals say no more."""
+    """m, rad: what the user gave; used where the residuals determine no more."""
     systematic: float = 0.0
     """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
     systematic_left: tuple[float, float] = (0.0, 0.0)
@@ -344,7 +344,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageResiduals:
-    """What the calibration says of each pose that the solver was given."""
+    """Residual and verdict of each pose that the solver was given."""
 
     inliers: Bool[ndarray, " n"]
     translation_residual_m: Float[ndarray, " n"]
@@ -377,7 +377,7 @@ class AngleRatio:
 
 @dataclass(frozen=True)
 class RobotExamined:
-    """What the residuals say of the robot itself."""
+    """What the residuals show of the robot itself."""
 
     noise: RobotNoise
     systematic_p: float | None = None
@@ -389,7 +389,7 @@ class RobotExamined:
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """What else than the robot's positions says how long a metre is."""
+    """Measures of the scale beside the robot's positions."""
 
     network: ScaleCheck | None = None
     """None where the reconstruction's unit is not meant to be the metre."""

@@ -137,7 +137,7 @@ class Finding:
 
 
 def no_reconstruction(error: NotTrustedError) -> tuple[Finding, ...]:
-    """What a failure of every back end says, as findings."""
+    """The failure of every back end as findings."""
     details = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)
     more = (
@@ -158,9 +158,9 @@ CAMERA = frozenset(
         Kind.INTRINSICS,
     }
 )
-"""Kinds that say that the camera is not one with these intrinsics."""
+"""Kinds by which the camera is not one with these intrinsics."""
 BENT = frozenset({Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
-"""Kinds that say that the robot's poses are bent by where the gripper is."""
+"""Kinds by which the robot's poses are bent, depending on where the gripper is."""
 LASTING = (
     CAMERA
     | BENT

@@ -22,7 +22,7 @@ LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing. Of 132 simulated captures of 8 to 20 images, 72 of them by arms with
 joint offsets of up to 1° and links 1 mm off, none comes below 1e-5, and none of seven real ones."""
 MATERIAL = 0.5
-"""Standard deviations that the answer would move by on an axis, or nobody need know."""
+"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 MIN_IMAGES = 6
 """With fewer no size of errors is known beside."""
 

@@ -18,7 +18,7 @@ SURE = 2.5
 """Standard deviations from which a joint's offset, or a ratio of angles, is named."""
 NOTABLE_RATIO = 0.003
 NOTABLE_ERRORS = 3e-5, float(np.radians(0.003))
-"""m, rad; real arms err by more, and of less nobody need hear."""
+"""m, rad: smaller systematic errors, which every real arm has, are not reported."""
 
 
 def check_robot(case: Case) -> Checked:

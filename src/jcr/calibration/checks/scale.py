@@ -1,4 +1,4 @@
-"""What else than the robot's positions knows how long a metre is: a network, a depth camera, or nothing."""
+"""Measures of the scale beside the robot's positions: a network's, a depth camera's, or none."""
 
 from dataclasses import replace
 

@@ -22,7 +22,7 @@ from jcr.records import Finding, HandEye, Kind
 LOG_P = float(np.log(1e-4))
 """Chance of any one alarm where there is nothing."""
 MATERIAL = 0.5
-"""Standard deviations that the answer would move by on an axis, or nobody need know."""
+"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 BY_CHANCE = 0.02
 """Share of groupings in any other order that may explain as much: the errors of real arms have heavy tails."""
 GROUPINGS = 200
@@ -66,7 +66,7 @@ def sequence_fault(
     time_s: Float[ndarray, " m"] | None = None,
     still: bool = False,
 ) -> Finding | None:
-    """What the order of the images says against one calibration of them; None where it says nothing.
+    """What the order of the images shows against one calibration of them; None where that is nothing.
 
     `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
     poses at 1 rad, `time_s` when they were taken; without, delay is counted in
@@ -276,5 +276,5 @@ def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[n
     position = CubicSpline(moment, base_from_gripper[:, :3, 3])
     rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
     little = 1e-3 * float(np.diff(moment).min())
-    turned = rotation(moment + little) * rotation(moment - little).inv()
-    return np.concatenate([position(moment, 1), turned.as_rotvec() / (2 * little)], axis=1)
+    rotation_between = rotation(moment + little) * rotation(moment - little).inv()
+    return np.concatenate([position(moment, 1), rotation_between.as_rotvec() / (2 * little)], axis=1)

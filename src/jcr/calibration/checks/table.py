@@ -62,7 +62,7 @@ CHECKS = (
         lambda case: _is_observable(case) and len(case.names) >= MIN_IMAGES and not _has(case, CAMERA | BENT),
     ),
     Check(check_images),
-    # A unit that somebody vouches for was used for the scale, and is no check of it.
+    # A unit with a stated standard deviation was used for the scale, and is no check of it.
     Check(
         check_network_scale,
         lambda case: case.reconstruction.is_metric and case.reconstruction.metric_std is None,

@@ -19,7 +19,7 @@ MANY = 1 / 4
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
-    """What its images alone say against a capture, causes of a rejection where it is rejected; empty of sharp images of
+    """What its images alone show against a capture, causes of a rejection where it is rejected; empty of sharp images of
     several views."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
@@ -43,7 +43,7 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What the images alone say, of a capture that is rejected: it is because of that where it concerns many images."""
+    """The findings of the images alone on a capture that is rejected; those that concern many images reject it."""
     return tuple(
         replace(one, severity="rejects")
         if one.kind is Kind.BLURRED and len(one.images) > MANY * float(one.details["of"])
