@@ -108,9 +108,9 @@ def check(
 ) -> Examination:
     """Examine a capture, or what lies at its path.
 
-    With `look` its images are registered sparsely and compared with the poses. A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
-    `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
-    compared with those.
+    With `look` its images are registered sparsely and compared with the poses. A few of them at a small size tell in
+    seconds; where these speak against the capture, or where it is to be `thorough`, all are registered as a calibration
+    does. Where the cameras' poses were given instead, the gripper's are compared with those.
 
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
     poses and joint angles contradict each other.
