@@ -28,21 +28,8 @@ from jcr.run_folder import State
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
-RESULTS_OF_CALLS = (
-    "jcr.results:RunResult",
-    "jcr.results:SavedRun",
-    "jcr.calibration.difference:Difference",
-    "jcr.verify:Verification",
-    "jcr.touch_test:Touched",
-    "jcr.records:Requirement",
-    "jcr.records:Capture",
-    "jcr.records:HandEye",
-    "jcr.records:Reconstruction",
-    "jcr.records:Pointmaps",
-    "jcr.represent.scene:SceneMap",
-    "jcr.represent.sample:Sample",
-)
-"""What the functions of the package return, and a user reads."""
+RESULTS_OF_CALLS = ("jcr.records:Pointmaps",)
+"""What is in a record of the package, is no name of its own, and a user reads."""
 FORMATS = {
     "calibration.json": (
         CalibrationFile,
@@ -52,7 +39,7 @@ FORMATS = {
     "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
     "reconstruction.npz": (
         About,
-        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#reconstruction).",
+        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#jcrreconstruction).",
     ),
     "depth.npz": (
         DepthAbout,
@@ -128,7 +115,7 @@ def api_page() -> str:
     ]
     for name in jcr.__all__:
         parts += _entry(f"jcr.{name}", getattr(jcr, name))
-    parts += ["## What functions return", ""]
+    parts += ["## Parts of these", ""]
     for place in RESULTS_OF_CALLS:
         module, _, name = place.partition(":")
         parts += _entry(name, getattr(import_module(module), name), "###")

@@ -245,7 +245,9 @@ def sound_run(out: Path) -> Path:
         frames.append({"image": name, "base_from_gripper": pose.tolist()})
     (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
     pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
-    attempt = Attempt("colmap", RUN_IMAGES, 1.0, 0.5, None)
+    attempt = Attempt(
+        backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
+    )
     content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
     lens = {
         "fx": 90.0,

@@ -4,6 +4,7 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
+from jcr.reconstruct.backends import BackendName
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
@@ -35,15 +37,16 @@ def run(
     out: str | Path,
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
-    backend: str | None = None,
+    backend: BackendName | None = None,
     progress: Progress | None = None,
     calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
     """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
 
-    Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
-    says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
-    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
+    `backend` (auto, or a name of `jcr models`) takes the place of that of `options`. Finished stages are reused from
+    `out` if capture and options are unchanged. Without torch there is no map, and a note says how to add it.
+    `calibrated` is called with the calibration before depth and map are made. Raises InputError if the input cannot be
+    used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
@@ -91,7 +94,7 @@ def calibrate(
     out: str | Path,
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
-    backend: str | None = None,
+    backend: BackendName | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
     """Calibrate a capture and write calibration and report to the folder `out`; raises as `run` does.
@@ -157,18 +160,25 @@ def build_map(
 def add_camera(
     out: str | Path,
     name: str,
-    pictures: Sequence[str | Path] | str | Path,
+    images: Sequence[str | Path] | str | Path = (),
     intrinsics: str | Path | None = None,
     *,
     progress: Progress | None = None,
+    pictures: Sequence[str | Path] | str | Path | None = None,
 ) -> RunResult:
     """Locate a fixed camera from its images of the scene of the run folder `out`.
 
-    `intrinsics` is a JSON file in the form of capture.json; None: they are estimated. The camera becomes part of the
-    run, of cameras.json and of the report. Raises InputError if the images are not from one camera or do not fit the
-    intrinsics, and NotTrustedError, writing nothing, if they do not determine the camera's pose or the run is rejected.
+    `images` are one file or more (`pictures`, their name in 0.1.0, is removed in 0.2.0). `intrinsics` is a JSON file in
+    the form of capture.json; None: they are estimated. The camera becomes part of the run, of cameras.json and of the
+    report. Raises InputError if the images are not from one camera or do not fit the intrinsics, and RejectedError,
+    writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
-    pictures = [pictures] if isinstance(pictures, str | Path) else pictures
+    if pictures is not None:
+        warnings.warn("add_camera: `pictures` is called `images` now", DeprecationWarning, stacklevel=2)
+        images = pictures
+    files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
+    if not files:
+        raise InputError(f"{name}: no images; give one or more that the camera took")
     before, report = RunFolder(Path(out)), progress or silent
     options, capture = RunOptions.of(before.options(), map=None), before.capture()
     if (doubt := before.calibration().doubt) is not None:
@@ -179,7 +189,7 @@ def add_camera(
         added = read_added_cameras(folder.path, capture)
         taken = [capture.camera_name, *(camera.name for camera in (*capture.others, *added))]
         file = None if intrinsics is None else Path(intrinsics)
-        camera = camera_of(name, [Path(picture) for picture in pictures], file, taken)
+        camera = camera_of(name, files, file, taken)
         result = stages.calibrated(capture, folder, options, report)
         located = stages.cameras(result, (*added, camera), folder, options, report)
         assert located is not None

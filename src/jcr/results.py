@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,6 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
 from jcr.records import (
     Capture,
@@ -28,6 +26,7 @@ from jcr.records import (
     Verdict,
     verdict_of,
 )
+from jcr.records.notebook import hand_eye_table
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith, RunFolder
 from jcr.segment.options import SegmentOptions
@@ -182,24 +181,6 @@ class RunResult:
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
         return hand_eye_table(self.hand_eye, str(self.out / "report.html"))
-
-
-def hand_eye_table(hand_eye: HandEye, report: str) -> str:
-    """The transform with its standard deviations as HTML."""
-    std = np.sqrt(np.diag(hand_eye.covariance))
-    mm = 1e3 * hand_eye.gripper_from_camera[:3, 3]
-    turn = np.degrees(rotation_log(hand_eye.gripper_from_camera[:3, :3]))
-    rows = "".join(
-        f"<tr><th>{axis}</th><td>{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm</td>"
-        f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
-        for k, axis in enumerate("xyz")
-    )
-    verdict = ": ".join(filter(None, (hand_eye.verdict, escape("; ".join(hand_eye.warnings)))))
-    return (
-        f"<p><b>gripper_from_camera</b>, {verdict}; {int(hand_eye.inliers.sum())} of {len(hand_eye.inliers)} poses "
-        f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
-        f"<p>1σ, gripper axes. {escape(report)}</p>"
-    )
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.records import Finding, HandEye, Kind, PosePairs
+from jcr.records.notebook import hand_eye_table
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
-from jcr.results import PosesResult, RunOptions, hand_eye_table
+from jcr.results import PosesResult, RunOptions
 
 DISAGREE = Finding(
     kind=Kind.EARLIER_VERSION, severity="rejects", details={"text": "the images disagree", "remedy": ""}
@@ -174,7 +175,7 @@ def test_one_notion_of_accepted_in_python_notebook_and_compare(
     for k, (asked, verdict) in enumerate(verdicts.items()):
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
         assert hand_eye.verdict == verdict and hand_eye.is_sound
-        assert f"</b>, {verdict}" in hand_eye_table(hand_eye, "")
+        assert f"gripper_from_camera, {verdict}" in hand_eye_table(hand_eye, "")
         write_calibration(tmp_path / f"{k}.json", page(given, hand_eye)[0])
     # By default it is a wish: it warns, in the notebook too.
     poor = calibrate_poses(PosePairs(given.source, given.images[:4], *_first(given, 4), False))

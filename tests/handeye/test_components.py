@@ -199,7 +199,7 @@ def test_the_posterior_that_is_expected_is_the_one_that_draws_have(count: int, s
         white = np.tile(np.repeat(WHITE, 3), count) * rng.normal(size=6 * count)
         drawn = replace(one, residual=part + white)
         reported.append(np.diag(posterior(drawn, *most_likely(drawn), None).covariance))
-    noise = RobotNoise(*WHITE, True, None, systematic_rad)
+    noise = RobotNoise(translation=WHITE[0], rotation=WHITE[1], estimated=True, systematic=systematic_rad)
     silent = replace(one, residual=np.zeros(6 * count))
     ratio = np.diag(expected_posterior(silent, noise, None).covariance) / np.median(reported, axis=0)
     assert (np.abs(np.log(ratio)) < np.log(1.6)).all(), ratio

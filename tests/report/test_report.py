@@ -21,7 +21,7 @@ from chromium import Chromium
 from conftest import shrunk_capture
 from jcr.calibration.calibration_json import CalibrationFile, calibration_file, failed_file
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import log, worst_direction
+from jcr.calibration.words import log
 from jcr.capture.capture_json import kept
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
@@ -43,6 +43,7 @@ from jcr.records import (
     Tracks,
     no_reconstruction,
 )
+from jcr.records.words import worst_direction
 from jcr.report.features import coverage, histogram, reprojection_errors_px
 from jcr.report.figures import ABOVE, camera_figure, rendered_points
 from jcr.report.html import failed_report_html, report_html
@@ -307,9 +308,27 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
             intrinsics=run.lens,
         )
         for name, kind, arm, images in (
-            ("top", "base", None, (ImageFound("t", True, 90, 0.3, None),)),
-            ("second", "gripper", None, tuple(ImageFound(i, i != "b", 90, 0.3, None) for i in "abc")),
-            ("other", "gripper", "right", (ImageFound("a", True, 90, 0.3, None),)),
+            (
+                "top",
+                "base",
+                None,
+                (ImageFound(image="t", used=True, points=90, reprojection_px=0.3, reason=None),),
+            ),
+            (
+                "second",
+                "gripper",
+                None,
+                tuple(
+                    ImageFound(image=i, used=i != "b", points=90, reprojection_px=0.3, reason=None)
+                    for i in "abc"
+                ),
+            ),
+            (
+                "other",
+                "gripper",
+                "right",
+                (ImageFound(image="a", used=True, points=90, reprojection_px=0.3, reason=None),),
+            ),
         )
     ]
     content = cameras_file(CellFound(tuple(found), (ArmFound("right", base, 1e-6 * np.eye(6)),), None), "0.0")
@@ -452,7 +471,7 @@ def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
         covariance[:3, :3] = std**2 * np.outer(optical, optical)
-        told = worst_direction(replace(result.hand_eye.estimate, covariance=covariance))
+        told = worst_direction(result.hand_eye.estimate.gripper_from_camera, covariance)
         assert told == f"along the optical axis: {words}"
 
 

@@ -395,7 +395,7 @@ def hand_eye() -> HandEye:
             inliers=np.ones(2, bool), translation_residual_m=none, rotation_residual_rad=none
         ),
         residuals=PaperResiduals(0.0, 0.0),
-        robot=RobotExamined(RobotNoise(0.0, 0.0, False)),
+        robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
     )
 
 

@@ -113,7 +113,12 @@ def robot_noise_of(found: Adjusted) -> RobotNoise:
     """The errors of the gripper poses, as an adjustment found them."""
     given = found.given.noise
     return RobotNoise(
-        *found.noise, exceeds(found.noise, given), given, found.systematic, found.systematic_left
+        translation=found.noise[0],
+        rotation=found.noise[1],
+        estimated=exceeds(found.noise, given),
+        given=given,
+        systematic=found.systematic,
+        systematic_left=found.systematic_left,
     )
 
 
@@ -178,16 +183,16 @@ def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
 
 def _leave_one_out(found: Adjusted) -> HeldOut | None:
     """Each image's gripper pose predicted by an adjustment that does not use it."""
-    missed = found.leave_one_out()
-    m = len(missed)
+    left_out = found.leave_one_out()
+    m = len(left_out)
     if m < 4:
         return None
-    metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(left_out.reshape(m, 2, 3), axis=2).mean(0)
     # The images as they would be with every gripper, and the rig on it, by as much beside its place.
     placed, evidence = found.most_likely, found.given.evidence
     x, z = placed.x[0], placed.z[0]
     gripper = predict(x, placed.scale, z, placed.scene.world_from_rig)
-    in_metres = inverse(z) @ retract(gripper, -missed) @ x
+    in_metres = inverse(z) @ retract(gripper, -left_out) @ x
     rigs = scale_translation(in_metres, 1 / placed.scale)
     moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
     return HeldOut(

@@ -41,7 +41,7 @@ def with_intrinsics_considered(
         return hand_eye
     moved = np.array(
         [
-            _moved(camera, tracks, rows, intrinsics, prior)
+            _camera_with_other_intrinsics(camera, tracks, rows, intrinsics, prior)
             for camera, rows in zip(recon_from_camera, seen, strict=True)
         ]
     )
@@ -68,7 +68,7 @@ def with_intrinsics_considered(
     return replace(hand_eye, estimate=estimate)
 
 
-def _moved(
+def _camera_with_other_intrinsics(
     recon_from_camera: Float[ndarray, "4 4"],
     tracks: Tracks,
     rows: ndarray,
@@ -79,8 +79,8 @@ def _moved(
     x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
     by_x = by_point(intrinsics, x_in_camera)
     by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
-    by_lens = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
-    steps = -np.linalg.lstsq(by_pose, by_lens.reshape(len(by_pose), -1), rcond=None)[0].T
+    by_intrinsics = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
+    steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
     return np.array(
         [recon_from_camera @ inverse(transform(rotation_exp(step[3:]), step[:3])) for step in steps]
     )

@@ -42,7 +42,7 @@ NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Drift:
     """How far the camera seems to have moved on the gripper since the calibration."""
 
@@ -72,16 +72,16 @@ def drift(
     steps of these cameras (geometry.retract, recon axes); `systematic` is the covariance of the systematic errors of old
     and new gripper poses at 1 rad.
     """
-    camera = _moved_by(calibrated, old, new, systematic, slice(0, 6))
-    scene = _moved_by(calibrated, old, new, systematic, slice(7, 13))
+    camera = _estimate_motion(calibrated, old, new, systematic, slice(0, 6))
+    scene = _estimate_motion(calibrated, old, new, systematic, slice(7, 13))
     difference = camera.misfit - scene.misfit
     return Drift(
-        camera.offset,
-        camera.covariance,
-        camera.p_value,
-        camera.misfit_p_value,
-        "either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
-        detectable(camera.covariance, alpha),
+        offset=camera.offset,
+        covariance=camera.covariance,
+        p_value=camera.p_value,
+        misfit_p_value=camera.misfit_p_value,
+        cause="either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
+        detectable=detectable(camera.covariance, alpha),
     )
 
 
@@ -96,8 +96,8 @@ def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, 
     return float(length * worst[0]), float(length * worst[1])
 
 
-@dataclass(frozen=True)
-class _Moved:
+@dataclass(frozen=True, kw_only=True)
+class _Motion:
     """One explanation of the new images: a motion of X, or of base_from_recon."""
 
     offset: Float[ndarray, "6"]
@@ -108,13 +108,13 @@ class _Moved:
     misfit_p_value: float | None
 
 
-def _moved_by(
+def _estimate_motion(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
     columns: slice,
-) -> _Moved:
+) -> _Motion:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns.start == 0
@@ -185,7 +185,7 @@ def _averaged(
     known_sizes: Iterable[tuple[ndarray, ndarray, Solution]],
     begun: Float[ndarray, "6"],
     freedom: int,
-) -> _Moved:
+) -> _Motion:
     """The motion, and how the new images agree on it, averaged over the sizes of the robot's errors that the old images
     leave open.
 
@@ -202,12 +202,12 @@ def _averaged(
     offset = weight @ steps
     off = steps - offset
     distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, steps[..., None])[..., 0])
-    return _Moved(
-        offset,
-        np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
-        float(weight @ chi2.sf(distances, 6)),
-        float(weight @ misfits),
-        float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
+    return _Motion(
+        offset=offset,
+        covariance=np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
+        p_value=float(weight @ chi2.sf(distances, 6)),
+        misfit=float(weight @ misfits),
+        misfit_p_value=float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
     )
 
 

@@ -129,7 +129,14 @@ def _with_residuals(
     used = used_distinct[distinct]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
-    noise = RobotNoise(*fit.noise, fit.noise_estimated, fit.given_noise, fit.systematic, fit.systematic_left)
+    noise = RobotNoise(
+        translation=fit.noise[0],
+        rotation=fit.noise[1],
+        estimated=fit.noise_estimated,
+        given=fit.given_noise,
+        systematic=fit.systematic,
+        systematic_left=fit.systematic_left,
+    )
     metres, radians = (
         np.linalg.norm(residual, axis=1)[distinct]
         for residual in (fit.translation_residual, fit.rotation_residual)

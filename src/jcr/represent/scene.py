@@ -16,6 +16,7 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
+from jcr.records.notebook import table
 from jcr.represent.chunks import in_chunks
 from jcr.represent.distance import DistanceGrid, distance_grid
 from jcr.represent.fields import Fields, FieldShape, Lattice
@@ -51,6 +52,18 @@ class SceneMap:
         self.fields.spread("occupancy")
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        lower, upper = self.box.round(3).tolist()
+        rows = [
+            ("workspace", f"{lower} to {upper} m, base frame"),
+            ("cell", f"{1e3 * self.cell:.1f} mm"),
+            ("properties", ", ".join(self.properties)),
+            ("labels", ", ".join(self.label_names)),
+            *self.history.items(),
+        ]
+        return table("map", rows)
 
     @property
     def box(self) -> Float[ndarray, "2 3"]:
