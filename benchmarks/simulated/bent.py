@@ -9,16 +9,8 @@ from numpy import ndarray
 from benchmarks.simulated.problem import HandEyeProblem, disturbed
 from jcr.geometry import rotation_exp, scale_translation, transform
 from jcr.handeye.robots import Arm
-from jcr.simulate.robots import (
-    PRESETS,
-    ArmErrors,
-    BentArm,
-    PresetName,
-    bend,
-    effective_about,
-    hand_eye_on,
-    views,
-)
+from jcr.simulate.bent_arm import BentArm, bend
+from jcr.simulate.robots import PRESETS, ArmErrors, PresetName, effective_about, hand_eye_on, views
 
 
 @dataclass(frozen=True)

@@ -28,15 +28,14 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import BentArm, bend
 from jcr.simulate.poses import looking_at, random_hand_eye
 from jcr.simulate.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
     PRESETS,
-    BentArm,
     PresetName,
     about_posture,
-    bend,
     effective_exchanged,
     hand_eye_on,
     table_center,

@@ -19,8 +19,8 @@ from jcr.adjust.robots import Adjusted, ArmPoses, Given, Placed, equations_of
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.geometry import apply, inverse
-from jcr.handeye.components import expected_posterior
 from jcr.handeye.equation import Poses
+from jcr.handeye.posterior import expected_posterior
 from jcr.records import Intrinsics, RobotNoise, Tracks
 
 COLUMNS = 9

@@ -42,9 +42,11 @@ from jcr.adjust.model_error import expressed, polynomials_of
 from jcr.adjust.pixel_noise import PixelNoise
 from jcr.adjust.scene import Freedom, Observations, Scene, similarities_of_rigs, stepped, with_freedom
 from jcr.geometry import inverse, retract, skew, step_between
-from jcr.handeye.components import POSES, Equations, most_likely, posterior, solve
+from jcr.handeye.components import most_likely
 from jcr.handeye.equation import PRIOR_STD, SCALE, Poses, predict, residuals, residuals_by_camera
-from jcr.handeye.fit import left_out
+from jcr.handeye.equation import UNKNOWNS as POSES
+from jcr.handeye.mixed_model import Equations, left_out, solve
+from jcr.handeye.posterior import posterior
 from jcr.handeye.systematic import Region
 from jcr.least_squares import one_blas_thread
 from jcr.records import Budget, ModelError
@@ -133,7 +135,7 @@ class Adjusted:
 
     def leave_one_out(self) -> Float[ndarray, "m 6"]:
         """Steps from the reported to the adjusted gripper poses (m, rad), each by an adjustment without that pose."""
-        missed, _ = left_out(self.equations, solve(self.equations, self.log_sizes), self.noise)
+        missed, _ = left_out(solve(self.equations, self.log_sizes), self.noise)
         return missed
 
     def intrinsics_covariance(self, c: int) -> Float[ndarray, "q q"]:
@@ -507,14 +509,14 @@ def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     region = Region.of_unknowns(np.delete(jacobian, SCALE, axis=1), count)
     return (
         Equations(
-            residual - by_rig @ step,
-            np.concatenate([jacobian, -by_rig @ follow], axis=1),
-            (prior + prior.T) / 2,
-            gradient,
-            (known + known.T) / 2,
-            region.left(systematic),
-            given.noise,
-            _bent(given.arms, region),
+            residual=residual - by_rig @ step,
+            jacobian=np.concatenate([jacobian, -by_rig @ follow], axis=1),
+            prior_information=(prior + prior.T) / 2,
+            prior_gradient=gradient,
+            known=(known + known.T) / 2,
+            systematic=region.left(systematic),
+            given=given.noise,
+            bent=_bent(given.arms, region),
         ),
         region,
     )

@@ -21,7 +21,7 @@ from jcr.adjust.robots import Adjusted, Placed, equations_of
 from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
-from jcr.handeye.components import solve
+from jcr.handeye.mixed_model import solve
 from jcr.records import Intrinsics
 
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}

@@ -48,7 +48,7 @@ SURPRISE = 1.5
 
 
 @one_blas_thread
-def solve_hand_eye(
+def solve_hand_eye(  # noqa: PLR0913: published; each is a fact of its own about the capture
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,
     *,
@@ -129,11 +129,7 @@ def _with_residuals(
     used = used_distinct[distinct]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
-    noise = RobotNoise(*fit.noise, fit.noise_estimated, fit.given_noise, fit.systematic, fit.systematic_left)
-    metres, radians = (
-        np.linalg.norm(residual, axis=1)[distinct]
-        for residual in (fit.translation_residual, fit.rotation_residual)
-    )
+    metres, radians = np.linalg.norm(fit.residual[distinct].reshape(-1, 2, 3), axis=2).T
     return HandEye(
         estimate=Estimate(
             gripper_from_camera=fit.gripper_from_camera,
@@ -146,10 +142,10 @@ def _with_residuals(
             inliers=used,
             translation_residual_m=metres,
             rotation_residual_rad=radians,
-            reasons=_reasons(used, metres, radians, noise),
+            reasons=_reasons(used, metres, radians, fit.noise),
         ),
         residuals=PaperResiduals(delta_t, delta_r),
-        robot=RobotExamined(noise),
+        robot=RobotExamined(fit.noise),
         held_out=_held_out(fit, used_distinct),
         findings=seen.findings,
     )
@@ -276,7 +272,7 @@ def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
     """Each used image predicted by a fit to the others; None when too few are left to fit."""
     if used.sum() < 4:
         return None
-    metres, radians = np.linalg.norm(fit.missed[used].reshape(-1, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(fit.leave_one_out[used].reshape(-1, 2, 3), axis=2).mean(0)
     return HeldOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )

@@ -13,14 +13,13 @@ from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.progress import Progress, silent, steps
+from jcr.simulate.bent_arm import BentArm, bend
 from jcr.simulate.cell_capture import Further, add_cameras, simulate_eye_to_hand, sizes_of
 from jcr.simulate.options import SimulateOptions
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
 from jcr.simulate.robots import (
     EFFECTIVE_POSES,
-    BentArm,
-    bend,
     effective_about,
     hand_eye_on,
     patterned,

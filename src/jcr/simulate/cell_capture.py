@@ -16,9 +16,9 @@ from jcr.capture.lens_json import lens_as_json
 from jcr.files import write_bytes, write_text
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.handeye.arms import arm_named
-from jcr.handeye.robots import ErrorSizes
 from jcr.progress import Progress, steps
 from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import ErrorSizes, bend
 from jcr.simulate.objects import held_package
 from jcr.simulate.options import SimulateOptions
 from jcr.simulate.poses import gripper_poses, looking_at, random_hand_eye
@@ -26,7 +26,6 @@ from jcr.simulate.render import render
 from jcr.simulate.robots import (
     EFFECTIVE_POSES,
     about_posture,
-    bend,
     effective_about,
     effective_exchanged,
     hand_eye_on,

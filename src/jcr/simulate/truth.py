@@ -17,7 +17,7 @@ from jcr.errors import InputError
 from jcr.files import read_bytes, write_bytes, write_text
 from jcr.intrinsics_json import IntrinsicsJson
 from jcr.records import Intrinsics
-from jcr.simulate.robots import BentArm
+from jcr.simulate.bent_arm import BentArm
 
 _DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""
