@@ -55,12 +55,11 @@ class ForeseenCamera:
     def of(adjusted: Adjusted) -> "ForeseenCamera":
         """The first camera of an adjustment, its next images being as those were."""
         images = adjusted.given.evidence
-        problem, view, left = images.problem, images.view, images.problem.freedom.model_error_std
-        weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
+        problem, left = images.problem, images.problem.freedom.model_error_std
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
-            information_per_px2=float(weight.sum()) / len(problem.seen.rows),
+            information_per_px2=float(images.weight.sum()) / len(problem.seen.rows),
             model_error=float(left[0]) if len(left) else 0.0,
         )
 

@@ -68,7 +68,7 @@ class PixelNoise:
         return (depth > max(nearest, 1e-9)) * weight
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """What of the observations the estimate needs and no adjustment changes."""
 
@@ -92,7 +92,13 @@ class Layout:
         _, cell = np.unique(keys, axis=1, return_inverse=True)
         freedom = np.maximum(2 * np.bincount(observations.point) - 3, 1)
         stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
-        return Layout(camera, observations.point, cell.ravel(), stated, chi2.ppf(0.5, freedom))
+        return Layout(
+            camera=camera,
+            point=observations.point,
+            cell=cell.ravel(),
+            stated_variance=stated,
+            median_square=chi2.ppf(0.5, freedom),
+        )
 
     @property
     def states_variances(self) -> bool:

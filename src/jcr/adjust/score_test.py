@@ -372,7 +372,7 @@ def _dispersion(images: ImageEvidence) -> float:
     """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
     Liang and Zeger, Biometrika 73, 1986)."""
     problem, view = images.problem, images.view
-    weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
+    weight = images.weight
     pull = weight[:, None] * view.residual_px
     taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
     share = max(1 - taken / (2 * len(weight)), 0.1)

@@ -5,9 +5,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
-from jcr.adjust.robots import Adjusted, ArmPoses, adjust
+from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.adjust.score_test import freed
+from jcr.adjust.together import adjust
 from jcr.geometry import apply, fit_similarity, scale_translation
 from jcr.handeye.fit import Unknowns
 from jcr.handeye.systematic import smooth_errors

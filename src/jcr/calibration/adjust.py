@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import median_reprojection_px, view_of
+from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.projection import view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import focal_lengths
 from jcr.adjust.wrist import adjust_wrist, recon_frame

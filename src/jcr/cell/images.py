@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import RigInformation
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
-from jcr.adjust.robots import Adjusted, ArmPoses, adjust
-from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.adjust.robots import Adjusted, ArmPoses
+from jcr.adjust.scene import Freedom, Observations, RigInformation, Scene
 from jcr.adjust.score_test import freed, with_intrinsics
+from jcr.adjust.together import adjust
 
 
 @dataclass(frozen=True, kw_only=True)

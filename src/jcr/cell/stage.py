@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.adjust.images import RigInformation, median_reprojection_px
+from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, prior_about, prior_of
 from jcr.adjust.robots import Adjusted, ArmPoses, Placed
-from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.adjust.scene import Freedom, Observations, RigInformation, Scene
 from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.checks.camera import camera_faults, with_contradiction
 from jcr.calibration.checks.given_intrinsics import contradicted_by

@@ -29,6 +29,8 @@ SETTLED = 1e-4
 
 Information = Float[ndarray, "c c"]
 """Expected, of the log sizes at their mode."""
+Weighed = list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]
+"""Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups."""
 
 
 def most_likely(
@@ -79,8 +81,8 @@ def over_sizes(
     log_sizes: LogSizes,
     information: Information,
     density: Callable[[Solution], Each] = lambda solution: solution.log_posterior,
-) -> list[tuple[Float[ndarray, " g"], Float[ndarray, "g c"], Solution]]:
-    """Posterior weights (their sum is 1) of log sizes about their mode, and the solutions at these, in groups.
+) -> Weighed:
+    """The log sizes about their mode that stand for all.
 
     `density` is the logarithm of the sizes' posterior, up to a constant.
     """

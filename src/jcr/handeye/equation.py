@@ -112,11 +112,11 @@ def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
     return np.diag(std**-2.0)
 
 
-def limited(step: Float[ndarray, " u"]) -> Float[ndarray, " u"]:
-    """A step of the unknowns of one or more arms, shortened so that it rotates nothing too far."""
+def share_within_limits(step: Float[ndarray, " u"]) -> float:
+    """Of a step of the unknowns of one or more arms, how much of it rotates nothing too far."""
     arms = range((len(step) - 1) // 12)
     rotations = np.r_[SCALE, *(columns_of_arm(arm)[[3, 4, 5, 9, 10, 11]] for arm in arms)]
-    return step * min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
+    return min(1.0, LARGEST_ROTATION / max(float(np.abs(step[rotations]).max()), 1e-300))
 
 
 def pose_information(

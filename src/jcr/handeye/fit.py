@@ -25,10 +25,10 @@ from jcr.handeye.equation import (
     TRANSLATION,
     UNKNOWNS,
     Poses,
-    limited,
     pose_by_pose,
     residuals,
     residuals_by_camera,
+    share_within_limits,
     weak_prior,
 )
 from jcr.handeye.mixed_model import Equations, LogSizes, Solution, left_out, solve
@@ -168,7 +168,7 @@ def _most_likely_unknowns(
         equations = linearised(problem, unknowns).equations
         log_sizes, _ = most_likely(equations, log_sizes)
         solution = solve(equations, log_sizes)
-        step = limited(solution.step)
+        step = share_within_limits(solution.step) * solution.step
         unknowns = after(unknowns, step)
         if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
             break

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import Transform, retract
-from jcr.handeye.equation import UNKNOWNS, Poses, columns_of_arm, limited, residuals
+from jcr.handeye.equation import UNKNOWNS, Poses, columns_of_arm, residuals, share_within_limits
 
 STEPS, SETTLED = 30, 1e-12
 
@@ -40,7 +40,7 @@ def fit_known_scale(
         step = np.zeros(UNKNOWNS)
         rows = (weight[:, None] * jacobian[:, :, free]).reshape(-1, len(free))
         step[free] = -np.linalg.lstsq(rows, (weight * residual).ravel(), rcond=1e-9)[0]
-        step = limited(step)
+        step *= share_within_limits(step)
         x, z = retract(x, step[:6]), retract(z, step[7:])
         if np.abs(step).max() < SETTLED:
             break

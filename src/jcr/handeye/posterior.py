@@ -5,7 +5,7 @@ covariance: the covariance is scaled until its 99 % ellipsoid holds 99 %, for an
 deviations off is the worst fault.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr.distributions import chi2
 from jcr.handeye.cholesky import cholesky, lower
-from jcr.handeye.components import Information, expected_information, over_sizes
+from jcr.handeye.components import Information, Weighed, expected_information, over_sizes
 from jcr.handeye.equation import UNKNOWNS
 from jcr.handeye.mixed_model import Each, Equations, LogSizes, Solution, solve
 from jcr.handeye.systematic import Region
@@ -46,8 +46,11 @@ def posterior(
     equations: Equations, log_sizes: LogSizes, information: Information, region: Region | None
 ) -> Posterior:
     """The unknowns averaged over the sizes about their mode; `region` adds what other poses of it would change."""
-    found = over_sizes(equations, log_sizes, information)
-    return _averaged(equations, log_sizes, found, lambda *at: _elsewhere(equations, *at, region))
+
+    def elsewhere(solution: Solution, sizes: LogSizes) -> Stack:
+        return _elsewhere(equations, solution, sizes, region)
+
+    return _averaged(equations, log_sizes, over_sizes(equations, log_sizes, information), elsewhere)
 
 
 def expected_posterior(equations: Equations, noise: RobotNoise, region: Region | None) -> Posterior:
@@ -75,8 +78,8 @@ def expected_covariance_at(equations: Equations, noise: RobotNoise, region: Regi
 
 def _averaged(
     equations: Equations,
-    mode: LogSizes,
-    found: Iterable[tuple[Float[ndarray, " g"], LogSizes, Solution]],
+    mode: Float[ndarray, " c"],
+    found: Weighed,
     elsewhere: Callable[[Solution, LogSizes], Stack],
 ) -> Posterior:
     """The mixture of the solutions that were `found` with their weights, each wider by `elsewhere`."""
