@@ -2,7 +2,7 @@
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
-those of arms that bend as robots.py has it, and the truth is the effective transform.
+those of arms that bend as simulate/bent_arm.py has it, and the truth is the effective transform.
 """
 
 from dataclasses import dataclass

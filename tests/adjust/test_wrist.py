@@ -11,7 +11,7 @@ from jcr.adjust import together
 from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.adjust.robots import Adjusted
-from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
@@ -146,7 +146,7 @@ def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypat
     calls = counted(monkeypatch)
     from_poses = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED))
     of_poses = len(calls)
-    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), near=near)
+    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), options=WristOptions(near=near))
     assert len(calls) - of_poses < of_poses
     apart = step_between(from_poses.placed.x[0], again.placed.x[0])
     assert (np.abs(apart) < 0.05 * np.sqrt(np.diag(from_poses.covariance)[:6])).all()

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 POINTS_AT_ONCE = 1024
-"""Points whose coupling to the cameras is held in memory together."""
+"""Points whose coupling to the cameras is in memory together."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ SAME_FEATURE = np.radians(40.0), 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class ForeseenCamera:
-    """A camera, what is known of it beforehand, and how much its images will tell."""
+    """A camera, what is known of it beforehand, and how much its images will show."""
 
     intrinsics: Intrinsics
     prior: IntrinsicsPrior
@@ -151,7 +151,7 @@ def _shown(
     shown = np.zeros((len(cameras), len(points)), bool)
     away = cameras[seen_from, :3, 3] - points
     far = np.linalg.norm(away, axis=1)
-    turn, ratio = SAME_FEATURE
+    angle, ratio = SAME_FEATURE
     for i, pose in enumerate(cameras):
         x_px = project(intrinsics, x_in_camera := apply(inverse(pose), points))
         inside = (
@@ -161,7 +161,7 @@ def _shown(
         )
         to = pose[:3, 3] - points
         distance = np.linalg.norm(to, axis=1)
-        alike = (away * to).sum(1) > np.cos(turn) * far * distance
+        alike = (away * to).sum(1) > np.cos(angle) * far * distance
         near = (distance < ratio * far) & (far < ratio * distance)
         shown[i] = (inside & alike & near) | (seen_from == i)
     return shown

@@ -3,7 +3,7 @@
 Reprojection errors under a Cauchy loss, over intrinsics, nuisances of single images, mounts, rigs and points. Points are
 eliminated (elimination.py); the rest is a small dense system, solved by Levenberg-Marquardt: least_squares.py without
 that elimination would hold a matrix of thousands of points. Where the images are weak, what the robots report may hold
-the rigs while everything moves (robots.py); `evidence` is what is left without it, so that nothing counts twice.
+the rigs while everything moves (together.py); `evidence` is what is left without it, so that nothing counts twice.
 """
 
 from collections.abc import Sequence

@@ -43,7 +43,7 @@ class PixelNoise:
     sigma_px: Float[ndarray, " c"]
     """Of one coordinate, by camera."""
     inflation: float = 1.0
-    """Of the variance of what many observations say together, because neighbours share errors; one for all cameras, for
+    """Of the variance of what many observations show together, because neighbours share errors; one for all cameras, for
     where points follow the few observations of one its own residuals do not show it."""
     common: float = 1.0
     """Share of the variance of a median observation that all have alike; the rest is as its match states it."""
@@ -109,6 +109,10 @@ class Layout:
         """Of each observation over the median one's, where all have this share of that in common."""
         return common + (1 - common) * self.stated_variance
 
+    def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
+        """Squared sums over cells of what each observation pulls, added up."""
+        return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
+
 
 def pixel_noise(
     layout: Layout,
@@ -131,9 +135,9 @@ def pixel_noise(
     factor = float(np.median(squares[clean] if clean.any() else squares))
     noise = PixelNoise(np.maximum(np.sqrt(factor * ratio), MIN_SIGMA_PX), common=common)
     pull = noise.weights(residual_px, depth, layout)[:, None] * residual_px
-    sums = sum(float((np.bincount(layout.cell, along) ** 2).sum()) for along in pull.T)
     # Of points that are all behind their cameras nothing pulls.
-    return replace(noise, inflation=max(1.0, sums / max(float((pull**2).sum()), 1e-300)))
+    inflation = layout.squares_of_cells(pull) / max(float((pull**2).sum()), 1e-300)
+    return replace(noise, inflation=max(1.0, inflation))
 
 
 def left_of_points(

@@ -2,7 +2,7 @@
 
 Under the null hypothesis a new image's reported gripper pose differs from the predicted one by the robot's errors, the
 image's own uncertainty and that of the calibration. All new images share the latter, and systematic errors are alike
-where new gripper poses are near old ones: old and new images are therefore solved together (components.py), with a
+where new gripper poses are near old ones: old and new images are therefore solved together (mixed_model.py), with a
 drift of the camera that only new ones see. The squared Mahalanobis distance of the drift follows χ²(6) when nothing
 moved; its tail is averaged over the sizes of the robot's errors. The same with a motion of the scene tells a table
 that was moved.

@@ -13,6 +13,7 @@ from jcr.geometry import Transform, transform
 from jcr.handeye.robots import Arm, from_dh
 
 Limits = Sequence[tuple[float, float]]
+Numbers = Sequence[float | int]
 TWICE = (-2 * pi, 2 * pi)
 """A full rotation either way."""
 
@@ -21,9 +22,7 @@ def _shifted(x: float, y: float, z: float) -> Transform:
     return transform(np.eye(3), np.array([x, y, z]))
 
 
-def _dh(
-    a: Sequence[float], d: Sequence[float], alpha_deg: Sequence[float]
-) -> list[tuple[float, float, float, float]]:
+def _dh(a: Numbers, d: Numbers, alpha_deg: Numbers) -> list[tuple[float, float, float, float]]:
     """Rows of `from_dh`, without offsets of the joints' zeros."""
     columns = zip(a, d, np.radians(alpha_deg), strict=True)
     return [(float(a), float(d), float(alpha), 0.0) for a, d, alpha in columns]

@@ -33,7 +33,7 @@ CONGRUENT = np.radians(1.5)
 BETTER = 3.0
 """A reading is named when it fits this many times better than the poses as given."""
 ROUGHLY = 2.0
-"""A closed form tells how well a reading fits to this factor."""
+"""A closed form shows how well a reading fits to this factor."""
 TURN, ON_MULTIPLE = 2 * np.pi, 1.5
 """Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
 MIN_SHARE = 0.8
@@ -106,7 +106,7 @@ def better_reading(
     camera_angle = _angles(recon_from_camera)
     gaps = [_incongruence(candidate, camera_angle) for candidate in others]
     if min(gaps) > CONGRUENT:
-        # Lost turns take seconds to find again: only where no cheaper reading has the cameras' angles.
+        # Lost rotations take seconds to find again: only where no cheaper reading has the cameras' angles.
         unwound = list(_degrees_taken_as_radians(base_from_gripper, recon_from_camera))
         others += unwound
         gaps += [_incongruence(candidate, camera_angle) for candidate in unwound]
@@ -203,26 +203,26 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
             )
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
-    def turned(name: str, read: Rotation) -> _Candidate:
+    def with_rotation(name: str, read: Rotation) -> _Candidate:
         return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
-    yield turned(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
-    yield turned(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
-    yield turned(
+    yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
+    yield with_rotation(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
+    yield with_rotation(
         "rotation vectors in radians that were taken as degrees",
         Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
     )
-    yield turned(TRANSPOSED, rotation.inv())
+    yield with_rotation(TRANSPOSED, rotation.inv())
     angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
-        yield turned(
+        yield with_rotation(
             f"Euler angles ({order}) in radians that were taken as degrees",
             Rotation.from_euler(order, np.degrees(angles[order])),
         )
     k = {order: rank for rank, order in enumerate(EULER_ORDERS)}
     for taken, meant in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: k[pair[0]] + k[pair[1]]):
-        yield turned(
+        yield with_rotation(
             f"Euler angles {meant} that were taken as {taken}", Rotation.from_euler(meant, angles[taken])
         )
 

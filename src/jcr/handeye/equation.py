@@ -1,4 +1,4 @@
-"""The hand-eye equation of one image as residuals with Jacobians, and what its pose tells of the unknowns.
+"""The hand-eye equation of one image as residuals with Jacobians, and what its pose shows of the unknowns.
 
 `base_from_gripper · X = base_from_recon · S_λ(recon_from_camera)`: the information of a pose depends on where it
 is and not on what its image shows, so poses can be chosen before any image is looked at.
@@ -122,7 +122,7 @@ def share_within_limits(step: Float[ndarray, " u"]) -> float:
 def pose_information(
     base_from_gripper: Poses, gripper_from_camera: Transform, noise: tuple[float, float]
 ) -> Float[ndarray, "n 13 13"]:
-    """What each gripper pose tells of the 13 unknowns (Fisher information), whatever its image shows."""
+    """What each gripper pose shows of the 13 unknowns (Fisher information), whatever its image shows."""
     # Any frame and unit of the reconstruction will do: the base's, in metres.
     camera = base_from_gripper @ gripper_from_camera
     _, j = residuals(gripper_from_camera, 1.0, np.eye(4), base_from_gripper, camera)

@@ -242,7 +242,7 @@ def _leave_one_out(
     found, covariance = np.empty_like(linear.residual), np.empty((len(used), 6, 6))
     random = noise.translation, noise.rotation
     found[used], covariance[used] = left_out(solution, random)
-    # What the other poses' errors tell of an unused one's (best linear unbiased prediction).
+    # What the other poses' errors show of an unused one's (best linear unbiased prediction).
     alike = linear.shared + noise.systematic**2 * linear.systematic
     rows = np.repeat(used, 6)
     for i in np.flatnonzero(~used):

@@ -1,4 +1,4 @@
-"""Which gripper poses to add: those that tell most of a seen point, the rotation and the scale, before any image.
+"""Which gripper poses to add: those that show most of a seen point, the rotation and the scale, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
 the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). That is of random
@@ -119,5 +119,5 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
     z, goal = rotation[:, :, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True)
     cross = np.cross(z, goal)
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
-    turn = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
-    return rotation_exp(cross / np.maximum(sine, 1e-12) * turn) @ rotation
+    angle = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
+    return rotation_exp(cross / np.maximum(sine, 1e-12) * angle) @ rotation

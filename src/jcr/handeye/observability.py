@@ -18,7 +18,7 @@ from jcr.handeye.fit import Cues, Poses
 from jcr.records import Excitation, Finding, Kind, Observability
 
 MIN_SPREAD = 0.1
-"""Metres; camera centres closer together than this say little of scale."""
+"""Metres; camera centres closer together than this show little of scale."""
 WEAK = 0.06
 """Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
 EXACT = 0.005
@@ -58,7 +58,7 @@ def observability(
     recon_from_camera: Poses | None = None,
     cues: Cues | None = None,
 ) -> Observability:
-    """A finding for each unseen direction; camera poses, if given, tell an orbit from a fixed tool."""
+    """A finding for each unseen direction; camera poses, if given, distinguish an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
@@ -88,7 +88,7 @@ def _explained(
     found: Excitation,
     unseen: Bool[ndarray, "7"],
 ) -> list[Finding]:
-    # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
+    # The mean rotation shrinks every direction that rotates; one it keeps long is a common axis.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():

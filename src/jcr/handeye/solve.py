@@ -48,7 +48,7 @@ SURPRISE = 1.5
 
 
 @one_blas_thread
-def solve_hand_eye(  # noqa: PLR0913: published; each is a fact of its own about the capture
+def solve_hand_eye(  # noqa: PLR0913 (published; each is a fact about the capture)
     base_from_gripper: ArrayLike,
     recon_from_camera: ArrayLike,
     *,
@@ -125,7 +125,7 @@ def _with_residuals(
     distinct: Int[ndarray, " n"],
     cues: Cues | None,
 ) -> HandEye:
-    """The calibration of a fit to distinct images, not judged yet; `distinct` says which of these each image is."""
+    """The calibration of a fit to distinct images, not judged yet; `distinct` is which of these each image is."""
     used = used_distinct[distinct]
     seen = observability(gripper[used], fit.gripper_from_camera, camera[used], cues)
     delta_t, delta_r = paper_residuals(gripper, camera, fit.gripper_from_camera, fit.scale, used)
@@ -165,7 +165,7 @@ JUDGED = frozenset(
 
 
 def judged(hand_eye: HandEye) -> HandEye:
-    """The calibration with findings of the kinds JUDGED as its numbers say now, after those of other kinds."""
+    """The calibration with findings of the kinds JUDGED as its numbers are now, after those of other kinds."""
     others = [finding for finding in hand_eye.findings if finding.kind not in JUDGED]
     findings = (*others, *_of_agreement(hand_eye), *_of_uncertainty(hand_eye), *_of_residuals(hand_eye))
     return replace(hand_eye, findings=strongest_first(findings))
@@ -226,13 +226,13 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
             details={"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]},
         )
     if (held_out := hand_eye.held_out) is not None:
-        missed, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
-        if missed > max(3 * typical, WELL_ABOVE):
+        leave_one_out, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+        if leave_one_out > max(3 * typical, WELL_ABOVE):
             yield Finding(
                 kind=Kind.LEAVE_ONE_OUT,
                 severity="warns",
                 mend="images",
-                value=missed,
+                value=leave_one_out,
                 details={"residual": typical},
             )
     if len(hand_eye.inliers) < FEW:

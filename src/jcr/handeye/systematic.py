@@ -117,7 +117,7 @@ class Region:
         """Covariance (p,p) of the unknowns for other poses of the same region, from E[e'e'ᵀ] of each of m used poses.
 
         The poses of the capture are a sample of the region: a regression on them differs from one on the region by
-        what their residuals tell, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
+        what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
         1985, "HC3").
         """
         own, m = self._corrected, second_moment.shape[-3]

@@ -204,7 +204,7 @@ def patterned(
     if not posture.fits:
         raise InputError(
             f"--pattern {pattern}: a {arm.name} does not reach all of its views (up to "
-            f"{1e3 * posture.missed_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
+            f"{1e3 * posture.misfit_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
         )
     return posture.joints
 
