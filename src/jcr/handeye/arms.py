@@ -104,8 +104,9 @@ def _z1() -> Arm:
 
     Source: robots/z1_description/xacro of unitreerobotics/unitree_ros, link dimensions of its z1.urdf.
     """
-    limits = np.radians([(-150, 150), (0, 170), (-165, 0), (-87, 87), (-77, 77), (-160, 160)])
-    arm = _from_origins("z1", Z1, _shifted(0.051, 0.0, 0.0), limits.tolist(), (0.0, 1.6, -1.2, 0.9, 0.0, 0.0))
+    degrees = ((-150, 150), (0, 170), (-165, 0), (-87, 87), (-77, 77), (-160, 160))
+    limits = [(float(np.radians(low)), float(np.radians(high))) for low, high in degrees]
+    arm = _from_origins("z1", Z1, _shifted(0.051, 0.0, 0.0), limits, (0.0, 1.6, -1.2, 0.9, 0.0, 0.0))
     return replace(arm, axes=np.eye(3)[[2, 1, 1, 1, 2, 0]], forward=np.array([1.0, 0.0, 0.0]))
 
 
