@@ -179,12 +179,7 @@ def linearised(
         of_rigs = information.diagonal()[problem.freedom.first_rig :]
         information += information_along(similarities(scene, problem.freedom), float(of_rigs.mean()))
     found = ImageEvidence(
-        scene=scene,
-        problem=problem,
-        information=information,
-        gradient=-normal.right,
-        noise=noise,
-        view=view,
+        scene=scene, problem=problem, information=information, gradient=-normal.right, noise=noise, view=view
     )
     return found, normal
 

@@ -134,7 +134,7 @@ class _OwnMap:
         return out
 
 
-def _of_camera(problem: ImageProblem, values: list[float]) -> Float[ndarray, " k"]:
+def _of_camera(problem: ImageProblem, values: list[float] | list[int]) -> Float[ndarray, " k"]:
     """Of each observation, from a value a camera."""
     return np.array(values, float)[problem.layout.camera]
 

@@ -210,10 +210,7 @@ def _with_one(
 
 
 def _place_by_kept(
-    adjusted: Adjusted,
-    place: Callable[[Placed], Transform],
-    columns: int,
-    kept: Int[ndarray, " k"],
+    adjusted: Adjusted, place: Callable[[Placed], Transform], columns: int, kept: Int[ndarray, " k"]
 ) -> Float[ndarray, "6 k"]:
     """How far a camera's place moves with each of the kept columns; with no parameter of a camera it does."""
     derivative = adjusted.derivative(place)
@@ -300,10 +297,7 @@ def differences(count: int) -> Float[ndarray, "n d"]:
 
 
 def freed(
-    freedom: Freedom,
-    combinations: Float[ndarray, "e p"],
-    images: Int[ndarray, " m"],
-    camera: int = 0,
+    freedom: Freedom, combinations: Float[ndarray, "e p"], images: Int[ndarray, " m"], camera: int = 0
 ) -> Freedom:
     """A freedom with combinations of the columns of one camera's `Alternatives` free too.
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import Rotations, inverse, nearest_rotation, transform
+from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transform
 
 Poses = Float[ndarray, "*#batch n 4 4"]
 Weights = Float[ndarray, "*#batch n"]
@@ -45,7 +45,7 @@ def initial_estimate(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
     weights: Float[ndarray, " n"] | None = None,
-) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
+) -> tuple[Transform, float, Transform]:
     """`closed_form` with a scale that a reconstruction can have: where motions do not show it, that of their extents."""
     x, scale, z = closed_form(base_from_gripper, recon_from_camera, weights)
     if scale <= 0:

@@ -125,10 +125,7 @@ def _score(equations: Equations, log_sizes: LogSizes) -> tuple[float, LogSizes, 
 
 
 def _grid(
-    equations: Equations,
-    mode: LogSizes,
-    information: Information,
-    log_density: Callable[[LogSizes], Each],
+    equations: Equations, mode: LogSizes, information: Information, log_density: Callable[[LogSizes], Each]
 ) -> tuple[Float[ndarray, "k c"], Float[ndarray, " k"]]:
     """Log sizes about their mode, and the log of the volume that each stands for.
 

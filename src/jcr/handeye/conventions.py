@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import fit_similarity, inverse, retract, rotation_exp, skew, transform
+from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_exp, skew, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.fit import Poses
 from jcr.handeye.robust import least_trimmed
@@ -147,12 +147,7 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
     solved = solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
     metres, radians = solved.robot_noise.together
-    return Reading(
-        candidate.name,
-        1e3 * metres,
-        float(np.degrees(radians)),
-        int(solved.inliers.sum()),
-    )
+    return Reading(candidate.name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
 
 
 def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> float:
@@ -304,7 +299,7 @@ def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
         return rotation.as_euler(order)
 
 
-Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "3"]]
+Unknowns = tuple[Transform, float, Float[ndarray, "3"]]
 """base_from_recon, the scale, and the gripper's place in the camera in recon units times the scale."""
 
 

@@ -13,7 +13,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import ARM, inverse, retract, rotation_angle, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import (
+    ARM,
+    Transform,
+    inverse,
+    retract,
+    rotation_angle,
+    rotation_exp,
+    rotation_log,
+    skew,
+    transform,
+)
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian, unwrapped
 
 STARTS = 12
@@ -44,7 +54,7 @@ class Posture:
     """Joint angles of gripper poses, and the misfit."""
 
     joints: Float[ndarray, "n dof"]
-    flange_from_tool: Float[ndarray, "4 4"]
+    flange_from_tool: Transform
     """Given, the identity, or estimated."""
     misfit_m: Float[ndarray, " n"]
     misfit_rad: Float[ndarray, " n"]
@@ -58,7 +68,7 @@ class Posture:
 def inverse_kinematics(
     arm: Arm,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"] | None = None,
+    flange_from_tool: Transform | None = None,
     seed: int = 0,
 ) -> Posture:
     """Joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
@@ -82,9 +92,7 @@ def inverse_kinematics(
 
 
 def required_posture(
-    arm: Arm,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"] | None = None,
+    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
 ) -> Posture:
     """`inverse_kinematics`; InputError with the misfit where the poses do not fit the arm."""
     posture = inverse_kinematics(arm, base_from_gripper, flange_from_tool)
@@ -149,7 +157,7 @@ def _error(
 def _posture(
     arm: Arm,
     base_from_tool: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"],
+    flange_from_tool: Transform,
     rng: np.random.Generator,
     known: Joints | None = None,
 ) -> Posture:
@@ -166,7 +174,7 @@ def _posture(
 
 
 def _misfit(
-    arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Float[ndarray, "4 4"]
+    arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
     """Distance (m) and angle (rad) from each pose."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
@@ -210,8 +218,8 @@ def _change(
 
 
 def _with_tool(
-    arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Float[ndarray, "4 4"]
-) -> tuple[Joints, Float[ndarray, "4 4"]]:
+    arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
+) -> tuple[Joints, Transform]:
     """Joint angles and one tool together: Gauss-Newton, the angles of each pose eliminated."""
     weight = 1e-6 / np.repeat(np.square(TOOL_STD), 3)
     for _ in range(STEPS):

@@ -148,9 +148,7 @@ def axis_twists(arm: Arm, frames: Float[ndarray, "n dof 4 4"], gripper: Poses) -
 
 
 def _twist(
-    frames: Float[ndarray, "n dof 4 4"],
-    gripper: Poses,
-    axis_in_base: Float[ndarray, "n dof 3"],
+    frames: Float[ndarray, "n dof 4 4"], gripper: Poses, axis_in_base: Float[ndarray, "n dof 3"]
 ) -> Float[ndarray, "n dof 6"]:
     lever = gripper[:, None, :3, 3] - frames[..., :3, 3]
     return np.concatenate([np.cross(axis_in_base, lever), axis_in_base], axis=-1)
