@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from jcr.geometry import ARM, Transform, transform
-from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, residuals
-from jcr.handeye.fit import Cues, Poses
+from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
+from jcr.handeye.fit import Cues
 from jcr.records import Excitation, Finding, Kind, Observability
 
 MIN_SPREAD = 0.1
