@@ -21,7 +21,7 @@ from jcr.distributions import chi2
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
-from jcr.handeye.fit import PoseFit, fit_poses
+from jcr.handeye.fit import PoseFit, PoseProblem, fit_poses
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -316,19 +316,15 @@ def fitted(
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
     )
-    fit = fit_poses(
-        *poses,
-        (
-            np.array(calibration.gripper_from_camera),
-            calibration.scale or 1.0,
-            np.array(calibration.base_from_recon),
-        ),
-        np.ones(int(row_used.sum()), bool),
-        options.robot_noise_m_rad,
+    problem = PoseProblem(
+        base_from_gripper=poses[0],
+        recon_from_camera=poses[1],
+        used=np.ones(len(poses[0]), bool),
         systematic=systematic,
-        averaged=False,
+        noise=options.robot_noise_m_rad,
     )
-    return fit, poses
+    x, z = np.array(calibration.gripper_from_camera), np.array(calibration.base_from_recon)
+    return fit_poses(problem, (x, calibration.scale or 1.0, z), averaged=False), poses
 
 
 def _used(calibration: CalibrationFile, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:

@@ -12,10 +12,12 @@ import pytest
 
 import jcr
 from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
-from jcr.adjust.images import ImageProblem, evidence, noise_of, view_of
+from jcr.adjust.images import evidence, noise_of
 from jcr.adjust.intrinsics_prior import HELD, prior_of
-from jcr.adjust.robots import Adjusted, adjust
+from jcr.adjust.projection import ImageProblem, view_of
+from jcr.adjust.robots import Adjusted
 from jcr.adjust.scene import Freedom, Scene, at_start, similarities
+from jcr.adjust.together import adjust
 from jcr.calibration.checks.camera import camera_faults
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions

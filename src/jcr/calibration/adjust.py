@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import median_reprojection_px, view_of
+from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.projection import view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import focal_lengths
-from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.geometry import inverse, retract, scale_translation, step_between
@@ -65,7 +66,7 @@ def adjust_case(
 ) -> Adjusted:
     """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
 
-    `prior` takes the place of the case's; the rest is as adjust_wrist takes it.
+    `prior` takes the place of the case's; the rest is that of WristOptions.
     """
     fit = case.hand_eye.before or case.hand_eye
     return adjust_wrist(
@@ -76,11 +77,13 @@ def adjust_case(
         case.tracks,
         noise=case.options.robot_noise_m_rad,
         prior=case.intrinsics_prior if prior is None else prior,
-        systematic=case.systematic,
-        combinations=combinations,
-        exchanged=exchanged,
-        near=case.adjusted if case.hand_eye.converged else None,
-        bent=bent,
+        options=WristOptions(
+            systematic=case.systematic,
+            combinations=combinations,
+            exchanged=exchanged,
+            near=case.adjusted if case.hand_eye.converged else None,
+            bent=bent,
+        ),
     )
 
 

@@ -7,14 +7,14 @@ Schmidt; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapt
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point
 from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
 from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.fit import Cues, fit_poses
+from jcr.handeye.fit import Cues, PoseProblem, fit_poses
 from jcr.records import HandEye, Intrinsics, Tracks
 
 FEWEST = 6
@@ -45,13 +45,18 @@ def with_intrinsics_considered(
             for camera, rows in zip(recon_from_camera, seen, strict=True)
         ]
     )
-    used: Bool[ndarray, " m"] = np.ones(len(recon_from_camera), dtype=bool)
+    problem = PoseProblem(
+        base_from_gripper=base_from_gripper,
+        recon_from_camera=recon_from_camera,
+        used=np.ones(len(recon_from_camera), dtype=bool),
+        systematic=systematic,
+        noise=hand_eye.robot_noise.given,
+        cues=cues or Cues(),
+    )
 
     def solved(camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
-        start = initial_estimate(base_from_gripper, camera, used.astype(float))
-        fit = fit_poses(
-            base_from_gripper, camera, start, used, hand_eye.robot_noise.given, cues, None, systematic, False
-        )
+        start = initial_estimate(base_from_gripper, camera)
+        fit = fit_poses(replace(problem, recon_from_camera=camera), start, averaged=False)
         return fit.gripper_from_camera, fit.scale
 
     x, scale = solved(recon_from_camera)

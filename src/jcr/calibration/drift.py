@@ -2,7 +2,7 @@
 
 Under the null hypothesis a new image's reported gripper pose differs from the predicted one by the robot's errors, the
 image's own uncertainty and that of the calibration. All new images share the latter, and systematic errors are alike
-where new gripper poses are near old ones: old and new images are therefore solved together (components.py), with a
+where new gripper poses are near old ones: old and new images are therefore solved together (mixed_model.py), with a
 drift of the camera that only new ones see. The squared Mahalanobis distance of the drift follows χ²(6) when nothing
 moved; its tail is averaged over the sizes of the robot's errors. The same with a motion of the scene tells a table
 that was moved.
@@ -20,7 +20,8 @@ from scipy.optimize import root_scalar
 from scipy.stats import chi2, ncx2
 
 from jcr.geometry import retract, step_between
-from jcr.handeye.components import Equations, Solution, lower, most_likely, over_sizes, solve
+from jcr.handeye.cholesky import lower
+from jcr.handeye.components import most_likely, over_sizes
 from jcr.handeye.equation import (
     PRIOR_STD,
     ROTATION,
@@ -31,6 +32,7 @@ from jcr.handeye.equation import (
     residuals_by_camera,
 )
 from jcr.handeye.fit import PoseFit, Unknowns
+from jcr.handeye.mixed_model import Equations, Solution, solve
 from jcr.handeye.systematic import Region
 
 CLEAR = 10.0
@@ -124,13 +126,12 @@ def _estimate_motion(
     region = Region.of_poses(stacked)
     prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
     alone = Equations(
-        residual.ravel(),
-        stacked,
-        prior,
-        np.zeros(13),
-        None,
-        region.left(systematic[:m, :m]),
-        calibrated.given_noise,
+        residual=residual.ravel(),
+        jacobian=stacked,
+        prior_information=prior,
+        prior_gradient=np.zeros(13),
+        systematic=region.left(systematic[:m, :m]),
+        given=calibrated.noise.given,
     )
     log_sizes, information = most_likely(alone)
 
@@ -169,13 +170,13 @@ def _together(
     design = np.concatenate([both, np.concatenate([np.zeros((m, 6)), of_new[:, columns]])], axis=1)
     everywhere = Region(np.delete(both, SCALE, axis=1), np.hstack([region.fit, np.zeros((12, n))]))
     return Equations(
-        np.concatenate([alone.residual, residual_new.ravel()]),
-        design,
-        np.diag(np.r_[np.diag(alone.prior_information), np.zeros(6)]),
-        np.zeros(19),
-        known,
-        everywhere.left(systematic),
-        alone.given,
+        residual=np.concatenate([alone.residual, residual_new.ravel()]),
+        jacobian=design,
+        prior_information=np.diag(np.r_[np.diag(alone.prior_information), np.zeros(6)]),
+        prior_gradient=np.zeros(19),
+        known=known,
+        systematic=everywhere.left(systematic),
+        given=alone.given,
     )
 
 

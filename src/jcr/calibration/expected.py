@@ -20,9 +20,9 @@ from jcr.calibration.case import Case
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.components import GIVEN_SHARE, TYPICAL
 from jcr.handeye.equation import Poses, point_ahead, uncertainty
 from jcr.handeye.fit import Cues, expected_fit
+from jcr.handeye.mixed_model import GIVEN_SHARE, TYPICAL
 from jcr.handeye.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
 from jcr.least_squares import one_blas_thread
 from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import RigInformation
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior, prior_about
-from jcr.adjust.robots import Adjusted, ArmPoses, adjust
-from jcr.adjust.scene import Freedom, Observations, Scene
+from jcr.adjust.robots import Adjusted, ArmPoses
+from jcr.adjust.scene import Freedom, Observations, RigInformation, Scene
 from jcr.adjust.score_test import freed, with_intrinsics
+from jcr.adjust.together import adjust
 from jcr.calibration.case import MIN_OBSERVATIONS, of_images
 from jcr.calibration.options import CalibrateOptions
 from jcr.cell.localise import Known
