@@ -16,6 +16,7 @@ from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, t
 from jcr.reconstruct import backends, predictions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays
+from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.predictions import PredictionsOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 from places import SHARED
@@ -217,7 +218,7 @@ def test_a_network_gives_the_same_record(
         return images, made, ("weights X: licence Y",)
 
     monkeypatch.setattr(dust3r, "predict", predict)
-    options = Dust3rOptions("X", "Y")
+    options = Dust3rOptions(weights=Weights(Path("X"), "X", "Y"))
     result = dust3r.reconstruct(capture, options)
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
@@ -267,11 +268,15 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     from functools import partial
 
     from jcr.reconstruct.views_at_once import mapanything
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct
 
     model = FakeMapAnything(truth)
-    options = ViewsOptions("mapanything", mapanything.load, Path("X"), "Apache-2.0", Cost(0.0, 0.0, 0.0, 0.0))
+    options = ViewsOptions(
+        backend="mapanything",
+        load=mapanything.load,
+        weights=Weights(Path("X"), "X", "Apache-2.0"),
+        cost=Cost(0.0, 0.0, 0.0, 0.0),
+    )
     result = reconstruct(capture, options, predict=partial(mapanything.predict, model))
     view = model.views[0]
     assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]

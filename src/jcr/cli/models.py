@@ -10,8 +10,8 @@ import tyro
 from jcr.cli.output import Output
 from jcr.errors import InputError
 from jcr.pages import pages
-from jcr.progress import progress_bars, silent
 from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
+from jcr.reconstruct.hub import HUB_FILES, HUB_ID, download
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Arguments:
     action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
     """list; or get: download the weights of a back end."""
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
-    """For get: the back end whose weights are downloaded."""
+    """For get: the back end whose weights are downloaded, or a hub id for --weights or --sam-weights."""
     accept_licence: bool = False
-    """For get: accept a non-commercial licence, which is asked for once otherwise."""
+    """For get: accept a non-commercial licence, which is asked for otherwise."""
     revision: str | None = None
-    """For get: a commit of the weights (unset: the one that was downloaded first, or the newest)."""
+    """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
     markdown: bool = False
     """Print the table of the page `jcr docs backends`."""
     output: Output = field(default_factory=Output)
@@ -153,33 +153,31 @@ def main(arguments: Arguments) -> int:
 
 
 def _get(arguments: Arguments) -> int:
-    """The weights of one back end, downloaded, checked, and put where it looks for them."""
+    """The weights of one back end, or of a hub id, downloaded, checked, and put where runs look for them."""
     with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
-    if arguments.name not in with_weights:
-        named = "name one" if arguments.name is None else f"{arguments.name} has none to get"
-        raise InputError(f"jcr models get: {named}; there are {', '.join(with_weights)}")
-    row = BACKENDS[arguments.name]
-    from jcr.reconstruct.hub_download import download, keep_pin, pins
-
-    if not row.commercial and not pins().get(row.hub_id, {}).get("licence_accepted"):
-        if not arguments.accept_licence and not _accepted(row):
-            raise InputError(
-                f"jcr models get {row.name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
-            )
-        keep_pin(row.hub_id, {"licence_accepted": True})
-    with progress_bars() as progress:
-        report = silent if arguments.output.quiet else progress
-        folder = download(row.hub_id, row.files, arguments.revision, report)
-    text = f"{row.hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
-    if not row.is_installed():
+    name = arguments.name
+    row = BACKENDS.get(name or "")
+    if name is None or not (HUB_ID.fullmatch(name) or name in with_weights):
+        named = "name one" if name is None else f"{name} has none to get"
+        raise InputError(
+            f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
+        )
+    hub_id, files, revision = (row.hub_id, row.files, row.revision) if row else (name, HUB_FILES, None)
+    if row and not (row.commercial or row.has_weights() or arguments.accept_licence or _accepts(row)):
+        raise InputError(
+            f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
+        )
+    folder = download(hub_id, files, arguments.revision or revision, arguments.output.quiet)
+    text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
+    if row and not row.is_installed():
         text += f"its package is missing: {row.install}\n"
-    facts = {"backend": row.name, "weights": row.hub_id, "revision": folder.name, "folder": str(folder)}
-    arguments.output.result(text, facts)
+    facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
+    arguments.output.result(text, facts | {"folder": str(folder)})
     return 0
 
 
-def _accepted(row: Backend) -> bool:
-    """Ask, where there is somebody to answer."""
+def _accepts(row: Backend) -> bool:
+    """Whether the user accepts a licence; False where nobody can be asked."""
     if not sys.stdin.isatty():
         return False
     sys.stderr.write(f"{weights_command(row)}.\nIts licence: {row.licence}\nDo you accept it? [y/N] ")

@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
 from jcr.progress import Progress
-from jcr.reconstruct.hub import HUB_FILES, cached_files
+from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
@@ -43,9 +43,10 @@ def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress 
     from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct
     from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
-    weights, licence = weights_of(options)
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
-    made = Dust3rOptions(weights, licence, device_of(options), pairs, backend=options.backend)
+    made = Dust3rOptions(
+        weights=weights_of(options), device=device_of(options), pairs=pairs, backend=options.backend
+    )
     return reconstruct(capture, made, progress)
 
 
@@ -55,19 +56,17 @@ def _views_at_once(
     """All models that see every view at once: their rows name the adapter."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import da3, mapanything
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct
 
     row = BACKENDS[options.backend]
     made = ViewsOptions(
-        row.name,
-        mapanything.load if row.name == "mapanything" else da3.load,
-        weights_folder(options),
-        weights_of(options)[1],
-        Cost(*row.cost),
-        row.takes_poses,
-        device_of(options),
-        options.memory_gb,
+        backend=row.name,
+        load=mapanything.load if row.name == "mapanything" else da3.load,
+        weights=weights_of(options),
+        cost=Cost(*row.cost),
+        takes_poses=row.takes_poses,
+        device=device_of(options),
+        memory_gb=options.memory_gb,
     )
     return reconstruct(capture, made, progress)
 
@@ -80,8 +79,9 @@ def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | 
     def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
         return _colmap(capture, replace(options, backend="colmap"), progress)
 
-    weights, licence = weights_folder(options), weights_of(options)[1]
-    made = SingleViewsOptions("moge", moge.load, weights, licence, cameras, device_of(options))
+    made = SingleViewsOptions(
+        load=moge.load, weights=weights_of(options), cameras=cameras, device=device_of(options)
+    )
     return reconstruct(capture, made, progress)
 
 
@@ -144,6 +144,8 @@ class Backend:
     """Whether its input counts images in the capture's own order."""
     accuracy: str = ""
     """As measured, and where that stands; empty: not measured here."""
+    revision: str = ""
+    """The commit of its weights that `jcr models get` downloads."""
     files: tuple[str, ...] = HUB_FILES
     """Of its weights on the hub."""
     parameters: int = 0
@@ -154,7 +156,7 @@ class Backend:
     takes_poses: bool = False
     """Whether it can be shown camera poses."""
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of an any-view model: views_at_once.cost.Cost."""
+    """Of an any-view model: views_at_once.Cost, of its fields in turn."""
 
     @property
     def sees_all_views(self) -> bool:
@@ -172,7 +174,7 @@ class Backend:
 
     def has_weights(self) -> bool:
         """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
-        return not self.hub_id or bool(cached_files(self.hub_id, self.files))
+        return not self.hub_id or bool(cached_files(self.hub_id, self.files, self.revision))
 
 
 BACKENDS: dict[str, Backend] = {
@@ -187,6 +189,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights", "pair_graph"),
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
+            revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
             package="torch",
             install=install("networks"),
             parameters=689,
@@ -202,6 +205,7 @@ BACKENDS: dict[str, Backend] = {
             options=("weights", "pair_graph"),
             selected_by="weights",
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+            revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
             package="torch",
             install=install("networks"),
             parameters=571,
@@ -225,6 +229,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-BASE",
+            revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
             package="depth_anything_3",
             install=INSTALL_DA3,
             parameters=135,
@@ -240,6 +245,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-SMALL",
+            revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
             package="depth_anything_3",
             install=INSTALL_DA3,
             parameters=34,
@@ -256,6 +262,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="facebook/map-anything-apache",
+            revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
             package="mapanything",
             install="pip install git+https://github.com/facebookresearch/map-anything",
             takes_poses=True,
@@ -277,6 +284,7 @@ BACKENDS: dict[str, Backend] = {
             metric=True,
             options=("weights",),
             hub_id="Ruicheng/moge-2-vitl",
+            revision="39c4d5e957afe587e04eec59dc2bcc3be5ecd968",
             package="moge",
             install="pip install --no-deps dlr-moge dlr-utils3d",
             files=("model.pt",),
@@ -495,34 +503,29 @@ def with_cameras_of(capture: Capture, options: ReconstructOptions) -> Reconstruc
     return replace(options, cameras=capture.cameras.resolve()) if free else options
 
 
-def weights_of(options: ReconstructOptions) -> tuple[str, str]:
-    """The weights of the network that `options` names, a path or hub id, and their licence."""
-    row = BACKENDS[options.backend]
-    weights = options.weights or row.hub_id
-    for published in BACKENDS.values():
-        if published.hub_id == weights:
-            return weights, published.licence
-    if "pair_graph" not in row.options:
-        return weights, f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
-    return weights, f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
-
-
-def weights_folder(options: ReconstructOptions) -> Path:
-    """The folder of an any-view model's weights: the one that was named, or where `jcr models get` put them.
+def weights_of(options: ReconstructOptions) -> Weights:
+    """The weights of the network that `options` names: a path that was given, or what `jcr models get` downloaded.
 
     Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
     """
     row = BACKENDS[options.backend]
-    if options.weights is not None and Path(options.weights).is_dir():
-        return Path(options.weights)
-    named = options.weights or row.hub_id
-    if cached := cached_files(named, row.files):
-        return cached[0].parent
-    if named == row.hub_id:
-        raise InputError(f"--backend {row.name}: its weights are not on this machine; {weights_command(row)}")
-    raise InputError(
-        f"--weights {named}: no such folder, nor such weights in the cache; {weights_command(row)}"
+    name = options.weights or row.hub_id
+    published = next((other for other in BACKENDS.values() if other.hub_id == name), None)
+    licence = (
+        published.licence
+        if published
+        else f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
     )
+    if options.weights is not None and Path(name).exists():
+        return Weights(Path(name), name, licence)
+    if cached := cached_files(name, (published or row).files, published and published.revision):
+        return Weights(cached[0].parent, name, licence)
+    if published:
+        raise InputError(f"{name}: not on this machine; {weights_command(published)}")
+    remedy = "give a file, a folder or a hub id (jcr models)"
+    if HUB_ID.fullmatch(name) and Path(name).suffix not in (".pth", ".pt", ".safetensors"):
+        remedy = f"jcr models get {name} downloads them"
+    raise InputError(f"--weights {name}: no such weights on this machine; {remedy}")
 
 
 def weights_command(row: Backend) -> str:

@@ -21,6 +21,7 @@ from jcr.geometry import (
     rotation_between_deg,
     transform,
 )
+from jcr.reconstruct.hub import Weights
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 pytestmark = pytest.mark.slow  # draws, and torch
@@ -106,13 +107,17 @@ class Fake:
 
 
 def options(**changes):
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions
 
     def load(weights, device):
         raise AssertionError
 
-    made = ViewsOptions("da3", load, Path("weights"), "Apache-2.0", Cost(0.1, 0.1, 1.0, 0.1))
+    made = ViewsOptions(
+        backend="da3",
+        load=load,
+        weights=Weights(Path("weights"), "weights", "Apache-2.0"),
+        cost=Cost(0.1, 0.1, 1.0, 0.1),
+    )
     return replace(made, **changes)
 
 
@@ -230,7 +235,11 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
         backend="colmap",
     )
-    made = SingleViewsOptions("moge", options().load, Path("w"), "MIT", lambda capture, progress: sparse)
+    made = SingleViewsOptions(
+        load=options().load,
+        weights=Weights(Path("w"), "w", "MIT"),
+        cameras=lambda capture, progress: sparse,
+    )
 
     def one_by_one(views):
         found = Fake(bend=0.02)(views)

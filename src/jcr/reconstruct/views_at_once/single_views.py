@@ -15,6 +15,7 @@ from jcr.camera import project, rays, unproject
 from jcr.errors import InputError
 from jcr.geometry import apply
 from jcr.progress import Progress, silent
+from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.preprocess import ImageGrid, prepare_images, resize_and_crop
 from jcr.reconstruct.views_at_once.interface import Predict, Views
 from jcr.reconstruct.views_at_once.refine import depth_changes, smooth_factor
@@ -25,14 +26,12 @@ LEAST_POINTS = 5
 """Of structure from motion, in a view; with fewer its depth has the unit of the others."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SingleViewsOptions:
     """One model, and where the cameras come from."""
 
-    backend: str
     load: Callable[[Path, str], Predict]
-    weights: Path
-    licence: str
+    weights: Weights
     cameras: Callable[[Capture, Progress | None], Reconstruction]
     """Cameras and tracks of the images that it can place; its pointmaps are not used."""
     device: str = "cpu"
@@ -50,7 +49,7 @@ def reconstruct(
     or damaged.
     """
     report = progress or silent
-    predict = predict or loaded(options.load, options.weights, options.device)
+    predict = predict or loaded(options.load, options.weights.path, options.device)
     sparse = options.cameras(capture, progress)
     placed = replace(
         capture,
@@ -70,9 +69,7 @@ def reconstruct(
     changes = np.array(depth_changes(tracks, sparse.recon_from_camera, depth))
     few = np.bincount(tracks.image, minlength=len(depth)) < LEAST_POINTS
     if few.all():
-        raise InputError(
-            f"--backend {options.backend}: structure from motion gave too few points; take another"
-        )
+        raise InputError("--backend moge: structure from motion gave too few points; take another")
     typical = float(np.median(changes[~few, 0]))
     changes[few] = [typical, 0, 0, 0, 0, 0]
     # The model's metre: what it says of most views, before each is fitted.
@@ -92,7 +89,7 @@ def reconstruct(
             colors=np.stack([resize_and_crop(image, grid) for image in images.colors]),
         ),
         tracks=replace(sparse.tracks, points_in_recon=unit * sparse.tracks.points_in_recon),
-        backend=options.backend,
+        backend="moge",
         is_metric=predicted.is_metric,
-        notes=(f"weights {options.weights.name}: {options.licence}", *sparse.notes),
+        notes=(options.weights.note, *sparse.notes),
     )

@@ -23,9 +23,9 @@ from jcr.geometry import apply, inverse, rotation_angle
 from jcr.handeye.solve import solve_hand_eye
 from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
+from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.pointmaps import fit_pinhole, reconstruction_from_pointmaps
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, prepare_images, resize_and_crop
-from jcr.reconstruct.views_at_once.cost import Cost
 from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
 from jcr.reconstruct.views_at_once.refine import Refined, refine
 from jcr.records import CameraEvidence, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
@@ -44,6 +44,34 @@ CLEARLY = 0.95
 
 
 @dataclass(frozen=True)
+class Cost:
+    """Linear in the number of views for memory, quadratic for time: attention over all views at once."""
+
+    base_gb: float
+    """Weights, in main memory, and what their library takes."""
+    view_gb: float
+    """Of each view."""
+    view_s: float
+    """Of each view on one core of a desktop's processor."""
+    pair_s: float
+    """Of each pair of views, likewise."""
+
+    def bytes(self, views: int) -> float:
+        """Peak of main memory on a CPU, over what the program takes without it."""
+        return GB * (self.base_gb + self.view_gb * views)
+
+    def seconds(self, views: int) -> float:
+        """On one core of a CPU."""
+        return self.view_s * views + self.pair_s * views * (views - 1) / 2
+
+    def sentence(self, views: int, device: str) -> str:
+        """For the line that announces the work."""
+        if device != "cpu":
+            return f", and {self.bytes(views) / GB:.1f} GB of the GPU's"
+        return f", and about {self.seconds(views):.0f} s on one core"
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewsOptions:
     """One model and where it runs."""
 
@@ -51,8 +79,7 @@ class ViewsOptions:
     """For the record: its row of the table of back ends."""
     load: Callable[[Path, str], Predict]
     """Of the folder of its weights, and the device."""
-    weights: Path
-    licence: str
+    weights: Weights
     cost: Cost
     takes_poses: bool = False
     device: str = "cpu"
@@ -104,7 +131,7 @@ def reconstruct(
     report = progress or silent
     _require_memory(capture, options)
     images = prepare_images(capture, lambda size: ImageGrid(size, size, (0, 0), size))
-    predict = predict or loaded(options.load, options.weights, options.device)
+    predict = predict or loaded(options.load, options.weights.path, options.device)
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 0.5)
@@ -144,7 +171,7 @@ def _require_memory(capture: Capture, options: ViewsOptions) -> None:
         + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
     )
     require(int(needed), options.memory_gb * GB, f"--backend {options.backend} with {len(capture)} images")
-    announce(int(needed), options.memory_gb * GB, options.cost.told(len(capture), options.device))
+    announce(int(needed), options.memory_gb * GB, options.cost.sentence(len(capture), options.device))
 
 
 def with_known_rays(predicted: Predicted, images: PreparedImages) -> Predicted:
@@ -374,7 +401,7 @@ def _record(
     )
     there = predicted.confidence > 0
     x_in_recon = np.where(there[..., None], in_recon, 0)
-    notes = (f"weights {options.weights.name}: {options.licence}", *notes)
+    notes = (options.weights.note, *notes)
     if refined is None:
         made = reconstruction_from_pointmaps(
             shown,
