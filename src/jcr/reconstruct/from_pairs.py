@@ -7,9 +7,9 @@ from numpy import ndarray
 
 from jcr.memory import MAP
 from jcr.progress import Progress, silent
+from jcr.reconstruct.global_alignment.align import align_with_robot
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.reconstruct.pointmap_matches import tracks_from_pairs
 from jcr.reconstruct.preprocess import PreparedImages
 from jcr.records import Intrinsics, Pointmaps, Reconstruction

@@ -10,7 +10,8 @@ Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -42,75 +43,76 @@ class Pointmap(NamedTuple):
     confidence: Tensor
 
 
-class Dust3r(nn.Module):
-    """The network, built from the fields of a published configuration.
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The fields of a published configuration; ValueError for one that this network does not cover."""
 
-    Raises ValueError for a configuration that this network does not cover.
+    enc_embed_dim: int = 768
+    enc_depth: int = 12
+    enc_num_heads: int = 12
+    dec_embed_dim: int = 512
+    dec_depth: int = 8
+    dec_num_heads: int = 16
+    head_type: str = "linear"
+    pos_embed: str = "RoPE100"
+    mlp_ratio: float = 4.0
+    patch_size: int = PATCH
+    output_mode: str = "pts3d"
+    depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf"))
+    conf_mode: Sequence[object] = ("exp", 1, float("inf"))
+    # How the published network was trained: these change nothing here.
+    img_size: object = None
+    patch_embed_cls: str = "PatchEmbedDust3R"
+    landscape_only: bool = False
+    freeze: str = "none"
+
+    def __post_init__(self) -> None:
+        covered = {
+            "pos_embed": (re.fullmatch(r"RoPE\d+(?:\.\d+)?", self.pos_embed), "RoPE100"),
+            "head_type": (self.head_type in ("linear", "dpt"), "linear or dpt"),
+            "patch_size": (self.patch_size == PATCH, PATCH),
+            "output_mode": (self.output_mode == "pts3d", "pts3d"),
+            "depth_mode": (list(self.depth_mode) == ["exp", -float("inf"), float("inf")], "exp, unbounded"),
+            "conf_mode": (list(self.conf_mode) == ["exp", 1, float("inf")], "exp from 1"),
+            "dec_depth": (self.head_type == "linear" or self.dec_depth > 9, "over 9 with a dpt head"),
+        }
+        for name, (known, remedy) in covered.items():
+            if not known:
+                raise ValueError(f"{name} = {getattr(self, name)!r} is not covered; it must be {remedy}")
+
+
+class Dust3r(nn.Module):
+    """The network, built from the fields of a published configuration (`Config`).
+
+    Raises ValueError for a configuration that this network does not cover, TypeError for an unknown field.
     """
 
-    def __init__(
-        self,
-        *,
-        enc_embed_dim: int = 768,
-        enc_depth: int = 12,
-        enc_num_heads: int = 12,
-        dec_embed_dim: int = 512,
-        dec_depth: int = 8,
-        dec_num_heads: int = 16,
-        head_type: str = "linear",
-        pos_embed: str = "RoPE100",
-        mlp_ratio: float = 4.0,
-        patch_size: int = PATCH,
-        output_mode: str = "pts3d",
-        depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf")),
-        conf_mode: Sequence[object] = ("exp", 1, float("inf")),
-        img_size: object = None,
-        patch_embed_cls: str = "PatchEmbedDust3R",
-        landscape_only: bool = False,
-        freeze: str = "none",
-    ) -> None:
-        """The last four say how the published network was trained and change nothing here."""
+    def __init__(self, **fields: Any) -> None:
         super().__init__()
-        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", pos_embed)
-        expected = {
-            "pos_embed": (pos_embed, frequency, "RoPE100"),
-            "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
-            "patch_size": (patch_size, patch_size == PATCH, PATCH),
-            "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
-            "depth_mode": (
-                depth_mode,
-                list(depth_mode) == ["exp", -float("inf"), float("inf")],
-                "exp, unbounded",
-            ),
-            "conf_mode": (conf_mode, list(conf_mode) == ["exp", 1, float("inf")], "exp from 1"),
-            "dec_depth": (dec_depth, head_type == "linear" or dec_depth > 9, "over 9 with a dpt head"),
-        }
-        for name, (value, known, cure) in expected.items():
-            if not known:
-                raise ValueError(f"{name} = {value!r} is not covered; it must be {cure}")
-        assert frequency is not None
-        self.rope_base = float(frequency[1])
-        self.head_dims = (enc_embed_dim // enc_num_heads, dec_embed_dim // dec_num_heads)
+        config = Config(**fields)
+        enc_dim, dec_dim = config.enc_embed_dim, config.dec_embed_dim
+        self.rope_base = float(config.pos_embed.removeprefix("RoPE"))
+        self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
         self.mixed_precision: bool | None = None
         """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
 
-        self.patch_embed = PatchEmbed(enc_embed_dim)
-        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_embed_dim))  # only its pre-training used it
+        self.patch_embed = PatchEmbed(enc_dim)
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
         self.enc_blocks = nn.ModuleList(
-            EncoderBlock(enc_embed_dim, enc_num_heads, mlp_ratio) for _ in range(enc_depth)
+            EncoderBlock(enc_dim, config.enc_num_heads, config.mlp_ratio) for _ in range(config.enc_depth)
         )
-        self.enc_norm = nn.LayerNorm(enc_embed_dim, eps=1e-6)
-        self.decoder_embed = nn.Linear(enc_embed_dim, dec_embed_dim)
+        self.enc_norm = nn.LayerNorm(enc_dim, eps=1e-6)
+        self.decoder_embed = nn.Linear(enc_dim, dec_dim)
         self.dec_blocks, self.dec_blocks2 = (
-            nn.ModuleList(DecoderBlock(dec_embed_dim, dec_num_heads, mlp_ratio) for _ in range(dec_depth))
+            nn.ModuleList(
+                DecoderBlock(dec_dim, config.dec_num_heads, config.mlp_ratio) for _ in range(config.dec_depth)
+            )
             for _ in range(2)
         )
-        self.dec_norm = nn.LayerNorm(dec_embed_dim, eps=1e-6)
+        self.dec_norm = nn.LayerNorm(dec_dim, eps=1e-6)
+        linear = config.head_type == "linear"
         self.downstream_head1, self.downstream_head2 = (
-            LinearHead(dec_embed_dim)
-            if head_type == "linear"
-            else DptHead(enc_embed_dim, dec_embed_dim, dec_depth)
-            for _ in range(2)
+            LinearHead(dec_dim) if linear else DptHead(enc_dim, dec_dim, config.dec_depth) for _ in range(2)
         )
 
     def forward(
