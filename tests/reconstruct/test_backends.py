@@ -234,11 +234,7 @@ def test_models_are_listed_with_licence_scale_and_what_is_present(capsys: pytest
     assert {row.name for row in BACKENDS.values()} == {name for name, _ in rows}
 
 
-def test_the_page_of_back_ends_is_the_table_and_its_numbers_are_measured(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert dispatch(["models", "--markdown"]) == 0
-    assert capsys.readouterr().out in page("backends")
+def test_the_numbers_of_the_table_are_measured() -> None:
     for row in BACKENDS.values():
         if row.accuracy:
             numbers, where = re.fullmatch(r"(.*) \(jcr docs (.*)\)", row.accuracy).groups()

@@ -1,6 +1,5 @@
 """`jcr models`: networks and other back ends, their licences, and the weights on this machine; `get` downloads some."""
 
-import re
 import sys
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
@@ -9,7 +8,6 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.pages import pages
 from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
 from jcr.reconstruct.hub import HUB_FILES, HUB_ID, download
 
@@ -35,12 +33,10 @@ class Arguments:
     """For get: accept a non-commercial licence, which is asked for otherwise."""
     revision: str | None = None
     """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
-    markdown: bool = False
-    """Print the table of the page `jcr docs backends`."""
     output: Output = field(default_factory=Output)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Model:
     """A row of the list."""
 
@@ -67,15 +63,15 @@ def models() -> list[Model]:
     """The back ends, in the order of `auto`."""
     return [
         Model(
-            row.name,
-            row.hub_id,
-            row.licence,
-            row.commercial,
-            SCALES[row.metric],
-            row.parameters,
-            row.download_gb,
-            _present(row),
-            row.accuracy,
+            backend=row.name,
+            weights=row.hub_id,
+            licence=row.licence,
+            commercial=row.commercial,
+            scale=SCALES[row.metric],
+            parameters_m=row.parameters,
+            download_gb=row.download_gb,
+            present=_present(row),
+            accuracy=row.accuracy,
         )
         for row in BACKENDS.values()
     ]
@@ -105,41 +101,6 @@ def as_text(rows: list[Model]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def as_markdown() -> str:
-    """The back ends as a table, without what differs from machine to machine."""
-    head = [
-        "back end",
-        "options of its own",
-        "auto",
-        "scale",
-        "parameters",
-        "download",
-        "licence",
-        "measured",
-    ]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for row in BACKENDS.values():
-        flags = [f"`--{name.replace('_', '-')}`" for name in row.options]
-        cells = [
-            f"`{row.name}`",
-            ", ".join(flags),
-            "yes" if row.auto else "no",
-            SCALES[row.metric],
-            f"{row.parameters} M" if row.parameters else "",
-            f"{row.download_gb:g} GB" if row.download_gb else "",
-            row.licence,
-            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _link(named: re.Match[str]) -> str:
-    """From the page of back ends to the one that a command prints."""
-    file = pages()[named[1]]
-    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
-
-
 def main(arguments: Arguments) -> int:
     """Print the list, or get weights."""
     if arguments.action == "get":
@@ -147,8 +108,7 @@ def main(arguments: Arguments) -> int:
     if arguments.name is not None or arguments.accept_licence or arguments.revision is not None:
         raise InputError("jcr models: a name, --accept-licence and --revision are for jcr models get NAME")
     rows = models()
-    text = as_markdown() if arguments.markdown else as_text(rows)
-    arguments.output.result(text, {"models": [asdict(row) for row in rows]})
+    arguments.output.result(as_text(rows), {"models": [asdict(row) for row in rows]})
     return 0
 
 
