@@ -23,7 +23,7 @@ from jcr.reconstruct import backends
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions
 from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.views_at_once import da3
-from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct
+from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
@@ -162,7 +162,9 @@ def _methods(
             cost=Cost(0.0, 0.0, 0.0, 0.0),
             refined=refined,
         )
-        return lambda capture: reconstruct(capture, options, predict=predictions(place, errors, seed))
+        return lambda capture: reconstruct_views_at_once(
+            capture, options, predict=predictions(place, errors, seed)
+        )
 
     def by_name(name: str) -> Callable[[Capture], Reconstruction]:
         return lambda capture: backends.reconstruct(capture, ReconstructOptions(name))

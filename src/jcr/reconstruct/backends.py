@@ -1,7 +1,7 @@
 """The back ends: each makes the same Reconstruction of a capture. A new one is a file and a row of this table."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -32,22 +32,22 @@ def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress 
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct.direct import reconstruct
+    from jcr.reconstruct.direct.direct import reconstruct_direct
 
-    return reconstruct(capture, progress, memory_gb=options.memory_gb)
+    return reconstruct_direct(capture, progress, memory_gb=options.memory_gb)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
     extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
     from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
     made = Dust3rOptions(
         weights=weights_of(options), device=device_of(options), pairs=pairs, backend=options.backend
     )
-    return reconstruct(capture, made, progress)
+    return reconstruct_dust3r(capture, made, progress)
 
 
 def _views_at_once(
@@ -56,7 +56,7 @@ def _views_at_once(
     """All models that see every view at once: their rows name the adapter."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import da3, mapanything
-    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 
     row = BACKENDS[options.backend]
     made = ViewsOptions(
@@ -68,13 +68,13 @@ def _views_at_once(
         device=device_of(options),
         memory_gb=options.memory_gb,
     )
-    return reconstruct(capture, made, progress)
+    return reconstruct_views_at_once(capture, made, progress)
 
 
 def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import moge
-    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct_single_views
 
     def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
         return _colmap(capture, replace(options, backend="colmap"), progress)
@@ -82,37 +82,37 @@ def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | 
     made = SingleViewsOptions(
         load=moge.load, weights=weights_of(options), cameras=cameras, device=device_of(options)
     )
-    return reconstruct(capture, made, progress)
+    return reconstruct_single_views(capture, made, progress)
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.marker import reconstruct
+    from jcr.reconstruct.marker import reconstruct_marker
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct(capture, options.board, progress, memory_gb=options.memory_gb)
+    return reconstruct_marker(capture, options.board, progress, memory_gb=options.memory_gb)
 
 
 def _predictions(
     capture: Capture, options: "ReconstructOptions", progress: Progress | None
 ) -> Reconstruction:
-    from jcr.reconstruct.predictions import PredictionsOptions, reconstruct
+    from jcr.reconstruct.predictions import reconstruct_predictions
 
     if options.predictions is None:
         raise InputError(
             "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
         )
-    return reconstruct(capture, PredictionsOptions(options.predictions, options.memory_gb), progress)
+    return reconstruct_predictions(capture, options.predictions, progress, memory_gb=options.memory_gb)
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions
-    from jcr.reconstruct.given import reconstruct
+    from jcr.reconstruct.given import reconstruct_given
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
     made = ColmapOptions(seed=options.seed, memory_gb=options.memory_gb)
-    return reconstruct(capture, options.cameras, made, progress)
+    return reconstruct_given(capture, options.cameras, made, progress)
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,9 @@ class Backend:
     reconstruct: Callable[..., Reconstruction]
     """A function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
     licence: str
+    _: KW_ONLY
     metric: bool | None = False
-    """Whether its scale is metres already; None: its input says."""
+    """Whether its scale is metres already; None: its input has a flag for it."""
     auto: bool = False
     """Whether `auto` may take it, where its package and its weights are on this machine."""
     tests_camera: bool = True
@@ -156,7 +157,7 @@ class Backend:
     takes_poses: bool = False
     """Whether it can be shown camera poses."""
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of an any-view model: views_at_once.Cost, of its fields in turn."""
+    """Of an any-view model: views_at_once.Cost, its fields in their order."""
 
     @property
     def sees_all_views(self) -> bool:
@@ -340,6 +341,7 @@ class ReconstructOptions:
     backend: BackendName = "auto"
     """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
     (jcr models), in this order, and the next only if the result is rejected."""
+    _: KW_ONLY
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""

@@ -52,7 +52,7 @@ def reconstruction_from_pairs(
     return Reconstruction(
         image_index=image_index,
         recon_from_camera=alignment.recon_from_camera,
-        intrinsics=images.lens or images.grid.original_intrinsics(pinhole),
+        intrinsics=images.intrinsics_of_capture or images.grid.original_intrinsics(pinhole),
         pointmaps=Pointmaps(
             intrinsics=pinhole,
             points_in_recon=points_in_recon,

@@ -26,9 +26,8 @@ class Dust3rOptions:
     device: str = "cpu"
     """Where the network runs: cpu or cuda."""
     pairs: PairOptions = field(default_factory=PairOptions)
-    align: AlignOptions = field(default_factory=AlignOptions)
     backend: str = "dust3r"
-    """What the reconstruction says it is from."""
+    """Its row of the table of back ends."""
 
 
 def predict(
@@ -55,7 +54,9 @@ def predict(
     return images, predictions, (options.weights.note, *notes)
 
 
-def reconstruct(capture: Capture, options: Dust3rOptions, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_dust3r(
+    capture: Capture, options: Dust3rOptions, progress: Progress | None = None
+) -> Reconstruction:
     """Camera poses, pointmaps and tracks of a capture, up to one similarity, or in metres with MASt3R.
 
     Raises InputError as `predict` does.
@@ -70,7 +71,7 @@ def reconstruct(capture: Capture, options: Dust3rOptions, progress: Progress | N
             rows,
             predictions,
             poses,
-            options.align,
+            AlignOptions(),
             backend=options.backend,
             notes=notes,
             progress=progress,

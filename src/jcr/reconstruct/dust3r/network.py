@@ -116,33 +116,10 @@ class Dust3r(nn.Module):
         )
 
     def forward(
-        self,
-        image1: Float[Tensor, "b 3 h w"],
-        image2: Float[Tensor, "b 3 h2 w2"],
-        true_shape1: Int[Tensor, "b 2"] | None = None,
-        true_shape2: Int[Tensor, "b 2"] | None = None,
+        self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16.
-
-        A row whose true (height, width) is the transpose of the tensor's is a portrait image that was laid
-        down to batch it with landscape ones; it is stood up for the network, its pointmap laid down again.
-        """
-        if true_shape1 is None and true_shape2 is None:
-            return self.decode(self.encode(image1), self.encode(image2))
-        lying = torch.stack([_lying(image1, true_shape1), _lying(image2, true_shape2)], 1)
-        view1, view2 = (
-            Pointmap(image.new_empty(*image[:, 0].shape, 3), torch.empty_like(image[:, 0]))
-            for image in (image1, image2)
-        )
-        for lies1, lies2 in lying.unique(dim=0).tolist():
-            rows = (lying == torch.tensor([lies1, lies2], device=lying.device)).all(1).nonzero()[:, 0]
-            features1 = self.encode(image1[rows].mT if lies1 else image1[rows])
-            features2 = self.encode(image2[rows].mT if lies2 else image2[rows])
-            part1, part2 = self.decode(features1, features2)
-            for view, part, lies in ((view1, part1, lies1), (view2, part2, lies2)):
-                view.points[rows] = part.points.transpose(1, 2) if lies else part.points
-                view.confidence[rows] = part.confidence.mT if lies else part.confidence
-        return view1, view2
+        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16, as they stand (portrait too)."""
+        return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"], many_pairs: bool = False) -> Features:
         """Features of images in [-1, 1]; each image needs this once, however many pairs it is in.
@@ -429,11 +406,3 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: FeatureMap) -> FeatureMap:
         return x + self.conv2(F.relu_(self.conv1(F.relu(x))))
-
-
-def _lying(image: Tensor, true_shape: Tensor | None) -> Tensor:
-    """Per row: whether the image lies on its side in the tensor."""
-    height, width = image.shape[-2:]
-    if true_shape is None or height == width:
-        return torch.zeros(len(image), dtype=torch.bool, device=image.device)
-    return (true_shape[:, 0] == width).to(image.device)

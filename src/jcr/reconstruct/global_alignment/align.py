@@ -79,10 +79,7 @@ def align_with_robot(
     alignment = dense_alignment(problem, kinematic or free, begin, progress)
     method = "fast" if kinematic is None else "kinematic"
     alignment = replace(
-        alignment,
-        method=method,
-        notes=(*alignment.notes, note),
-        warnings=(*alignment.warnings, *warnings),
+        alignment, method=method, notes=(*alignment.notes, note), warnings=(*alignment.warnings, *warnings)
     )
     return RobotAlignment(alignment, evidence)
 

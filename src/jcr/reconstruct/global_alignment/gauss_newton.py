@@ -141,7 +141,7 @@ class Problem:
         return [self.observe(k, pixels) for k, pixels in enumerate(choose_pixels(self.predictions, count))]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Solution:
     """The result of Gauss-Newton."""
 
@@ -200,7 +200,14 @@ def gauss_newton(
         pair_spread = _spread(state.pair_error, variance, pair_spread)
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
-            return Solution(state, cameras, images, noise, pair_spread, settled)
+            return Solution(
+                state=state,
+                cameras=cameras,
+                images=images,
+                noise=noise,
+                pair_spread=pair_spread,
+                settled=settled,
+            )
         del linearised  # or they would stay until the next ones are complete
     raise AssertionError
 
@@ -277,14 +284,14 @@ def _after_step(
         pair_error[o.second_pairs] = ties.error + np.einsum("kij,kj->ki", ties.axes, pair_step)
         variance[o.second_pairs] = image.reduced.error_variance
     focals = [layout.focal(k) for k in range(layout.images)]
-    moved = State(
+    after = State(
         recon_from_camera=cameras.recon_from_camera,
         log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
         log_pair_scale=state.log_pair_scale + step[layout.scales],
         pair_error=pair_error,
         log_depth=log_depth,
     )
-    return moved, variance
+    return after, variance
 
 
 def _spread(
@@ -350,7 +357,7 @@ def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
     """What speaks against an alignment."""
     warnings, middle = [], float(np.median(residual))
     if not settled:
-        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
+        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations and may be wrong")
     if middle > USELESS:
         warnings.append(
             f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"

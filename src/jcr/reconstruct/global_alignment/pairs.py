@@ -36,7 +36,7 @@ class PairPredictions:
     conf2: Float[ndarray, "e h w"]
     """Of `pts3d_in_other_view`."""
     images: tuple[str, ...] = ()
-    """Names by which the capture speaks of the images; empty when the file does not say."""
+    """Names of the images in the capture; empty when the file has none."""
     colors: UInt8[ndarray, "n h w 3"] | None = None
     """RGB at the pointmaps' pixels."""
     intrinsics: Intrinsics | None = None
@@ -47,7 +47,7 @@ class PairPredictions:
 
     @property
     def image_count(self) -> int:
-        """Images the edges speak of."""
+        """Images that the edges join."""
         return len(self.images) or int(self.edges.max()) + 1
 
     def release(self) -> None:

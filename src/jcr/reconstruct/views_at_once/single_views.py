@@ -37,7 +37,7 @@ class SingleViewsOptions:
     device: str = "cpu"
 
 
-def reconstruct(
+def reconstruct_single_views(
     capture: Capture,
     options: SingleViewsOptions,
     progress: Progress | None = None,
@@ -58,12 +58,14 @@ def reconstruct(
         intrinsics=sparse.intrinsics,
     )
     images = prepare_images(placed, lambda size: ImageGrid(size, size, (0, 0), size))
-    assert images.pinhole is not None and images.lens is not None  # structure from motion found them
+    assert (
+        images.pinhole is not None and images.intrinsics_of_capture is not None
+    )  # structure from motion found them
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 1.0)
     grid, there = predicted.grid, predicted.confidence > 0
-    undistorted = project(images.pinhole, unproject(images.lens, sparse.tracks.x_px))
+    undistorted = project(images.pinhole, unproject(images.intrinsics_of_capture, sparse.tracks.x_px))
     tracks = replace(sparse.tracks, x_px=grid.grid_from_original(undistorted))
     depth = np.where(there, predicted.x_in_camera[..., 2], 0)
     changes = np.array(depth_changes(tracks, sparse.recon_from_camera, depth))
@@ -72,7 +74,7 @@ def reconstruct(
         raise InputError("--backend moge: structure from motion gave too few points; take another")
     typical = float(np.median(changes[~few, 0]))
     changes[few] = [typical, 0, 0, 0, 0, 0]
-    # The model's metre: what it says of most views, before each is fitted.
+    # The model's metre: the median over the views, before each is fitted.
     unit = float(np.exp(-typical))
     factor = unit * np.stack([smooth_factor(change, *depth.shape[1:]) for change in changes])
     poses = sparse.recon_from_camera.copy()
