@@ -1,4 +1,5 @@
-"""Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas.
+"""Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas, and
+the table of backends.md.
 
 `docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. The pages are committed, for
 those who read them in the repository or by `jcr docs`; a test holds them to the source.
@@ -21,7 +22,10 @@ from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS
 from jcr.cli.help import Argument, groups
+from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
+from jcr.pages import pages
+from jcr.reconstruct.backends import BACKENDS
 from jcr.reconstruct.reconstruction_npz import About
 from jcr.run_folder import State
 
@@ -305,7 +309,50 @@ def _type(value: dict[str, Any]) -> str:
     return str(value.get("type", "any"))
 
 
-PAGES = {"cli.md": cli_page, "api.md": api_page, "formats.md": formats_page}
+def backends_page() -> str:
+    """The page of back ends with its table as the source has it."""
+    head = [
+        "back end",
+        "options of its own",
+        "auto",
+        "scale",
+        "parameters",
+        "download",
+        "licence",
+        "measured",
+    ]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for row in BACKENDS.values():
+        flags = [f"`--{name.replace('_', '-')}`" for name in row.options]
+        cells = [
+            f"`{row.name}`",
+            ", ".join(flags),
+            "yes" if row.auto else "no",
+            SCALES[row.metric],
+            f"{row.parameters} M" if row.parameters else "",
+            f"{row.download_gb:g} GB" if row.download_gb else "",
+            row.licence,
+            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    written = (REFERENCE / "backends.md").read_text("utf-8")
+    return re.sub(
+        r"(?m)^\| back end \| options of its own(?:.*\n\|)*.*$", lambda _: "\n".join(lines), written
+    )
+
+
+def _link(named: re.Match[str]) -> str:
+    """From the page of back ends to the one that a command prints."""
+    file = pages()[named[1]]
+    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
+
+
+PAGES = {
+    "api.md": api_page,
+    "backends.md": backends_page,
+    "cli.md": cli_page,
+    "formats.md": formats_page,
+}
 """What writes each page."""
 
 if __name__ == "__main__":

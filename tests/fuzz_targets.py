@@ -193,6 +193,7 @@ def networks(folder: Path) -> dict[str, Target]:
     import torch
 
     from jcr.reconstruct.dust3r.weights import load_weights
+    from jcr.reconstruct.hub import Weights
 
     folder.mkdir()
     shape = (2, 4, 4)
@@ -204,7 +205,9 @@ def networks(folder: Path) -> dict[str, Target]:
         "pairs.npz": Target(
             folder / "pairs.npz", lambda file: pairs_from_arrays(read_arrays(file), file.name)
         ),
-        "weights.pth": Target(folder / "weights.pth", lambda file: load_weights(str(file), "cpu")),
+        "weights.pth": Target(
+            folder / "weights.pth", lambda file: load_weights(Weights(file, file.name, "unknown"))
+        ),
     }
 
 

@@ -127,7 +127,7 @@ def test_pages_that_messages_name_exist():
     assert named and named <= pages().keys()
 
 
-@pytest.mark.parametrize("name", ["cli.md", "api.md", "formats.md"])
+@pytest.mark.parametrize("name", ["api.md", "backends.md", "cli.md", "formats.md"])
 def test_pages_of_the_reference_are_those_that_the_source_makes(name: str):
     spec = spec_from_file_location("generated", ROOT / "docs" / "generated.py")
     assert spec is not None and spec.loader is not None

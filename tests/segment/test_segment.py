@@ -515,6 +515,9 @@ def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monk
     pytest.importorskip("transformers", reason="the extra `sam` is not installed")
     with pytest.raises(InputError, match="config.json and model.safetensors"):
         load_sam(str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(InputError, match="not on this machine; jcr models get owner/sam downloads them"):
+        load_sam("owner/sam")
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match=r"pip install 'jcr-handeye\[sam\]'"):
         load_sam("facebook/sam2.1-hiera-tiny")

@@ -36,7 +36,7 @@ def loaded() -> "LoadedNetwork":
     network = Dust3r(
         enc_embed_dim=32, enc_depth=2, enc_num_heads=2, dec_embed_dim=32, dec_depth=2, dec_num_heads=2
     )
-    return LoadedNetwork(network.eval().requires_grad_(False), "seeded", "none", is_metric=True)
+    return LoadedNetwork(network.eval().requires_grad_(False), is_metric=True)
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,8 @@ from jcr.calibration.stage import calibrate
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.from_pairs import reconstruction_from_pairs
-from jcr.reconstruct.global_alignment.align import AlignOptions, align
+from jcr.reconstruct.global_alignment.align import AlignOptions, align, align_with_robot
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
