@@ -12,6 +12,8 @@ from typing import Any
 
 import tyro
 
+from jcr.cli.usage import CONFIGURATION
+
 EVERYTHING = "--help-all"
 COLUMN = 26
 """Where what is said of an argument begins."""
@@ -54,6 +56,8 @@ class Argument:
     value: str
     """How its value is named, or its choices in braces; empty for a switch."""
     text: str
+    choices: tuple[str, ...] = ()
+    """Its values, where these are few."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +71,10 @@ class Group:
 
 def groups(record: Any, program: str) -> list[Group]:
     """The arguments of a command's `Arguments` but for its help, as the parser has them."""
-    from jcr.cli import configuration
-
     with warnings.catch_warnings():
         # The only way to ask tyro for what it has parsed; it is to go with nothing in its place yet.
         warnings.simplefilter("ignore", DeprecationWarning)
-        parser = tyro.extras.get_parser(record, prog=program, config=configuration())
+        parser = tyro.extras.get_parser(record, prog=program, config=CONFIGURATION)
     found = []
     for group in parser._action_groups:
         arguments = tuple(_argument(action) for action in group._group_actions if action.dest != "help")
@@ -88,6 +90,7 @@ def _argument(action: Any) -> Argument:
         flag=action.option_strings[-1] if action.option_strings else "",
         value=" ".join(value) if isinstance(value, tuple) else value,
         text=NO_DEFAULT.sub("", text),
+        choices=tuple(choice for choice in action.choices or () if choice != "None"),
     )
 
 

@@ -229,7 +229,7 @@
     const picture = context.createImageData(canvas.width, canvas.height);
     const visible = [];
     if (show.layer < layers.length - 1) visible.push(layers[show.layer]);
-    if (show.tracks) visible.push({ ...layers[layers.length - 1], size: 0.006 });
+    if (show.tracks) visible.push(layers[layers.length - 1]);
     drawPoints(view, visible, picture);
     context.putImageData(picture, 0, 0);
     if (state.through < 0) {
