@@ -20,7 +20,7 @@ import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS
-from jcr.cli.help import Argument, groups
+from jcr.cli.arguments import Argument, groups
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.reconstruct.reconstruction_npz import About
 from jcr.run_folder import State

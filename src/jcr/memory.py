@@ -90,14 +90,14 @@ def plan(
     """
     width, height = size
     program = resident() + ALLOWANCE
-    pictures = 3 * width * height * images
+    pixels = 3 * width * height * images
     results = images * (result + FOUND)
     budget = memory_gb * GB
-    least = program + pictures + max(features, results + max(work, MAP))
+    least = program + pixels + max(features, results + max(work, MAP))
     require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
     at_once = min(os.cpu_count() or 1, images)
     # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
-    ample = program + pictures + max(features * at_once, results + at_once * work + MAP)
+    ample = program + pixels + max(features * at_once, results + at_once * work + MAP)
     announce(min(ample, int(budget)), budget)
 
 

@@ -91,7 +91,7 @@ class RunOptions:
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunResult:
     """What a run found, and where it is kept; each stage adds its part."""
 
@@ -135,8 +135,13 @@ class RunResult:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """As the calibration left it."""
+        """As the calibration left them."""
         return self.hand_eye.intrinsics or self.reconstruction.intrinsics
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The former name of `intrinsics`."""
+        return self.intrinsics
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -177,7 +182,9 @@ class RunResult:
                 f"{self.out}: its camera is fixed and no gripper pose places its points; use seen_uncertainty"
             )
         x_px = np.asarray(x_px, float)
-        return seen_in_base(self.hand_eye, self.intrinsics, x_px, distance_m, np.asarray(base_from_gripper, float))
+        return seen_in_base(
+            self.hand_eye, self.intrinsics, x_px, distance_m, np.asarray(base_from_gripper, float)
+        )
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
@@ -253,7 +260,7 @@ def load_run(out: str | Path) -> SavedRun:
     return SavedRun(folder.path, folder.calibration(), folder.cameras())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosesResult:
     """What camera poses that were given say, without images."""
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 LOCK = ".lock"
-"""Held by the run that writes there."""
+"""Locked by the run that writes there."""
 MOVING = "moving"
 """Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
 CAPTURE = "capture"
@@ -304,8 +304,8 @@ class RunFolder:
 
 
 @contextmanager
-def held(path: Path) -> Iterator[RunFolder]:
-    """The folder, made and held, so that a second run on it writes nothing between the first one's files.
+def locked(path: Path) -> Iterator[RunFolder]:
+    """The folder, made and locked, so that a second run on it writes nothing between the first one's files.
 
     What a killed run had begun to write is removed, and so is a new folder into which nothing came.
     """
@@ -357,7 +357,7 @@ def state_of(capture: Capture, options: MadeWith) -> State:
 
 
 def fingerprints_with_depth(capture: Capture, options: MadeWith) -> list[str]:
-    """Those of the same reconstruction in files that held its depth: with the same depth, or none."""
+    """Those of the same reconstruction in files that hold its depth too: with the same depth, or none."""
     made = _deciding(options.reconstruct)
     return [
         fingerprint(capture, made | {"dense": dense, "priors": priors}, WITH_DEPTH)

@@ -18,8 +18,8 @@ import pytest
 from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.cli import COMMANDS, dispatch
+from jcr.cli.arguments import groups
 from jcr.cli.completion import SHELLS, script
-from jcr.cli.help import groups
 from jcr.cli.output import Output
 from jcr.cli.query import labelled
 from jcr.export.formats import FORMATS

@@ -87,7 +87,15 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     names = ("none", *(f"<i>{thing.name}" for thing in truth.objects))
     cloud = point_cloud(capture, reconstruction, hand_eye, label, label_names=names)
     scene = build_scene(cloud, MapOptions(cell=CELL, max_seconds=4.0))
-    return RunResult(folder, capture, content, hand_eye, reconstruction, cloud, scene)
+    return RunResult(
+        out=folder,
+        capture=capture,
+        calibration=content,
+        hand_eye=hand_eye,
+        reconstruction=reconstruction,
+        cloud=cloud,
+        scene=scene,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -340,7 +348,8 @@ def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult)
     reconstruction = replace(result.reconstruction, backend="marker", tracks=nothing)
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
-    page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
+    bare = replace(result, cloud=None, scene=None, reconstruction=reconstruction)
+    page = report_html(replace(bare, capture=capture, calibration=content, hand_eye=hand_eye))
     assert "back end marker" in Elements(page).text and 'class="marks"' not in page
     assert "features refined" not in page
 
@@ -354,7 +363,8 @@ def test_untrusted_calibration_is_not_recommended(run: RunResult):
     reconstruction = replace(result.reconstruction, recon_from_camera=cameras[:UNREGISTERED])
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {}, "0.0")
-    page = report_html(RunResult(result.out, capture, content, hand_eye, reconstruction))
+    bare = replace(result, cloud=None, scene=None, reconstruction=reconstruction)
+    page = report_html(replace(bare, capture=capture, calibration=content, hand_eye=hand_eye))
     text = Elements(page).text
     assert f"Rejected: {content.warnings[0]}." in text
     assert "Accepted:" not in text and "no comfort" in text

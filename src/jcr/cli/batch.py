@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jcr.batch import Row
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 

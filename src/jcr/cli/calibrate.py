@@ -15,7 +15,7 @@ from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
 

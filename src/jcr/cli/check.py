@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jcr.records import Capture, PosePairs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
 

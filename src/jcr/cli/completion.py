@@ -6,7 +6,7 @@ shtab has no fish, and tyro's own scripts start Python at every Tab.
 from collections.abc import Mapping
 from importlib import import_module
 
-from jcr.cli.help import Argument, groups
+from jcr.cli.arguments import Argument, groups
 from jcr.errors import InputError
 
 SHELLS = ("bash", "zsh", "fish")

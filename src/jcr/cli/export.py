@@ -11,7 +11,7 @@ from jcr.cli.output import Output, warn
 from jcr.export.options import ExportOptions, FormatName
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
 

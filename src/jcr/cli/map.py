@@ -11,7 +11,7 @@ from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """(Re)build cloud, map and report of a run with other options, or with further images.
 

@@ -18,7 +18,7 @@ from jcr.files import write_bytes, write_text
 _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
 

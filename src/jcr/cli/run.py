@@ -18,7 +18,7 @@ from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 

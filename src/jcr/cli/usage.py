@@ -12,15 +12,9 @@ from typing import Any, get_args
 import tyro
 from tyro import _errors
 
+from jcr.cli.arguments import CONFIGURATION, groups
 from jcr.errors import InputError, did_you_mean
 
-CONFIGURATION = (
-    tyro.conf.OmitArgPrefixes,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.PositionalMetavarFromFieldName,
-    tyro.conf.DisallowNone,
-)
-"""How tyro makes options of the fields of a command's `Arguments`."""
 VALUES = {float: "number", int: "whole number", str: "text", Path: "path"}
 """Types of values, for people."""
 
@@ -36,8 +30,6 @@ def parsed(record: type, program: str, arguments: Sequence[str]) -> Any:
 
 
 def _complaint(event: _errors.ParseErrorEvent, record: type, program: str, arguments: Sequence[str]) -> str:
-    from jcr.cli.help import groups
-
     flags = [argument.flag for group in groups(record, program) for argument in group.arguments]
     options = (word.partition("=")[0] for word in arguments if word.startswith("--"))
     if unknown := next((word for word in options if word.replace("_", "-") not in flags), None):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jcr.verify import Verification
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Test a calibration with new images: has the camera moved on the gripper since?
 

@@ -10,7 +10,7 @@ import tyro
 from jcr.cli.output import Output
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
