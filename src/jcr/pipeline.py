@@ -43,7 +43,7 @@ def run(
 
     Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
     says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
-    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
+    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then has the reason).
     """
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)

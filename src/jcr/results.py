@@ -195,10 +195,10 @@ def hand_eye_table(hand_eye: HandEye, report: str) -> str:
     """The transform with its standard deviations as HTML."""
     std = np.sqrt(np.diag(hand_eye.covariance))
     mm = 1e3 * hand_eye.gripper_from_camera[:3, 3]
-    turn = np.degrees(rotation_log(hand_eye.gripper_from_camera[:3, :3]))
+    rotation = np.degrees(rotation_log(hand_eye.gripper_from_camera[:3, :3]))
     rows = "".join(
         f"<tr><th>{axis}</th><td>{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm</td>"
-        f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
+        f"<td>{rotation[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
         for k, axis in enumerate("xyz")
     )
     verdict = ": ".join(filter(None, (hand_eye.verdict, escape("; ".join(hand_eye.warnings)))))
@@ -262,7 +262,7 @@ def load_run(out: str | Path) -> SavedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class PosesResult:
-    """What camera poses that were given say, without images."""
+    """The calibration from camera poses that were given, without images."""
 
     out: Path
     pairs: PosePairs

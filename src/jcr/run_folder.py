@@ -1,6 +1,6 @@
 """A run folder: what its files are, which stage made each and from what, who may write there, and reading them back.
 
-Whatever a command is given as OUT is input like any other: somebody may have edited or cut it. What is read here has
+Whatever a command is given as OUT is input like any other: it may have been edited or cut. What is read here has
 been validated; what has not raises InputError in one line.
 """
 
@@ -274,7 +274,7 @@ class RunFolder:
         self.keep_state(self.state().model_copy(update={"complete": self._completion(capture, options)}))
 
     def is_complete(self, capture: Capture, options: Any) -> bool:
-        """Whether a run of the same is finished, and nobody has changed or removed its files since."""
+        """Whether a run of the same is finished, and its files were neither changed nor removed since."""
         files = [RECONSTRUCTION, CALIBRATION, REPORT] + ([] if options.map is None else [CLOUD, MAP])
         if not all((self.path / name).is_file() for name in files):
             return False
@@ -339,7 +339,7 @@ def _with_depth_apart(content: bytes) -> bytes:
         del old["dense"]  # which was set by the command
         state["options"]["depth"] = {"priors": old.pop("priors")}
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return content  # as it is written now, or damaged: where, the model says
+        return content  # as it is written now, or damaged, and refused by the model
     return json.dumps(state).encode()
 
 
@@ -376,14 +376,14 @@ def fingerprint(capture: Capture, options: dict[str, Any], format: str = FORMAT)
     for name in capture.images:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
     digest.update(capture.base_from_gripper.tobytes())
-    lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
+    intrinsics = None if capture.intrinsics is None else asdict(capture.intrinsics)
     for name in ("weights", "predictions", "cameras"):
         if options[name] is None:
             continue
-        # Gigabytes at times: size and date tell one file of that name from another.
+        # Gigabytes at times: size and date distinguish files of one name.
         path = Path(options[name])
         files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         options = options | {name: states or options[name]}
-    digest.update(json.dumps([lens, options, __version__, format], sort_keys=True).encode())
+    digest.update(json.dumps([intrinsics, options, __version__, format], sort_keys=True).encode())
     return digest.hexdigest()

@@ -15,7 +15,7 @@ class Arguments:
 
     OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
     matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated too,
-    and the output says if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
+    and the output names it if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
     report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
 
     examples:
@@ -35,7 +35,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Place the camera and say where it is."""
+    """Locate the camera and print its pose."""
     import re
 
     from jcr.cell.cameras_json import in_words

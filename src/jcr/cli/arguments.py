@@ -15,7 +15,7 @@ CONFIGURATION = (
 )
 """How tyro makes options of the fields of a command's `Arguments`."""
 NO_DEFAULT = re.compile(r" *\(default: *(?:None|True|False|)\)")
-"""What the parser says of options that have no value, and of switches."""
+"""What the parser adds to options that have no value, and of switches."""
 
 
 @dataclass(frozen=True)

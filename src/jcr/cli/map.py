@@ -35,7 +35,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Build the map and say where it is."""
+    """Build the map and print its path."""
     from jcr.pipeline import build_map
     from jcr.progress import progress_bars
 

@@ -1,4 +1,4 @@
-"""report.html: one file that says whether to trust a calibration, hands it over, and shows what was found."""
+"""report.html: one file that with the verdict on a calibration, its numbers to copy, and what was found."""
 
 from collections.abc import Iterable
 from datetime import UTC, datetime

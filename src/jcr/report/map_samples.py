@@ -30,7 +30,7 @@ class SurfacePoints:
     color: UInt8[ndarray, "n 3"]
     label: Int[ndarray, " n"]
     unknown_share: float
-    """Share of the workspace that nobody has seen."""
+    """Share of the workspace that no camera has seen."""
     point_size: float
     """Side (m) of the squares that are drawn in place of the points."""
 

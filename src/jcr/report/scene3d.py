@@ -55,7 +55,7 @@ def scene_section(
             }
             for pose in result.calibration.next_poses
         ],
-        "lens": asdict(result.intrinsics),
+        "intrinsics": asdict(result.intrinsics),
     }
     checks = [("cameras", "cameras", True), *([("others", "other cameras", True)] * bool(others))]
     checks += [("grippers", "grippers", True), ("grid", "base and grid", True)]
@@ -170,7 +170,7 @@ def _others(result: RunResult, base_from_camera: Float[ndarray, "m 4 4"]) -> lis
                 "name": found.name,
                 "caption": f"{'fixed in the base' if found.mount == 'base' else f'on the gripper{arm}'}{doubt}",
                 "fixed": found.mount == "base",
-                "lens": {
+                "intrinsics": {
                     key: getattr(intrinsics, key) for key in ("fx", "fy", "cx", "cy", "width", "height")
                 },
                 "cameras": [_rows(place) for place in places],
