@@ -54,7 +54,7 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
         parts = [PARTS[k] for k in np.argsort(-direction) if direction[k] > NAMED]
         name = ", ".join(parts) or PARTS[int(direction.argmax())]
         kind = "used" if value >= WEAK else "rejected"
-        yield kind, name, min(100 * float(value) / GENERAL, 100), significant(float(value))
+        yield kind, name, min(100 * float(value) / GENERAL, 100.0), significant(float(value))
 
 
 def _spreads(name: str, std: Sequence[float], unit: str) -> Iterator[Bar]:

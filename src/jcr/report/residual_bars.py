@@ -69,7 +69,7 @@ def _noise(fit: HandEye) -> dict[str, str | int | None]:
 
 def _bar(values: Sequence[float], longest: float, unit: str) -> tuple[float, float | None, str]:
     """Percent of the bar for the first value, of a tick for the second if there is one, and the number."""
-    shares = [min(100 * float(value) / longest, 100) for value in values]
+    shares = [min(100 * float(value) / longest, 100.0) for value in values]
     return shares[0], shares[1] if len(shares) > 1 else None, f"{significant(values[0])}{unit}"
 
 
