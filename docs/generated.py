@@ -21,7 +21,7 @@ import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS
-from jcr.cli.help import Argument, groups
+from jcr.cli.arguments import Argument, groups
 from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
 from jcr.pages import pages

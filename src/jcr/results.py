@@ -90,7 +90,7 @@ class RunOptions:
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunResult:
     """What a run found, and where it is kept; each stage adds its part."""
 
@@ -133,9 +133,14 @@ class RunResult:
         return self.reconstruction.image_index
 
     @property
-    def lens(self) -> Intrinsics:
-        """As the calibration left it."""
+    def intrinsics(self) -> Intrinsics:
+        """As the calibration left them."""
         return self.hand_eye.intrinsics or self.reconstruction.intrinsics
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The former name of `intrinsics`."""
+        return self.intrinsics
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -152,12 +157,12 @@ class RunResult:
     ) -> Float[ndarray, "*points 3 3"]:
         """Covariance (m², camera axes) of where on the gripper points are that are seen at pixels at distances.
 
-        `x_px` (...,2) are pixels of the distorted image, `distance_m` is along the ray. It is that of `lens`,
+        `x_px` (...,2) are pixels of the distorted image, `distance_m` is along the ray. It is that of `intrinsics`,
         `gripper_from_camera` and the scale together; the robot's pose errors are not in it.
         """
         from jcr.calibration.seen import seen_uncertainty
 
-        return seen_uncertainty(self.hand_eye.estimate, self.lens, np.asarray(x_px, float), distance_m)
+        return seen_uncertainty(self.hand_eye.estimate, self.intrinsics, np.asarray(x_px, float), distance_m)
 
     def seen_in_base(
         self,
@@ -176,7 +181,9 @@ class RunResult:
                 f"{self.out}: its camera is fixed and no gripper pose places its points; use seen_uncertainty"
             )
         x_px = np.asarray(x_px, float)
-        return seen_in_base(self.hand_eye, self.lens, x_px, distance_m, np.asarray(base_from_gripper, float))
+        return seen_in_base(
+            self.hand_eye, self.intrinsics, x_px, distance_m, np.asarray(base_from_gripper, float)
+        )
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
@@ -234,9 +241,9 @@ def load_run(out: str | Path) -> SavedRun:
     return SavedRun(folder.path, folder.calibration(), folder.cameras())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosesResult:
-    """What camera poses that were given say, without images."""
+    """The calibration from camera poses that were given, without images."""
 
     out: Path
     pairs: PosePairs

@@ -40,9 +40,13 @@ def pairs(seed: int, count: int) -> tuple[PosePairs, np.ndarray]:
     return found, problem.gripper_from_camera
 
 
+def _poses_result(of: PosePairs, content: CalibrationFile, hand_eye: HandEye) -> PosesResult:
+    return PosesResult(out=Path("out"), pairs=of, calibration=content, hand_eye=hand_eye, scale_is_one=False)
+
+
 def page(of: PosePairs, hand_eye: HandEye) -> tuple[CalibrationFile, str]:
     content = calibration_file(of, of, hand_eye, {}, "0.0")
-    return content, poses_report_html(PosesResult(Path("out"), of, content, hand_eye, False))
+    return content, poses_report_html(_poses_result(of, content, hand_eye))
 
 
 @pytest.mark.parametrize("spread", [(1, 1, 1), (3, 1, 0.1), (1, 0, 0), (10, 1, 1)])
@@ -152,7 +156,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
     given, _ = pairs(12, 12)
     for asked in (None, (0.5, 0.1)):
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
-        result = PosesResult(Path("out"), given, page(given, hand_eye)[0], hand_eye, False)
+        result = _poses_result(given, page(given, hand_eye)[0], hand_eye)
         if asked is None:
             show_calibration(result, Output())
             said = capsys.readouterr().out

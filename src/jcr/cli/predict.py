@@ -12,7 +12,7 @@ from jcr.reconstruct.backends import PairBackendName
 from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Predict the pointmaps of a capture's pairs of images, for `jcr align` or `--backend predictions`.
 

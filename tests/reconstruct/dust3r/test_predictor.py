@@ -100,7 +100,7 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
     flipped.write_bytes(content)
     cut.write_bytes(cut.read_bytes()[:-1])
     poses = np.tile(np.eye(4), (4, 1, 1))
-    memory._say.cache_clear()
+    memory._write_once.cache_clear()
     third, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))
     assert sum(decoded) == 14
     assert notes == (f"2 of the pairs in the cache {tmp_path} were damaged: predicted again",)

@@ -40,12 +40,12 @@
     next: document.getElementById("scene-next")?.checked,
   });
 
-  // Right, down and forward of the eye in the base frame, its centre, and its lens in canvas pixels.
+  // Right, down and forward of the eye in the base frame, its centre, and its intrinsics in canvas pixels.
   function eye() {
     const [w, h] = [canvas.width, canvas.height];
     if (state.through >= 0) {
       const camera = scene.views[state.through].camera;
-      const { fx, fy, cx, cy, width, height } = scene.lens;
+      const { fx, fy, cx, cy, width, height } = scene.intrinsics;
       const zoom = Math.min(w / width, h / height);
       return {
         axes: [0, 1, 2].map((k) => column(camera, k)), center: column(camera, 3),
@@ -142,17 +142,17 @@
       if (!image.camera) return;
       const center = column(image.camera, 3);
       if (show.grippers && show.cameras) line(view, [grip, center], colors.faint, 1);
-      if (show.cameras) frustum(view, image.camera, scene.lens, color, k === picked ? 3 : 1.5);
+      if (show.cameras) frustum(view, image.camera, scene.intrinsics, color, k === picked ? 3 : 1.5);
     });
-    if (show.others) scene.others.forEach(({ fixed, lens, cameras }, k) => {
+    if (show.others) scene.others.forEach(({ fixed, intrinsics, cameras }, k) => {
       const chosen = scene.views.length + k === picked;
       cameras.forEach((camera) =>
-        frustum(view, camera, lens, chosen ? colors.accent : colorOf(k, colors), chosen ? 3 : fixed ? 2.5 : 1.5, fixed ? 0.08 : 0.05));
+        frustum(view, camera, intrinsics, chosen ? colors.accent : colorOf(k, colors), chosen ? 3 : fixed ? 2.5 : 1.5, fixed ? 0.08 : 0.05));
     });
     if (show.next) scene.next.forEach(({ gripper, camera }) => {
       triad(view, gripper, 0.03, 2.5);
       line(view, [column(gripper, 3), column(camera, 3)], colors.next, 1);
-      frustum(view, camera, scene.lens, colors.next, 2.5);
+      frustum(view, camera, scene.intrinsics, colors.next, 2.5);
     });
     if (show.others) drawNames(view, colors);
   }
@@ -191,8 +191,8 @@
     }
   }
 
-  function frustum(view, camera, lens, color, thick, reach = 0.05) {
-    const { fx, fy, cx, cy, width, height } = lens;
+  function frustum(view, camera, intrinsics, color, thick, reach = 0.05) {
+    const { fx, fy, cx, cy, width, height } = intrinsics;
     const center = column(camera, 3);
     const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) =>
       apply(camera, [(reach * (u - 0.5 - cx)) / fx, (reach * (v - 0.5 - cy)) / fy, reach]));
@@ -229,7 +229,7 @@
     const picture = context.createImageData(canvas.width, canvas.height);
     const visible = [];
     if (show.layer < layers.length - 1) visible.push(layers[show.layer]);
-    if (show.tracks) visible.push({ ...layers[layers.length - 1], size: 0.006 });
+    if (show.tracks) visible.push(layers[layers.length - 1]);
     drawPoints(view, visible, picture);
     context.putImageData(picture, 0, 0);
     if (state.through < 0) {
@@ -244,8 +244,8 @@
     const through = state.through >= 0;
     photo.hidden = photoMix.parentElement.hidden = !through;
     if (!through) return;
-    const { width, height, cx, cy } = scene.lens;
-    const zoom = view.fx / scene.lens.fx / ratio;
+    const { width, height, cx, cy } = scene.intrinsics;
+    const zoom = view.fx / scene.intrinsics.fx / ratio;
     const [left, top] = [view.cx / ratio - zoom * (cx + 0.5), view.cy / ratio - zoom * (cy + 0.5)];
     Object.assign(photo.style, {
       left: `${left}px`, top: `${top}px`, width: `${zoom * width}px`, height: `${zoom * height}px`,
