@@ -28,7 +28,7 @@ from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import RunFolder
-from jcr.simulate.capture import with_robot_noise
+from jcr.simulate.taken import with_robot_noise
 
 pytestmark = pytest.mark.slow
 

@@ -67,8 +67,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Collect until there are enough images."""
-    from jcr.live.camera import opened
     from jcr.live.collect import collect
+    from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
 
     answers: list[Answer] = []

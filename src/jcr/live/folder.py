@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
+from jcr.capture.camera_json import read_intrinsics
 from jcr.capture.capture_json import FILE, read_joints
 from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
-from jcr.capture.lens_json import read_lens
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -77,7 +77,7 @@ class LiveFolder:
                 f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
             )
         if self.lens is not None:
-            read_lens(self.lens, size, self.folder / FILE)
+            read_intrinsics(self.lens, size, self.folder / FILE)
         name = f"images/{self._next_number():03d}.png"
         write_bytes(self.folder / name, encode_png(image))
         depth = None
