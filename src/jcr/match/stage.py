@@ -6,9 +6,8 @@ are guessed.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
@@ -21,15 +20,14 @@ from jcr.match import gate as robot
 from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
 from jcr.match.gate import Gate, Key, Pair
+from jcr.match.matchers import Matcher
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
 from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
 from jcr.match.still import hidden, still_cells
 from jcr.match.still import in_words as still_in_words
-from jcr.match.verify import View, pair_of
+from jcr.match.verify import Geometries, View, pair_of
 from jcr.records import Intrinsics
-
-Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 WORTH_SAYING = 0.1
 """Share of the matched pairs: a few wrong ones are left out of every set."""
@@ -40,43 +38,6 @@ STILL = (5e-3, math.radians(1))
 GUESSED_AT_ONCE = 6
 """Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """Features of a capture's images, of any kind."""
-
-    @property
-    def x_px(self) -> Sequence[Float[ndarray, "_ 2"]]:
-        """Keypoints at the working size; pixel centres are whole numbers."""
-        ...
-
-    @property
-    def minds_roll(self) -> bool:
-        """Whether images must be rotated upright for it."""
-        ...
-
-    @property
-    def raw(self) -> Mapping[Key, Int[ndarray, "_ 2"]]:
-        """All matches of the pairs that were tried last, right or wrong."""
-        ...
-
-    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
-        """The geometry of some of a pair's matches; None where too few agree on one."""
-        ...
-
-    @property
-    def every_pair(self) -> int:
-        """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
-        ...
-
-    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
-        ...
-
-    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        """Verified two-view geometries of pairs, their images rotated (rad) before."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -135,9 +96,8 @@ class _Search:
         if not todo:
             return
         found = self.matcher.geometries(todo, np.array(turns))
-        self.view = View.of(
-            self.matcher.x_px, self.view.lens
-        )  # an image that is turned brings keypoints of its own
+        if self.matcher.minds_roll:  # an image that is rotated brings keypoints of its own
+            self.view = View.of(self.matcher.x_px, self.view.lens)
         for key, geometry in found.items():
             clean = self._seen(key, geometry)
             if clean is None:
