@@ -23,7 +23,7 @@ from jcr.match.gate import Gate, Key, Pair
 from jcr.match.matchers import Matcher
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
-from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
+from jcr.match.pairs import FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.match.still import hidden, still_cells
 from jcr.match.still import in_words as still_in_words
 from jcr.match.verify import Geometries, View, pair_of
@@ -201,9 +201,9 @@ def match_with_robot(
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
-    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)
-    first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]
-    search.match(first)
+    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
+    first = near_pairs(motion, FIRST_NEIGHBOURS)
+    search.match([key for key in first if not matcher.minds_roll or angle[key] < AS_TAKEN])
     search.hide_still_parts()
     report(0.3)
     found = _with_lens(search, lens)
@@ -217,13 +217,12 @@ def match_with_robot(
         notes = _beside(search, found, names, original)
         return Matched(search.geometries, None, search.view.lens, None, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
-    if matcher.minds_roll:
-        search.match(everything, upright)
+    search.match(seen_in_common(search.view, found, motion, upright) or everything, upright)
     found = search.gate(found)
     report(0.8)
-    if n > matcher.every_pair:
-        search.match(seen_in_common(search.view, found, motion, upright), upright)
-        found = search.gate(found)
+    lonely = _without_partners(found, n)
+    search.match([key for key in everything if lonely & set(key)], upright)
+    found = search.gate(found)
     found = search.second_motions_confirmed(found)
     stale = _contradicted_by_all(found, motion)
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
@@ -236,6 +235,12 @@ def match_with_robot(
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
     return Matched(kept, found, search.view.lens, upright, notes, warnings)
+
+
+def _without_partners(found: Gate, count: int) -> set[int]:
+    """Images that fewer than two confirmed pairs tie to others."""
+    rows = [row for pair in found.confirmed for row in pair.key]
+    return set(np.flatnonzero(np.bincount(rows, minlength=count) < 2).tolist())
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:

@@ -23,10 +23,14 @@ STATIONARY_PX = 4.0
 """Matches that keep their pixel while the gripper moves: fingers, or text drawn into the images."""
 
 
-def verification(seed: int, known: bool = False) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's options for every pair; `known`: the intrinsics are no guess."""
+def _verification(seed: int, known: bool, matches: int) -> pycolmap.TwoViewGeometryOptions:
+    """COLMAP's options for a pair of so many matches; `known`: the intrinsics are no guess."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
+    # With COLMAP's own (0.25, 3, 0.999, 10000) it takes four times as long and finds 1 % more inliers.
+    options.ransac.min_inlier_ratio = max(0.25, MIN_INLIERS / matches)
+    options.ransac.dyn_num_trials_multiplier = 1.0
+    options.ransac.confidence, options.ransac.max_num_trials = 0.99, 2000
     options.min_num_inliers = MIN_INLIERS
     # The gripper's fingers, or text drawn into the pictures, keep their pixels while the scene moves.
     options.filter_stationary_matches = True
@@ -85,7 +89,7 @@ def matched(
         camera,
         x_px[j] + HALF_PIXEL,
         rows.astype(np.uint32),
-        verification(seed, known),
+        _verification(seed, known, len(rows)),
     )
     return found if len(found.inlier_matches) >= MIN_INLIERS else None
 

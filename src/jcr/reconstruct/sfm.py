@@ -336,7 +336,9 @@ def _pipeline(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
-    pipeline.multiple_models = pipeline.extract_colors = False
+    pipeline.extract_colors = False
+    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    pipeline.multiple_models, pipeline.max_num_models = not known, 3
     pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
     pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
     pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = _ENOUGH
