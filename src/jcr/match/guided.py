@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle, skew
-from jcr.match.stage import Matcher
+from jcr.match.matchers import Matcher
 from jcr.match.verify import View, matched, pair_of
 
 RATIO = 0.85

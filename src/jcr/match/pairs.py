@@ -13,9 +13,9 @@ from jcr.match.gate import Gate, Key
 from jcr.match.verify import View
 from jcr.records import Intrinsics
 
-NEIGHBOURS = 8
-"""Of an image, by the way between grippers, before X is known."""
-PARTNERS = 10
+FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
+"""Of an image, by the way between grippers: from which X is sought, and where these do not show it."""
+PARTNERS = 8
 """Of an image, by what both see, once X is known."""
 WIDEST = math.radians(60)
 """Between two viewing directions: nothing matches beyond."""
@@ -28,7 +28,7 @@ def all_pairs(n: int) -> list[Key]:
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
-def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int = NEIGHBOURS) -> list[Key]:
+def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
     """The nearest neighbours of every image by the gripper's way; in proportion to n."""
     return _best(-np.asarray(motion_length(motion)), neighbours)
 

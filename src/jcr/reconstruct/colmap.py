@@ -46,7 +46,8 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.reconstruct.sfm import BYTES_OF_FEATURES, structure_from_motion
+    from jcr.match.sift import BYTES_OF_FEATURES
+    from jcr.reconstruct.sfm import structure_from_motion
 
     options = options or ColmapOptions()
     report = progress or silent

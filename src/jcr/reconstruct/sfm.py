@@ -16,24 +16,22 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
-from PIL import Image
 
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
-from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, transform
 from jcr.match.guided import guided
-from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
+from jcr.match.matchers import FeatureName, Features, Matcher
 from jcr.match.pairs import all_pairs
-from jcr.match.stage import Matched, Matcher, match_with_robot
-from jcr.match.verify import View, read_geometries, verification, write_geometries
+from jcr.match.sift import BYTES_OF_FEATURES, SiftFeatures, grey_of
+from jcr.match.stage import Matched, match_with_robot
+from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
 from jcr.memory import GB, give_back, resident
-from jcr.progress import Progress, steps
+from jcr.progress import Progress
 from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
@@ -46,8 +44,6 @@ from jcr.reconstruct.placed import (
 )
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
-BYTES_OF_FEATURES = 330
-"""Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
 _MIN_REGISTERED = 3
 _GUIDED_PARTNERS = 6
 """Images with which one that was left out is matched along epipolar lines."""
@@ -85,14 +81,8 @@ def structure_from_motion(
     """
     with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        if features == "sift":
-            cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb)
-            matcher: Matcher = SiftMatcher(database, len(images), seed)
-        else:
-            cameras, _ = _enter(database, images, lenses, known, working_size_px)
-            matcher = LearnedMatcher(
-                features, images, database, cameras[0], _at_work(lenses[0], cameras[0]), known, seed, report
-            )
+        cameras = enter(database, len(images), lenses, known, working_size_px)
+        matcher = matcher_of(features, images, cameras[0], known, seed, report, memory_gb)
         matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
         model = _map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
@@ -126,83 +116,53 @@ def structure_from_motion(
     )
 
 
-def extract(
-    database: Path,
-    images: Sequence[UInt8[ndarray, "h w 3"]],
-    lenses: Sequence[Intrinsics],
-    known: bool,
-    working_size_px: int,
-    report: Progress,
-    memory_gb: float = 8.0,
+def enter(
+    database: Path, count: int, lenses: Sequence[Intrinsics], known: bool, working_size_px: int
 ) -> list[pycolmap.Camera]:
-    """Features of every image, at the working size, in a new database; and the intrinsics as COLMAP's cameras.
-
-    As many threads are used as the budget, a peak resident set, has room for.
-    """
-    cameras, names = _enter(database, images, lenses, known, working_size_px)
-    size = cameras[0].width, cameras[0].height
-    cpu = pycolmap.Device.cpu
-    cores = os.cpu_count() or 1
-    extraction = pycolmap.FeatureExtractionOptions()
-    give_back()
-    room = memory_gb * GB - resident()
-    extraction.num_threads = max(1, min(cores, int(room // (size[0] * size[1] * BYTES_OF_FEATURES))))
-    at_once = 4 * cores  # fewer would leave threads idle at every end
-    for start in steps(report, "features", range(0, len(names), at_once)):
-        few = names[start : start + at_once]
-        pycolmap.extract_features(
-            database,
-            database.parent,
-            few,
-            pycolmap.CameraMode.SINGLE,
-            extraction_options=extraction,
-            device=cpu,
-        )
-    give_back()
-    return cameras
-
-
-def _enter(
-    database: Path,
-    images: Sequence[UInt8[ndarray, "h w 3"]],
-    lenses: Sequence[Intrinsics],
-    known: bool,
-    working_size_px: int,
-) -> tuple[list[pycolmap.Camera], list[str]]:
-    """A new database of grey images at the working size; the intrinsics as COLMAP's cameras, and the images' names."""
+    """A new database of `count` images without features; the intrinsics, at the working size, as COLMAP's cameras."""
     width, height = lenses[0].width, lenses[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
     cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
-    names = [f"{row:05d}.png" for row in range(len(images))]
-    # Images are entered beforehand: extraction threads would number them in the order in which they finish.
     with closing(pycolmap.Database.open(database)) as db:
         db.write_camera(cameras[0], use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
         rig.add_ref_sensor(cameras[0].sensor_id)
         db.write_rig(rig, use_rig_id=True)
-        for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
-            (database.parent / name).write_bytes(encode_png(_grey(pixels, size)))
-            image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
+        for row in range(count):
+            image = pycolmap.Image(name=f"{row:05d}", camera_id=1, image_id=row + 1)
             db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
-    return cameras, names
+    return cameras
 
 
-def _grey(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
-    """An image as features are found in it, of this width and height.
+def matcher_of(
+    features: FeatureName,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    known: bool,
+    seed: int,
+    report: Progress,
+    memory_gb: float = 8.0,
+) -> Matcher:
+    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched.
 
-    Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
+    As many threads find SIFT's as the budget, a peak resident set, has room for.
     """
-    grey = np.asarray(Image.fromarray(pixels).convert("L"))
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if features == "sift":
+        give_back()
+        size = camera.width, camera.height
+        at_once = int((memory_gb * GB - resident()) // (size[0] * size[1] * BYTES_OF_FEATURES))
+        found: Features = SiftFeatures(images, size, max(1, min(os.cpu_count() or 1, at_once)), report)
+        give_back()
+        return Matcher(found, np.ones(2), camera, known, seed)
+    from jcr.match.learned import LearnedFeatures
 
-
-def match(database: Path, seed: int) -> None:
-    """All pairs of the images in a database, by images alone."""
-    pycolmap.match_exhaustive(database, verification_options=verification(seed), device=pycolmap.Device.cpu)
+    height, width = images[0].shape[:2]
+    scale = np.array([camera.width / width, camera.height / height])
+    return Matcher(LearnedFeatures(features, images, report), scale, camera, known, seed)
 
 
 def _matched(
@@ -217,7 +177,7 @@ def _matched(
 ) -> Matched:
     """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
-    working = _at_work(lens, cameras[0])
+    working = resized(lens, cameras[0].width, cameras[0].height)
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
@@ -232,16 +192,12 @@ def _matched(
             (lens.width, lens.height),
             lambda fraction: report("matching", fraction),
         )
+    write_keypoints(database, matcher.x_px)
     write_geometries(database, matched.geometries)
     if not known and matched.lens != working:
         cameras.insert(0, camera_of(matched.lens, known))
     report("matching", 1.0)
     return matched
-
-
-def _at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
-    """The intrinsics of the images at the working size."""
-    return resized(lens, camera.width, camera.height)
 
 
 def _map_incrementally(
@@ -367,7 +323,7 @@ def _second_model(
     with closing(pycolmap.Database.open(database)) as db:
         db.update_camera(camera)
     pipeline = _pipeline(known, seed)
-    pipeline.image_names = [f"{row:05d}.png" for row in left]
+    pipeline.image_names = [f"{row:05d}" for row in left]
     pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
     pipeline.mapper.abs_pose_min_num_inliers = 15
     models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
@@ -380,7 +336,9 @@ def _pipeline(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
-    pipeline.multiple_models = pipeline.extract_colors = False
+    pipeline.extract_colors = False
+    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    pipeline.multiple_models, pipeline.max_num_models = not known, 3
     pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
     pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
     pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = _ENOUGH
@@ -442,7 +400,7 @@ def _align_observations(
     camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
     size = camera.width, camera.height
     poses = poses_of(model, [image_id - 1 for image_id in image_ids])
-    greys = np.stack([_grey(images[image_id - 1], size) for image_id in image_ids])
+    greys = np.stack([grey_of(images[image_id - 1], size) for image_id in image_ids])
     aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
