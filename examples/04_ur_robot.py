@@ -16,8 +16,9 @@ from pathlib import Path
 import jcr
 from jcr.capture.images import read_image
 from jcr.live.arm_words import ArmWords
-from jcr.live.camera import Camera, Frame, Recorded, opened
+from jcr.live.camera import Camera, Frame, Recorded
 from jcr.live.collect import CollectOptions, collect
+from jcr.live.devices import opened
 from jcr.live.folder import LiveFolder
 from jcr.live.rest import asks_at_rest
 from jcr.live.ur import states

@@ -20,7 +20,6 @@ from PIL import Image
 import capture_writers as writers
 from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.simulated.ros_bag import write_bag
-from benchmarks.simulated.truth import read_truth
 from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
@@ -38,7 +37,6 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
 from jcr.segment.labels import _read_names
-from places import ROOT
 
 TOO_LONG_S = 5.0
 VALUES = {
@@ -173,7 +171,6 @@ def documents(folder: Path) -> dict[str, Document]:
     in_file("capture.json, gone on with", file, lambda: gone_on(capture.folder))
     _of_others(folder, capture, cameras, in_file, source)
     _of_runs(folder, capture, in_file, found)
-    _of_simulation(folder, in_file)
     _of_robots(folder, capture, in_file, found, source)
     return found
 
@@ -284,15 +281,6 @@ def _archive(folder: Path, found: dict[str, Document]) -> None:
             np.savez(stream, about=np.array(text), allow_pickle=False, **kept)
 
     found["reconstruction.npz, about"] = Document(about, write, lambda: read_reconstruction(file))
-
-
-def _of_simulation(folder: Path, in_file: Any) -> None:
-    bundled = ROOT / "examples" / "tabletop" / "truth" / "scene.json"
-    place = folder / "simulated"
-    (place / "truth").mkdir(parents=True)
-    file = place / "truth" / "scene.json"
-    file.write_text(bundled.read_text())
-    in_file("truth/scene.json", file, lambda: read_truth(place))
 
 
 def _of_robots(folder: Path, capture: Capture, in_file: Any, found: dict[str, Document], source: Any) -> None:

@@ -84,7 +84,9 @@ def test_a_process_that_dies_takes_no_other_capture_with_it(monkeypatch: pytest.
 
 def test_a_capture_that_falls_short_of_what_is_required_is_rejected(tmp_path: Path, captures: list[Path]):
     options = RunOptions(calibrate=CalibrateOptions(require=(0.001, 0.001)))
-    row = run_one(Task(captures[1], tmp_path / "b", options, True, ReadOptions()))
+    row = run_one(
+        Task(capture=captures[1], out=tmp_path / "b", run=options, calibrate_only=True, read=ReadOptions())
+    )
     assert row.status == "rejected" and row.reason, row
 
 
@@ -102,7 +104,15 @@ def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         raise ZeroDivisionError("oops")
 
     monkeypatch.setattr(module, "calibrate", broken)
-    row = run_one(Task(captures[1], tmp_path / "out", RunOptions(), calibrate_only=True, read=ReadOptions()))
+    row = run_one(
+        Task(
+            capture=captures[1],
+            out=tmp_path / "out",
+            run=RunOptions(),
+            calibrate_only=True,
+            read=ReadOptions(),
+        )
+    )
     assert row.status == "failed" and "ZeroDivisionError: oops" in row.reason
     assert not (tmp_path / "out" / STATE).exists()
 

@@ -23,7 +23,7 @@ from jcr.match.gate import Gate, Key, Pair
 from jcr.match.matchers import Matcher
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
-from jcr.match.pairs import FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
+from jcr.match.pairs import FEW, FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.match.still import hidden, still_cells
 from jcr.match.still import in_words as still_in_words
 from jcr.match.verify import Geometries, View, pair_of
@@ -194,15 +194,15 @@ def match_with_robot(
 
     `original` is the size of the images as they were taken, for notes. `lens` is at the working size, and a first guess
     unless `known`. Where X's rotation cannot be found from the pairs, the robot poses are not used: they may be of
-    another
-    convention, or too few pairs match.
+    another convention, or too few pairs match.
     """
     n = len(base_from_gripper)
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
-    first = near_pairs(motion, FIRST_NEIGHBOURS)
+    at_once = n <= FEW and not matcher.minds_roll
+    first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     search.match([key for key in first if not matcher.minds_roll or angle[key] < AS_TAKEN])
     search.hide_still_parts()
     report(0.3)
