@@ -16,8 +16,8 @@ from jcr.records import Intrinsics
 FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
 """Of an image, by the way between grippers: from which X is sought, and where these do not show it."""
 FEW = 16
-"""Images of which every pair is matched at once: cheap, and a pair that only happens to match ties a camera whose others
-are far (doosan_bench: one camera 12 mm from its gripper with the nearest alone, 7 mm with every pair)."""
+"""A capture of so few images has every pair matched at once: cheap, and a pair that only happens to match ties a camera
+whose others are far (doosan_bench: one camera 12 mm from its gripper with the nearest alone, 7 mm with every pair)."""
 PARTNERS = 8
 """Of an image, by what both see, once X is known."""
 WIDEST = math.radians(60)
