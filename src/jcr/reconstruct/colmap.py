@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from PIL import ExifTags, Image
 
@@ -12,6 +13,9 @@ from jcr.match.matchers import FeatureName
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
+
+if TYPE_CHECKING:
+    from jcr.reconstruct.sfm import Kept
 
 _FILM_DIAGONAL_MM = 43.27
 """Of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
@@ -54,13 +58,12 @@ def reconstruct(
     working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
     plan(len(capture), (width, height), options.memory_gb, features=working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, warnings = usable_lens(capture.intrinsics)
-    lenses = [given] if given else _guessed_lenses(capture)
+    lenses, is_known, warnings = starting_intrinsics(capture)
     try:
         sparse = structure_from_motion(
             images,
             lenses,
-            given is not None,
+            is_known,
             options.working_size_px,
             options.seed,
             options.verbose,
@@ -69,6 +72,7 @@ def reconstruct(
             options.features,
             capture.base_from_gripper if options.robot_checks else None,
             capture.images,
+            _kept(capture, options),
         )
     except NotTrustedError as error:
         raise error.with_more(*warnings) from None
@@ -76,6 +80,24 @@ def reconstruct(
     if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
         notes += (f"{len(registered)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings))
+
+
+def _kept(capture: Capture, options: ColmapOptions) -> "Kept | None":
+    """The features of a capture that was calibrated while it was taken; None where there are none."""
+    from jcr.reconstruct.kept_features import SEED, KeptFeatures, file_digest
+
+    if options.features != "sift" or options.seed != SEED:
+        return None
+    kept = KeptFeatures.of(capture.folder)
+    if not kept.row_of:
+        return None
+    return kept, kept.rows(file_digest(capture.folder / name) for name in capture.images)
+
+
+def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
+    """The intrinsics from which the mapping starts, tried in turn; whether they are known; and warnings about them."""
+    given, warnings = usable_lens(capture.intrinsics)
+    return [given] if given else _guessed_lenses(capture), given is not None, warnings
 
 
 def _guessed_lenses(capture: Capture) -> list[Intrinsics]:

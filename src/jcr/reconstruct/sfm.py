@@ -26,7 +26,7 @@ from PIL import Image
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, transform
+from jcr.geometry import inverse
 from jcr.match.guided import guided
 from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
 from jcr.match.pairs import all_pairs
@@ -34,6 +34,7 @@ from jcr.match.stage import Matched, Matcher, match_with_robot
 from jcr.match.verify import View, read_geometries, verification, write_geometries
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress, steps
+from jcr.reconstruct.kept_features import KeptFeatures, enter_image, image_name, new_database
 from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
@@ -48,6 +49,8 @@ from jcr.records import Intrinsics, Reconstruction, Tracks
 
 BYTES_OF_FEATURES = 330
 """Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
+Kept = tuple[KeptFeatures, Sequence[int | None]]
+"""Features that were found before, and the row there of each image."""
 _MIN_REGISTERED = 3
 _GUIDED_PARTNERS = 6
 """Images with which one that was left out is matched along epipolar lines."""
@@ -74,10 +77,12 @@ def structure_from_motion(
     features: FeatureName = "sift",
     base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
     names: Sequence[str] = (),
+    kept: Kept | None = None,
 ) -> Reconstruction:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
-    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes.
+    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. `kept`
+    are SIFT features and matches of the same images that need not be found again.
 
     A `known` intrinsics are the only ones of `lenses`, do not fold over, and are held; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
@@ -86,38 +91,36 @@ def structure_from_motion(
     with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         if features == "sift":
-            cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb)
+            cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb, kept)
             matcher: Matcher = SiftMatcher(database, len(images), seed)
         else:
             cameras, _ = _enter(database, images, lenses, known, working_size_px)
             matcher = LearnedMatcher(
-                features, images, database, cameras[0], _at_work(lenses[0], cameras[0]), known, seed, report
+                features, images, database, cameras[0], at_work(lenses[0], cameras[0]), known, seed, report
             )
-        matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
-        model = _map_incrementally(database, len(images), cameras, known, seed, report)
+        matched = matched_pairs(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
+        model = map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
-        _adjust_robustly(model, hold_lens=known)
+        adjust_robustly(model, hold_lens=known)
         std_px = _align_observations(
-            model, images, lenses[0] if known else _lens_of(model.camera(1), lenses[0])
+            model, images, lenses[0] if known else lens_of(model.camera(1), lenses[0])
         )
-        _adjust_robustly(model, hold_lens=known)
-        lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
+        adjust_robustly(model, hold_lens=known)
+        lens, notes = (lenses[0] if known else lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
             notes.append("the views do not determine the distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
-            _adjust_robustly(model, hold_lens=True)
-            lens = _lens_of(model.camera(1), lens)
+            adjust_robustly(model, hold_lens=True)
+            lens = lens_of(model.camera(1), lens)
     report("mapping", 1.0)
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    motions = [model.image(row + 1).cam_from_world() for row in rows]
-    camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
     tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
     return Reconstruction(
         image_index=np.array(rows),
-        recon_from_camera=inverse(camera_from_recon),
+        recon_from_camera=poses_of(model, rows),
         intrinsics=lens,
         tracks=replace(tracks, std_px=std_px),
         backend="colmap",
@@ -134,13 +137,26 @@ def extract(
     working_size_px: int,
     report: Progress,
     memory_gb: float = 8.0,
+    kept: Kept | None = None,
 ) -> list[pycolmap.Camera]:
     """Features of every image, at the working size, in a new database; and the intrinsics as COLMAP's cameras.
 
-    As many threads are used as the budget, a peak resident set, has room for.
+    Those that are kept, and their matches, are copied. As many threads are used as the budget, a peak resident set, has
+    room for.
     """
     cameras, names = _enter(database, images, lenses, known, working_size_px)
-    size = cameras[0].width, cameras[0].height
+    if kept is not None:
+        there = kept[0].copy_into(database, cameras[0], kept[1])
+        names = [name for row, name in enumerate(names) if row not in there]
+    extract_images(database, names, cameras[0], report, memory_gb)
+    return cameras
+
+
+def extract_images(
+    database: Path, names: Sequence[str], camera: pycolmap.Camera, report: Progress, memory_gb: float = 8.0
+) -> None:
+    """Features of images that a database has, and whose files lie beside it."""
+    size = camera.width, camera.height
     cpu = pycolmap.Device.cpu
     cores = os.cpu_count() or 1
     extraction = pycolmap.FeatureExtractionOptions()
@@ -159,7 +175,6 @@ def extract(
             device=cpu,
         )
     give_back()
-    return cameras
 
 
 def _enter(
@@ -174,24 +189,21 @@ def _enter(
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
     cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
-    names = [f"{row:05d}.png" for row in range(len(images))]
+    new_database(database, cameras[0])
     # Images are entered beforehand: extraction threads would number them in the order in which they finish.
-    with closing(pycolmap.Database.open(database)) as db:
-        db.write_camera(cameras[0], use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(cameras[0].sensor_id)
-        db.write_rig(rig, use_rig_id=True)
-        for row, (name, pixels) in enumerate(zip(names, images, strict=True)):
-            (database.parent / name).write_bytes(encode_png(_grey(pixels, size)))
-            image = pycolmap.Image(name=name, camera_id=1, image_id=row + 1)
-            db.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
-            frame.add_data_id(image.data_id)
-            db.write_frame(frame, use_frame_id=True)
+    names = [enter_pixels(database, row, working_image(pixels, size)) for row, pixels in enumerate(images)]
     return cameras, names
 
 
-def _grey(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
+def enter_pixels(database: Path, row: int, grey: UInt8[ndarray, "h w"]) -> str:
+    """Enter an image of the working size before its features, and write it as a file beside the database; its name."""
+    with closing(pycolmap.Database.open(database)) as db:
+        name = enter_image(db, row)
+    (database.parent / name).write_bytes(encode_png(grey))
+    return name
+
+
+def working_image(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
     """An image as features are found in it, of this width and height.
 
     Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
@@ -205,7 +217,7 @@ def match(database: Path, seed: int) -> None:
     pycolmap.match_exhaustive(database, verification_options=verification(seed), device=pycolmap.Device.cpu)
 
 
-def _matched(
+def matched_pairs(
     database: Path,
     matcher: Matcher,
     base_from_gripper: Float[ndarray, "n 4 4"] | None,
@@ -217,7 +229,7 @@ def _matched(
 ) -> Matched:
     """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
-    working = _at_work(lens, cameras[0])
+    working = at_work(lens, cameras[0])
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
@@ -239,12 +251,12 @@ def _matched(
     return matched
 
 
-def _at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
+def at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
     """The intrinsics of the images at the working size."""
     return resized(lens, camera.width, camera.height)
 
 
-def _map_incrementally(
+def map_incrementally(
     database: Path,
     n_images: int,
     cameras: list[pycolmap.Camera],
@@ -256,7 +268,7 @@ def _map_incrementally(
 
     The share of images in the model is reported; it falls back where another start is tried.
     """
-    pipeline = _pipeline(known, seed)
+    pipeline = pipeline_options(known, seed)
     if n_images > _MANY:
         pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
     mapper = pipeline.mapper
@@ -295,7 +307,7 @@ def _placed(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
-    lens = matched.lens if known else _lens_of(camera, matched.lens)
+    lens = matched.lens if known else lens_of(camera, matched.lens)
     _match_guided(
         database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left, known, seed
     )
@@ -309,7 +321,7 @@ def _placed(
     resected = poses.keys() - set(rows)
     if not resected and not together:
         return model, matched
-    larger = retriangulated(database, camera, poses | together, lambda made: _adjust_robustly(made, True))
+    larger = retriangulated(database, camera, poses | together, lambda made: adjust_robustly(made, True))
     notes, warnings = list(matched.notes), list(matched.warnings)
     if together and shared_points(larger, set(together)) < LEAST_SHARED:
         listed = ", ".join(names[row] for row in sorted(together))
@@ -319,7 +331,7 @@ def _placed(
         )
         if not resected:
             return model, replace(matched, warnings=tuple(warnings))
-        larger = retriangulated(database, camera, poses, lambda made: _adjust_robustly(made, True))
+        larger = retriangulated(database, camera, poses, lambda made: adjust_robustly(made, True))
     elif together:
         listed = ", ".join(names[row] for row in sorted(together))
         notes.append(f"{listed} were mapped apart, and joined through the robot's motion")
@@ -366,8 +378,8 @@ def _second_model(
         return None
     with closing(pycolmap.Database.open(database)) as db:
         db.update_camera(camera)
-    pipeline = _pipeline(known, seed)
-    pipeline.image_names = [f"{row:05d}.png" for row in left]
+    pipeline = pipeline_options(known, seed)
+    pipeline.image_names = [image_name(row) for row in left]
     pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
     pipeline.mapper.abs_pose_min_num_inliers = 15
     models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
@@ -375,7 +387,7 @@ def _second_model(
     return largest if largest is not None and largest.num_reg_images() >= 2 else None
 
 
-def _pipeline(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's incremental mapping, the same for the same seed."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
@@ -412,7 +424,7 @@ def _models(
     )
 
 
-def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
+def adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
     """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
 
     It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
@@ -442,7 +454,7 @@ def _align_observations(
     camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
     size = camera.width, camera.height
     poses = poses_of(model, [image_id - 1 for image_id in image_ids])
-    greys = np.stack([_grey(images[image_id - 1], size) for image_id in image_ids])
+    greys = np.stack([working_image(images[image_id - 1], size) for image_id in image_ids])
     aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
@@ -515,7 +527,7 @@ def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     return camera
 
 
-def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
+def lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
     """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
