@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from jcr.check import check as check_capture
     from jcr.export.formats import export_run
     from jcr.handeye.solve import solve_hand_eye
+    from jcr.live.calibration import LiveCalibration
+    from jcr.live.calibration_progress import Progress
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.reconstruct.backends import ReconstructOptions
     from jcr.represent.map_file import load_map
@@ -41,6 +43,8 @@ _MODULE_OF = {
     "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
+    "LiveCalibration": "jcr.live.calibration",
+    "Progress": "jcr.live.calibration_progress",
     "run": "jcr.pipeline",
     "add_camera": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
@@ -52,7 +56,9 @@ _MODULE_OF = {
 __all__ = [
     "CalibrateOptions",
     "InputError",
+    "LiveCalibration",
     "NotTrustedError",
+    "Progress",
     "ReadOptions",
     "ReconstructOptions",
     "RejectedError",

@@ -64,7 +64,7 @@ def coverage(
     poses, joints = np.stack(live.poses), live.all_joints()
     assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
-    row, next_joints = _reachable(proposed.added, Path(poses, joints), words)
+    row, next_joints = reachable(proposed.added, Path(poses, joints), words)
     chosen = replace(proposed, added=proposed.added[row : row + 1])
     known = () if before is None else before.expected
     rows = [np.arange(count) for count in range(FEWEST + len(known), len(poses) + 1)]
@@ -96,7 +96,7 @@ def _errors(
         return errors_of(poses)
 
 
-def _reachable(
+def reachable(
     proposed: Float[ndarray, "c 4 4"], path: Path, words: ArmWords
 ) -> tuple[int, Float[ndarray, " dof"] | None]:
     """The first proposal that the arm reaches within its joint limits, and the angles; else the first, without."""

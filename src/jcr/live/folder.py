@@ -13,10 +13,12 @@ from numpy import ndarray
 from jcr.capture.capture_json import FILE, read_joints
 from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
-from jcr.capture.lens_json import read_lens
+from jcr.capture.lens_json import read_lens, read_std
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
+from jcr.handeye.arms import ROBOT_NAMES
+from jcr.records import Capture
 
 THUMBNAIL_PX = 240
 
@@ -31,6 +33,7 @@ class LiveFolder:
         self.poses: list[Float[ndarray, "4 4"]] = []
         self.joints: list[Float[ndarray, " dof"] | None] = []
         self.depths: list[str | None] = []
+        self.times_s: list[float | None] = []
         self.lens = lens
         self.size: tuple[int, int] | None = None
         self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
@@ -56,6 +59,8 @@ class LiveFolder:
             angles, depth = frame.get("joints"), frame.get("depth")
             self.joints.append(None if angles is None else read_joints(angles, f"{where}: joints"))
             self.depths.append(depth if isinstance(depth, str) else None)
+            time_s = frame.get("time_s")
+            self.times_s.append(float(time_s) if isinstance(time_s, int | float) else None)
         self.lens = self.lens or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
 
@@ -65,10 +70,12 @@ class LiveFolder:
         base_from_gripper: Float[ndarray, "4 4"],
         joints: Float[ndarray, " dof"] | None = None,
         depth_mm: UInt16[ndarray, "h w"] | None = None,
+        time_s: float | None = None,
     ) -> str:
         """Keep an image (RGB) and its pose, and return the image's name; capture.json is whole again after.
 
-        `joints` (rad) are kept when all images have them.
+        `joints` (rad) are kept when all images have them. Raises InputError where the image's size is not that of the
+        others.
         """
         size = (image.shape[1], image.shape[0])
         if self.size not in (None, size):
@@ -93,8 +100,35 @@ class LiveFolder:
         self.poses.append(base_from_gripper)
         self.joints.append(joints)
         self.depths.append(depth)
+        self.times_s.append(time_s)
         self._write()
         return name
+
+    def remove(self, name: str) -> None:
+        """Take an image out of the capture; capture.json is whole before its files are deleted."""
+        row = self.names.index(name)
+        files = [name, self.thumbnail(name), *filter(None, [self.depths[row]])]
+        for of_images in (self.names, self.poses, self.joints, self.depths, self.times_s):
+            del of_images[row]
+        self._write()
+        for file in files:
+            contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
+
+    def capture(self) -> Capture:
+        """The images so far as a capture, of one image too; they were checked when they were taken."""
+        assert self.size is not None
+        lens = read_lens(self.lens, self.size, self.folder / FILE)
+        return Capture(
+            folder=self.folder,
+            images=tuple(self.names),
+            base_from_gripper=np.stack(self.poses),
+            image_size=self.size,
+            intrinsics=lens,
+            intrinsics_std=read_std(self.rest.get("intrinsics_std"), lens, self.folder / FILE),
+            joints=self.all_joints(),
+            robot=name if (name := self.rest.get("robot")) in ROBOT_NAMES else None,
+            depths=tuple(self.depths) if any(self.depths) else None,
+        )
 
     def all_joints(self) -> Float[ndarray, "n dof"] | None:
         """Joint angles (rad) of all images, or None where one lacks them."""
@@ -109,6 +143,8 @@ class LiveFolder:
                 frame["joints"] = np.asarray(self.joints[row]).tolist()
             if self.depths[row] is not None:
                 frame["depth"] = self.depths[row]
+            if self.times_s[row] is not None:
+                frame["time_s"] = self.times_s[row]
             frames.append(frame)
         content = {"frames": frames, "intrinsics": self.lens, **self.rest}
         write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")

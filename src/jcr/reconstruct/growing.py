@@ -51,7 +51,7 @@ FEW = 5
 """Images up to which all are mapped again with each: the first pair may have been an unlucky one."""
 AGAIN = 1.3
 """Growth of the number of images after which all are mapped again where images stay out of the map."""
-ADJUSTED_AGAIN = 1.15
+ADJUSTED_AGAIN = 1.5
 """Growth of the number of images after which all cameras and points are adjusted, not only those near the new image."""
 LEAST_INLIERS = 15
 """Points by which an image is registered."""
@@ -105,9 +105,7 @@ class Growing:
         self._matched_with = {row: 0 for row in self._rows}
         for key in matched.geometries:
             self._count_match(key)
-        self._model = map_incrementally(
-            self._database, len(capture), cameras, self._known, SEED, silent
-        )
+        self._model = map_incrementally(self._database, len(capture), cameras, self._known, SEED, silent)
         self._mapped_of = self._adjusted_of = len(capture)
         if self._model is not None:
             adjust_robustly(self._model, hold_lens=self._known)
@@ -232,7 +230,9 @@ class Growing:
 
     def _believed(self, judged: Gate) -> tuple[Pair, ...]:
         if not judged.confirmed and len(judged.contradicted) >= LEAST_AGAINST:
-            return judged.contradicted  # its gripper pose is in doubt, not its matches; the calibration will tell
+            return (
+                judged.contradicted
+            )  # its gripper pose is in doubt, not its matches; the calibration will tell
         return judged.confirmed if self._known else (*judged.confirmed, *judged.undecided)
 
     def _moving(

@@ -114,7 +114,9 @@ class KeptFeatures:
                 self.database.parent.mkdir(parents=True, exist_ok=True)
                 new_database(self.database, source.read_camera(1))
             with closing(pycolmap.Database.open(self.database)) as target:
-                while target.exists_image(number + 1):  # of a capture that was interrupted before the index was written
+                while target.exists_image(
+                    number + 1
+                ):  # of a capture that was interrupted before the index was written
                     number += 1
                 enter_image(target, number)
                 _copy_image(source, row, target, number)

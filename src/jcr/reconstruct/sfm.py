@@ -98,7 +98,9 @@ def structure_from_motion(
             matcher = LearnedMatcher(
                 features, images, database, cameras[0], at_work(lenses[0], cameras[0]), known, seed, report
             )
-        matched = matched_pairs(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
+        matched = matched_pairs(
+            database, matcher, base_from_gripper, lenses[0], cameras, known, names, report
+        )
         model = map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
