@@ -25,7 +25,8 @@ from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.handeye.arms import arm_named
 from jcr.least_squares import one_blas_thread
-from jcr.live.arm_words import ArmWords, Path as ArmPath
+from jcr.live.arm_words import ArmWords
+from jcr.live.arm_words import Path as ArmPath
 from jcr.live.calibration_left_out import left_out
 from jcr.live.calibration_progress import LeftOut, Progress, Reached
 from jcr.live.coverage import ALTERNATIVES, reachable
@@ -152,7 +153,7 @@ class LiveCalibration:
             sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
             return Finding(kind=Kind.SIZE_DIFFERS, severity="rejects", mend="images", details=sizes)
         coarse = grid(image)
-        for name, pose in zip(self.live.names, self.live.poses, strict=True):
+        for name, pose in self.live.places():
             metres, radians = largest_motion(np.stack([pose, base_from_gripper]))
             if name == without or (metres < MOVED[0] and radians < MOVED[1]):
                 continue
@@ -170,13 +171,12 @@ class LiveCalibration:
     @one_blas_thread
     def update(self) -> Progress:
         """Bring the calibration up to what the folder holds: images that were added there, or removed."""
-        names, capture = list(self.live.names), None
-        before = len(self._mapped)
+        capture = self.live.capture() if self.live.names else None
+        names, before = [] if capture is None else list(capture.images), len(self._mapped)
         for name in [name for name in self._mapped if name not in names]:
             self._forget(name)
         new = [name for name in names if name not in self._mapped]
-        if names:
-            capture = self.live.capture()
+        if capture is not None:
             self._extend(capture)
         added = new[-1] if new and before <= len(names) else None
         self.progress = self._calibrated(capture, added)
@@ -225,15 +225,12 @@ class LiveCalibration:
     def _looked_at(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
         """What an image by itself, and when it was taken, say against it."""
         found = []
-        width, row = edge_width(image), self.live.names.index(name)
-        if width > BLURRED_EDGE:
+        if (width := edge_width(image)) > BLURRED_EDGE:
             edge_px = max(*image.shape[:2], EDGES_AT) * width
             found.append(
                 Finding(kind=Kind.BLURRED, severity="warns", mend="images", images=(name,), value=edge_px)
             )
-        times = self.live.times_s[: row + 1]
-        if len(times) > 1 and times[-1] is not None and times[-2] is not None and times[-1] <= times[-2]:
-            back = times[-2] - times[-1]
+        if (back := self.live.seconds_back(name)) is not None:
             found.append(
                 Finding(kind=Kind.CLOCK_JUMPS, severity="warns", mend="poses", images=(name,), value=back)
             )

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
@@ -16,7 +15,6 @@ from jcr.calibration.expected import (
     typical_camera,
 )
 from jcr.calibration.robot_errors import RobotErrors, errors_of, of_poses
-from jcr.capture.lens_json import read_lens
 from jcr.errors import InputError
 from jcr.handeye.observability import observability
 from jcr.live.arm_words import ArmWords, Path, joints_at, pose_lines
@@ -59,10 +57,12 @@ def coverage(
 ) -> Coverage:
     """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
-    if len(live.poses) < 2:
-        return Coverage(len(live.poses), (), (), None, None, None, words)
-    poses, joints = np.stack(live.poses), live.all_joints()
-    assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
+    if len(places := live.places()) < 2:
+        return Coverage(len(places), (), (), None, None, None, words)
+    capture = live.capture()
+    poses, joints = capture.base_from_gripper, capture.joints
+    camera = typical_camera(capture.intrinsics, capture.image_size)
+    assumptions, robot = assumed(poses, camera), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
     row, next_joints = reachable(proposed.added, Path(poses, joints), words)
     chosen = replace(proposed, added=proposed.added[row : row + 1])
@@ -76,14 +76,9 @@ def coverage(
         (*known, *more),
         next_pose,
         next_joints,
-        live.names[next_pose.like],
+        capture.images[next_pose.like],
         words,
     )
-
-
-def _camera(live: LiveFolder) -> ForeseenCamera:
-    assert live.size is not None
-    return typical_camera(read_lens(live.lens, live.size, live.folder), live.size)
 
 
 def _errors(

@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ class LiveFolder:
     def __init__(self, folder: Path, lens: dict[str, Any] | None = None, robot: str | None = None):
         """Raises InputError when `folder` holds a capture.json that cannot be resumed."""
         self.folder = folder
+        self._lock = threading.Lock()
         self.names: list[str] = []
         self.poses: list[Float[ndarray, "4 4"]] = []
         self.joints: list[Float[ndarray, " dof"] | None] = []
@@ -95,27 +97,45 @@ class LiveFolder:
         bgr = np.ascontiguousarray(image[..., ::-1])
         small = cv2.resize(bgr, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
         write_bytes(self.folder / self.thumbnail(name), cv2.imencode(".jpg", small)[1].tobytes())
-        self.size = size
-        self.names.append(name)
-        self.poses.append(base_from_gripper)
-        self.joints.append(joints)
-        self.depths.append(depth)
-        self.times_s.append(time_s)
-        self._write()
+        with self._lock:
+            self.size = size
+            self.names.append(name)
+            self.poses.append(base_from_gripper)
+            self.joints.append(joints)
+            self.depths.append(depth)
+            self.times_s.append(time_s)
+            self._write()
         return name
 
     def remove(self, name: str) -> None:
         """Take an image out of the capture; capture.json is whole before its files are deleted."""
-        row = self.names.index(name)
-        files = [name, self.thumbnail(name), *filter(None, [self.depths[row]])]
-        for of_images in (self.names, self.poses, self.joints, self.depths, self.times_s):
-            del of_images[row]
-        self._write()
+        with self._lock:
+            row = self.names.index(name)
+            files = [name, self.thumbnail(name), *filter(None, [self.depths[row]])]
+            for of_images in (self.names, self.poses, self.joints, self.depths, self.times_s):
+                del of_images[row]
+            self._write()
         for file in files:
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)
 
+    def places(self) -> list[tuple[str, Float[ndarray, "4 4"]]]:
+        """The images and their gripper poses, while another thread may add to them."""
+        with self._lock:
+            return list(zip(self.names, self.poses, strict=True))
+
+    def seconds_back(self, name: str) -> float | None:
+        """By how much an image was stamped before the one taken before it; None where it was not, or has no stamp."""
+        with self._lock:
+            row = self.names.index(name) if name in self.names else 0
+            now, before = self.times_s[row], self.times_s[row - 1]
+        return before - now if row and now is not None and before is not None and now <= before else None
+
     def capture(self) -> Capture:
         """The images so far as a capture, of one image too; they were checked when they were taken."""
+        with self._lock:
+            return self._capture()
+
+    def _capture(self) -> Capture:
         assert self.size is not None
         lens = read_lens(self.lens, self.size, self.folder / FILE)
         return Capture(

@@ -26,14 +26,13 @@ from jcr.match.matchers import SiftMatcher
 from jcr.match.pairs import near_pairs, seen_in_common
 from jcr.match.stage import Geometries
 from jcr.match.still import hidden
-from jcr.match.verify import View, pair_of, write_geometries
+from jcr.match.verify import View, pair_of
 from jcr.progress import silent
 from jcr.reconstruct.colmap import ColmapOptions, starting_intrinsics
 from jcr.reconstruct.kept_features import SEED, KeptFeatures, file_digest
 from jcr.reconstruct.placed import poses_of
 from jcr.reconstruct.sfm import (
     adjust_robustly,
-    at_work,
     enter_pixels,
     extract,
     extract_images,

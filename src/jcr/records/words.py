@@ -567,8 +567,8 @@ _TEXT: dict[Kind, Words] = {
     Kind.SIZE_DIFFERS: "the image has {size} pixels, the others {before}: not kept",
     Kind.CLOCK_JUMPS: "the time of {images[0]} is {value:.3g} s before that of the image before it",
     Kind.LEFT_OUT_DISAGREE: (
-        "{of:.0f} images that take no part show points {mm:.1f} mm and {deg:.2g}° (rms) from where the others place them, "
-        "where {expected_mm:.1f} mm and {expected_deg:.2g}° are expected"
+        "{of:.0f} images that take no part show points {mm:.1f} mm and {deg:.2g}° (rms) from where the others place "
+        "them, where {expected_mm:.1f} mm and {expected_deg:.2g}° are expected"
     ),
 }
 _REMEDY: dict[Kind, Words] = {
