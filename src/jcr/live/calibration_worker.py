@@ -3,20 +3,29 @@
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jcr.errors import InputError, NotTrustedError
 from jcr.live.calibration_progress import Progress
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
     from jcr.results import RunResult
 
-    Heard = Callable[[Progress | RunResult | Exception], None]
+    Heard = Callable[[Progress | RunResult | Failed | Exception], None]
 
 LONGEST_S = 60.0
 """That the end of a capture waits for the calibration of its last images."""
 INTERRUPTED_S = 10.0
 """The same of a capture that is interrupted."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why there is no calibration of the images so far: the capture goes on."""
+
+    reason: str
 
 
 class CalibrationWorker:
@@ -70,6 +79,8 @@ class CalibrationWorker:
             self._remove_all()
             try:
                 self._calibrate()
+            except (InputError, NotTrustedError) as error:
+                self._heard(Failed(str(error)))
             except Exception as error:
                 self._heard(error)
             if ends:

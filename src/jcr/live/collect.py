@@ -15,13 +15,13 @@ import numpy as np
 import tyro
 
 from jcr.capture.images import brightness_and_sharpness, read_image
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
 from jcr.live.calibration_keys import Typed
 from jcr.live.calibration_progress import Progress
 from jcr.live.calibration_words import progress_answer, progress_lines
-from jcr.live.calibration_worker import CalibrationWorker
+from jcr.live.calibration_worker import CalibrationWorker, Failed
 from jcr.live.camera import Camera
 from jcr.live.coverage import as_answer, coverage, in_words
 from jcr.live.folder import LiveFolder
@@ -69,7 +69,7 @@ class CollectOptions:
         return None if self.reach is None else np.array(self.reach).reshape(2, 3)
 
 
-_Event = Ask | Typed | Progress | Exception | None
+_Event = Ask | Typed | Progress | Failed | Exception | None
 """None: nobody asks any more."""
 
 
@@ -175,8 +175,8 @@ class _Taking:
             self._obey(event)
         elif isinstance(event, Progress):
             self._tell_progress(event)
-        elif isinstance(event, NotTrustedError):
-            self.tell({"accepted": False, "reason": str(event)}, [f"no calibration: {event}"])
+        elif isinstance(event, Failed):
+            self.tell({"calibration": None, "reason": event.reason}, [f"no calibration: {event.reason}"])
         elif isinstance(event, Exception):
             raise event
         else:

@@ -45,6 +45,7 @@ class LiveFolder:
             self._resume(read_json(folder / FILE))
         if robot is not None:
             self.rest["robot"] = robot
+        self._stamped_before = tuple(self.names)
 
     def _resume(self, content: Any) -> None:
         file = self.folder / FILE
@@ -124,11 +125,16 @@ class LiveFolder:
             return list(zip(self.names, self.poses, strict=True))
 
     def seconds_back(self, name: str) -> float | None:
-        """By how much an image was stamped before the one taken before it; None where it was not, or has no stamp."""
+        """By how much an image was stamped before the one taken before it; None where it was not, or has no stamp.
+
+        Another run of the program, which took the images that were there before, may have had another clock.
+        """
         with self._lock:
             row = self.names.index(name) if name in self.names else 0
+            if row == 0 or (self.names[row - 1] in self._stamped_before) != (name in self._stamped_before):
+                return None
             now, before = self.times_s[row], self.times_s[row - 1]
-        return before - now if row and now is not None and before is not None and now <= before else None
+        return before - now if now is not None and before is not None and now <= before else None
 
     def capture(self) -> Capture:
         """The images so far as a capture, of one image too; they were checked when they were taken."""
