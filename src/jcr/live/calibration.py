@@ -322,7 +322,10 @@ class LiveCalibration:
         poses, names = case.base_from_gripper[used], [case.names[row] for row in used]
         pose: NextPose = hand_eye.next_poses[0]
         joints = None
-        if self._reach is not None or self._arm is not None:
+        is_bounded = self._reach is not None or self._arm is not None
+        if is_bounded and not hand_eye.converged:
+            return self._before_calibration(case.capture)
+        if is_bounded:
             ahead = Ahead.of(assumptions, poses, robot.of(used), ALTERNATIVES, self._reach)
             angles = case.capture.joints
             of_used = None if angles is None else angles[case.reconstruction.image_index[used]]

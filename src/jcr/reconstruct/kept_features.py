@@ -110,7 +110,8 @@ class KeptFeatures:
         number = max(self.row_of.values(), default=-1) + 1
         with closing(pycolmap.Database.open(database)) as source:
             if not self.row_of:
-                self.database.unlink(missing_ok=True)
+                for ending in ("", "-wal", "-shm"):  # SQLite's journals of a program that was killed
+                    Path(f"{self.database}{ending}").unlink(missing_ok=True)
                 self.database.parent.mkdir(parents=True, exist_ok=True)
                 new_database(self.database, source.read_camera(1))
             with closing(pycolmap.Database.open(self.database)) as target:
