@@ -4,6 +4,7 @@ import json
 import queue
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -166,7 +167,8 @@ def test_poses_of_another_convention_are_named(grown, tmp_path: Path):
     for frame in content["frames"]:
         frame["base_from_gripper"] = inverse(np.array(frame["base_from_gripper"])).tolist()
     (folder / "capture.json").write_text(json.dumps(content))
-    state = LiveCalibration(folder).update()
+    with closing(LiveCalibration(folder)) as live:
+        state = live.update()
     assert Kind.POSE_CONVENTION in {one.kind for one in state.findings}
     assert state.hand_eye is not None and not state.hand_eye.converged and not state.is_accurate
 
@@ -265,4 +267,6 @@ def test_what_is_typed_removes_and_retakes_images(tmp_path: Path, tabletop: Path
     # The second image was taken in place of the first; there was no seventh.
     assert {"retake": "images/000.png"} in answers
     assert "images/000.png" not in live.names and "images/001.png" in live.names
-    assert jcr.read_capture(live.folder).images == tuple(live.names)
+    written = json.loads((live.folder / "capture.json").read_text())["frames"]
+    assert [frame["image"] for frame in written] == live.names and len(live.names) == 2
+    assert done is None
