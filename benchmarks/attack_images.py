@@ -42,7 +42,7 @@ INTRINSICS = frozenset({Kind.INTRINSICS})
 MOVED = frozenset({Kind.SLIP, Kind.DRIFT})
 ORDER = frozenset({Kind.POSE_CONVENTION, Kind.DELAY, Kind.POSES_SWAPPED})
 ONE_POSE = frozenset({Kind.POSES_SWAPPED, Kind.POSE_CONTRADICTS_IMAGE})
-ROBOT = frozenset({Kind.SYSTEMATIC_ERRORS, Kind.JOINT_OFFSETS})
+ROBOT = frozenset({Kind.SYSTEMATIC_ERRORS, Kind.JOINT_OFFSETS, Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
 
 
 @dataclass(frozen=True)

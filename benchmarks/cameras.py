@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.stats import chi2
 
+from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.adjust.robots import Adjusted, Placed, adjust
@@ -22,7 +23,6 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
-from jcr.simulate.robots import PresetName
 
 DRAWS, MANY_DRAWS = 10, 40
 """Of each kind of cell; with --long."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.seen import WAYS, Knowledge
+from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.observations import observed
 from jcr.calibration.adjust import adjusted
@@ -24,7 +25,6 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
-from jcr.simulate.robots import PresetName
 
 ROBOTS: tuple[PresetName, ...] = ("typical", "white", "typical", "typical", "white")
 COUNTS = (6, 8, 12, 20)

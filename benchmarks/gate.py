@@ -19,10 +19,10 @@ from jcr.geometry import Transforms, inverse, rotation_exp, transform
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.records import Capture, Intrinsics
-from jcr.simulate.capture import with_robot_noise
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
 from jcr.simulate.scenes import Scene, make_scene
+from jcr.simulate.taken import with_robot_noise
 
 IMAGES = 9
 SEEDS: dict[FeatureName, int] = {"sift": 1}

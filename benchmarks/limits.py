@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from benchmarks.figure import blank, png
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
+from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
@@ -26,7 +27,7 @@ from jcr.records import HandEye
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render
 from jcr.simulate.scenes import Scene, make_scene
-from jcr.simulate.truth import Truth, read_truth
+from jcr.simulate.truth import Truth
 
 COUNT = 10
 SEED = 0

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.predicted_views import ViewErrors, auc, predicted_views, predictions
 from benchmarks.simulated.surface import truth_points
+from benchmarks.simulated.truth import read_truth
 from benchmarks.table1 import WEBCAM
 from benchmarks.table2 import matched
 from jcr.calibration.stage import calibrate
@@ -30,7 +31,6 @@ from jcr.segment.labels import read_labels
 from jcr.segment.measure import measure
 from jcr.segment.tabletop import label_tabletop
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import read_truth
 
 SEEDS = (3,)
 IMAGES = 10

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.truth import read_truth, true_depth
 from jcr.camera import rays
 from jcr.geometry import inverse, rotation_angle, rotation_exp, transform
 from jcr.reconstruct.views_at_once.da3 import grid_of
 from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
-from jcr.simulate.truth import Truth, read_truth, true_depth
+from jcr.simulate.truth import Truth
 
 
 @dataclass(frozen=True)

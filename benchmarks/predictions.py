@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.simulated.problem import HandEyeProblem, error
 from benchmarks.simulated.surface import truth_points
+from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import pairs_of_capture
 from jcr.capture.read import read_capture
 from jcr.pipeline import RunOptions
@@ -16,7 +17,6 @@ from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import write_pairs
 from jcr.results import RunResult
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import read_truth
 
 SEEDS, MANY_SEEDS = 1, 3
 """MANY_SEEDS with --long."""

@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from benchmarks.figure import blank
 from benchmarks.peers import opencv
+from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
 from benchmarks.simulated.observations import LENS, observed
 from benchmarks.simulated.problem import error
@@ -24,7 +25,6 @@ from jcr.files import write_bytes
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import HandEye, Intrinsics, Tracks
-from jcr.simulate.robots import PresetName
 
 ARMS = ROBOT_NAMES
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
 from benchmarks.simulated.observations import LENS, observed
 from jcr.adjust.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
@@ -18,7 +19,6 @@ from jcr.geometry import apply, step_between
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Estimate, Intrinsics
-from jcr.simulate.robots import PresetName
 
 PRESETS: tuple[PresetName, ...] = ("white", "typical")
 COUNTS = (8, 12, 30)

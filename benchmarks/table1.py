@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from benchmarks.peers import grid_search
+from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
@@ -22,7 +23,7 @@ from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
 from jcr.records import Capture, Reconstruction
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.scenes import SceneName
-from jcr.simulate.truth import Truth, read_truth
+from jcr.simulate.truth import Truth
 
 SCENES: tuple[SceneName, ...] = ("light8", "light7", "dark")
 COUNTS = (10, 12, 15)

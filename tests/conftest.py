@@ -15,9 +15,9 @@ import pytest
 from PIL import Image
 
 import shape_checks
+from benchmarks.simulated.truth import read_truth
 from jcr.geometry import apply, transform
 from jcr.simulate.scenes import make_scene
-from jcr.simulate.truth import read_truth
 from places import ROOT, SHARED
 
 if TYPE_CHECKING:

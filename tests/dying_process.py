@@ -9,4 +9,4 @@ def dies_on_bad(task: Task) -> Row:
     """What a process short of memory does."""
     if task.capture.name == "bad":
         os._exit(9)
-    return Row(str(task.capture), str(task.out), "accepted", offset_std_mm=1.0)
+    return Row(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)

@@ -20,6 +20,7 @@ from PIL import Image
 import capture_writers as writers
 from benchmarks.simulated.problem import hand_eye_problem
 from benchmarks.simulated.ros_bag import write_bag
+from benchmarks.simulated.truth import read_truth
 from fuzz_targets import NAMES, SIZE, small_capture, sound_run
 from jcr.batch import STATE as BATCH
 from jcr.batch import _finished
@@ -37,7 +38,6 @@ from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_recons
 from jcr.records import Capture
 from jcr.run_folder import RunFolder
 from jcr.segment.labels import _read_names
-from jcr.simulate.truth import read_truth
 from places import ROOT
 
 TOO_LONG_S = 5.0
@@ -237,10 +237,29 @@ def _batch_state(folder: Path, capture: Capture, in_file: Any) -> None:
     from jcr.capture.options import ReadOptions
     from jcr.results import RunOptions
 
-    task = Task(capture.folder, folder / "batch", RunOptions(), True, ReadOptions())
+    task = Task(
+        capture=capture.folder,
+        out=folder / "batch",
+        run=RunOptions(),
+        calibrate_only=True,
+        read=ReadOptions(),
+    )
     task.out.mkdir()
     row = vars(
-        Row(str(capture.folder), str(task.out), "accepted", "colmap", 4, 4, 1.0, 0.1, 0.1, 1.0, 0.1, 1.0, "")
+        Row(
+            capture=str(capture.folder),
+            out=str(task.out),
+            status="accepted",
+            backend="colmap",
+            images=4,
+            used=4,
+            offset_std_mm=1.0,
+            turn_std_deg=0.1,
+            scale_std_percent=0.1,
+            held_out_mm=1.0,
+            held_out_deg=0.1,
+            seconds=1.0,
+        )
     )
     as_json(task.out / BATCH, {"made_from": "x", "row": row})
     in_file(f"{BATCH} of a batch", task.out / BATCH, lambda: _finished(task, "x"))
@@ -309,7 +328,6 @@ def _of_robots(folder: Path, capture: Capture, in_file: Any, found: dict[str, Do
         sent[:] = [json.dumps(content).replace("Infinity", "1e309").encode()]
 
     def take() -> object:
-        message = parsed(sent[0])
-        return pose_of(message) if isinstance(message, dict) else message
+        return pose_of(parsed(sent[0]))
 
     found["a line to `jcr capture`"] = Document(line, send, take)

@@ -125,7 +125,7 @@ def test_a_node_of_a_ray_cluster_that_dies_loses_nothing(monkeypatch: pytest.Mon
         deadline = time.monotonic() + 60
         while task.capture != first and not removed.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
-        return Row(str(task.capture), str(task.out), "accepted", offset_std_mm=1.0)
+        return Row(capture=str(task.capture), out=str(task.out), status="accepted", offset_std_mm=1.0)
 
     monkeypatch.setattr(module, "run_one", unfinished)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2})

@@ -1,9 +1,11 @@
 """Whether a calibration is still valid: false alarms at their rate, bumps found, a moved table told from them."""
 
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,7 +28,7 @@ from jcr.reconstruct.reconstruction_npz import write_reconstruction
 from jcr.reconstruct.relocate import Located, relocate
 from jcr.records import Capture, Reconstruction, Tracks
 from jcr.run_folder import RunFolder
-from jcr.simulate.capture import with_robot_noise
+from jcr.simulate.taken import with_robot_noise
 
 pytestmark = pytest.mark.slow
 
@@ -291,3 +293,31 @@ def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, 
     assert "cannot tell" in capsys.readouterr().err
     assert dispatch(["verify", str(out), str(tmp_path / "nothing"), "--quiet"]) == 2
     assert "no such capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("deg", [0.0, 0.3])
+def test_a_new_image_of_a_fixed_camera_shows_whether_it_rotated(
+    out: Path, capture: Capture, tmp_path: Path, capsys, deg: float
+):
+    """A rotation about the camera's own centre moves pixels by a homography, whatever the scene."""
+    run = tmp_path / "out"
+    shutil.copytree(out, run)
+    intrinsics = capture.intrinsics
+    assert intrinsics is not None
+    content = json.loads((capture.folder / "capture.json").read_text())
+    (tmp_path / "camera.json").write_text(json.dumps(content["intrinsics"]))
+    image = cv2.imread(str(capture.folder / capture.images[10]))
+    assert image is not None
+    cv2.imwrite(str(tmp_path / "overhead.png"), image)
+    given = ["--name", "overhead", "--intrinsics", str(tmp_path / "camera.json")]
+    assert dispatch(["add-camera", str(run), str(tmp_path / "overhead.png"), *given, "--quiet"]) == 0
+    k = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
+    now_from_then = k @ rotation_exp(np.radians(deg) * np.array([0.6, -0.64, 0.48])) @ np.linalg.inv(k)
+    seen = cv2.warpPerspective(image, now_from_then, image.shape[1::-1], flags=cv2.INTER_CUBIC)
+    noise = np.random.default_rng(3).normal(0, 2, image.shape)
+    cv2.imwrite(str(tmp_path / "today.png"), np.clip(seen + noise, 0, 255).astype(np.uint8))
+    capsys.readouterr()
+    status = dispatch(["verify", str(run), str(tmp_path / "today.png"), "--camera", "overhead", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert (status, found["moved"]) == ((3, True) if deg else (0, False))
+    assert np.linalg.norm(found["drift_deg"]) == pytest.approx(deg, abs=0.06)

@@ -19,7 +19,7 @@ MAY_NEED_TORCH = (
     "match/aliked", "match/learned", "match/lightglue", "match/xfeat",
     "reconstruct/dust3r/", "reconstruct/global_alignment/adam",
     "reconstruct/views_at_once/", "reconstruct/predictions", "represent/", "segment/sam",
-    "export/mesh", "export/rrd", "export/volume", "view/",
+    "export/rrd", "export/volume", "view/",
 )  # fmt: skip
 """Modules in src/jcr that may import torch (or viser) when they are imported themselves."""
 NEED_NONE = {"represent/cloud", "represent/map_file", "represent/options", "represent/robot"}

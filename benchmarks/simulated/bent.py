@@ -6,19 +6,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PRESETS, ArmErrors, PresetName
 from benchmarks.simulated.problem import HandEyeProblem, disturbed
 from jcr.geometry import rotation_exp, scale_translation, transform
 from jcr.handeye.robots import Arm
-from jcr.simulate.robots import (
-    PRESETS,
-    ArmErrors,
-    BentArm,
-    PresetName,
-    bend,
-    effective_about,
-    hand_eye_on,
-    views,
-)
+from jcr.simulate.robots import BentArm, bend, effective_about, hand_eye_on, views
 
 
 @dataclass(frozen=True)

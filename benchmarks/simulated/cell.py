@@ -5,13 +5,14 @@ arms with a wrist camera each before one table; `carried`, a fixed camera that w
 those of arms that bend as robots.py has it, and the truth is the effective transform.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PRESETS, PresetName
 from benchmarks.simulated.observations import LENS
 from benchmarks.simulated.problem import disturbed
 from jcr.adjust.robots import ArmPoses
@@ -22,19 +23,18 @@ from jcr.geometry import (
     apply_similarity,
     inverse,
     rotation_exp,
+    scale_translation,
     transform,
 )
 from jcr.handeye.arms import arm_named
-from jcr.handeye.known_scale import fit_known_scale
+from jcr.handeye.known_scale import Fit, fit_known_scale
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
 from jcr.simulate.poses import looking_at, random_hand_eye
 from jcr.simulate.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
-    PRESETS,
     BentArm,
-    PresetName,
     about_posture,
     bend,
     effective_exchanged,
@@ -44,7 +44,7 @@ from jcr.simulate.robots import (
 )
 
 Kind = Literal["fixed", "wrists", "arms", "carried"]
-FIXED_LENS = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
+FIXED_CAMERA = Intrinsics(905.0, 903.0, 645.0, 355.0, 1280, 720, (0.06, -0.1, 5e-4, 3e-4, 0.02))
 TABLE = np.array([[-0.25, -0.25, 0.0], [0.25, 0.25, 0.12]])
 """m about the middle of the table: where points lie."""
 BOX = np.array([0.16, 0.12, 0.1])
@@ -52,7 +52,7 @@ BOX = np.array([0.16, 0.12, 0.1])
 BOX_AHEAD = 0.12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CellProblem:
     """What is reported and seen, and the truth."""
 
@@ -97,6 +97,24 @@ def cell_problem(
     return make(kind, preset, count, np.random.default_rng([seed, 13]), noise_px, points)
 
 
+@dataclass
+class _Cell:
+    """A cell as it is, in the base of its first arm."""
+
+    kind: Kind
+    reported: list[Float[ndarray, "n 4 4"]] = field(default_factory=list)
+    """base_from_gripper of each arm, with its errors."""
+    rigs: list[Float[ndarray, "m 4 4"]] = field(default_factory=list)
+    """base_from_rig of each arm, then of fixed cameras."""
+    mounts: list[Float[ndarray, "4 4"]] = field(default_factory=lambda: [np.eye(4)])
+    """rig_from_camera of each camera."""
+    cameras: list[Intrinsics] = field(default_factory=lambda: [LENS])
+    images: list[tuple[int, int]] = field(default_factory=list)
+    """Row of the rig and of the camera that took each."""
+    truth: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
+    starts: list[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]] = field(default_factory=list)
+
+
 def _before_table(
     kind: Kind, preset: PresetName, count: int, rng: np.random.Generator, noise_px: float, points: int
 ) -> CellProblem:
@@ -106,58 +124,45 @@ def _before_table(
     )
     target = table_center(arms[0].arm)
     base_from_second[:3, 3] = target - base_from_second[:3, :3] @ target + 0.03 * rng.normal(size=3)
-    bases = [np.eye(4), base_from_second]
-    rigs, reported, fits, mounted = [], [], [], []
-    for bent, world_from_base in zip(arms, bases, strict=False):
+    cell, fits = _Cell(kind, images=[(k, 0) for k in range(count)]), []
+    for bent, world_from_base in zip(arms, [np.eye(4), base_from_second], strict=False):
         x = hand_eye_on(bent.arm, rng)
         joints = views(bent.arm, count, x, rng)
         others = np.concatenate([views(bent.arm, count, x, rng) for _ in range(-(-EFFECTIVE_POSES // count))])
         cameras = world_from_base @ bent.true(others) @ x
-        fits.append(
-            fit_known_scale(bent.reported(others), cameras, (x, inverse(world_from_base)), EFFECTIVE_NOISE)
-        )
-        rigs.append(world_from_base @ bent.true(joints) @ x)
-        reported.append(disturbed(bent.reported(joints), PRESETS[preset].white, rng))
-        mounted.append(x)
-    mounts, lenses = [np.eye(4)], [LENS]
-    pictures = [(k, 0) for k in range(count)]
-    truth = {"gripper_from_camera": fits[0].gripper_from_camera}
-    if kind == "wrists":
-        mounts.append(transform(rotation_exp(0.05 * rng.normal(size=3)), np.array([0.055, 0.0, 0.0])))
-        lenses.append(FIXED_LENS)
-        pictures += [(k, 1) for k in range(count)]
-        truth["gripper_from_second"] = fits[0].gripper_from_camera @ mounts[1]
-    if kind == "arms":
-        mounts.append(np.eye(4))
-        lenses.append(FIXED_LENS)
-        pictures += [(count + k, 1) for k in range(count)]
-        truth["gripper_from_second"] = fits[1].gripper_from_camera
-        truth["base1_from_base2"] = fits[0].base_from_recon @ inverse(fits[1].base_from_recon)
-    if kind == "fixed":
+        start = x, inverse(world_from_base)
+        fits.append(fit_known_scale(bent.reported(others), cameras, start, EFFECTIVE_NOISE))
+        cell.rigs.append(world_from_base @ bent.true(joints) @ x)
+        cell.reported.append(disturbed(bent.reported(joints), PRESETS[preset].white, rng))
+        cell.starts.append(start)
+    cell.truth["gripper_from_camera"] = fits[0].gripper_from_camera
+    _add_second_camera(cell, fits, target, count, rng)
+    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
+    return _seen(cell, x_in_base, None, noise_px, rng)
+
+
+def _add_second_camera(
+    cell: _Cell, fits: list[Fit], target: Float[ndarray, "3"], count: int, rng: np.random.Generator
+) -> None:
+    """Add the second wrist camera, the other arm's or the fixed one to a cell whose arms have their poses."""
+    mount = np.eye(4)
+    if cell.kind == "wrists":
+        mount = transform(rotation_exp(0.05 * rng.normal(size=3)), np.array([0.055, 0.0, 0.0]))
+        cell.images += [(k, 1) for k in range(count)]
+        cell.truth["gripper_from_second"] = fits[0].gripper_from_camera @ mount
+    if cell.kind == "arms":
+        cell.images += [(count + k, 1) for k in range(count)]
+        cell.truth["gripper_from_second"] = fits[1].gripper_from_camera
+        cell.truth["base1_from_base2"] = fits[0].base_from_recon @ inverse(fits[1].base_from_recon)
+    if cell.kind == "fixed":
         azimuth = rng.uniform(-2.5, 2.5)
         away = np.array([0.75 * np.cos(azimuth), 0.75 * np.sin(azimuth), rng.uniform(0.6, 1.1)])
         base_from_camera = looking_at(target + away, target, rng)
-        rigs.append(base_from_camera[None])
-        mounts.append(np.eye(4))
-        lenses.append(FIXED_LENS)
-        pictures.append((count, 1))
-        truth["base_from_camera"] = fits[0].base_from_recon @ base_from_camera
-    x_in_base = target + rng.uniform(TABLE[0], TABLE[1], (points, 3))
-    starts = [(x, inverse(base)) for x, base in zip(mounted, bases, strict=False)]
-    return _seen(
-        kind,
-        reported,
-        np.concatenate(rigs),
-        mounts,
-        lenses,
-        pictures,
-        x_in_base,
-        None,
-        truth,
-        starts,
-        noise_px,
-        rng,
-    )
+        cell.rigs.append(base_from_camera[None])
+        cell.images.append((count, 1))
+        cell.truth["base_from_camera"] = fits[0].base_from_recon @ base_from_camera
+    cell.mounts.append(mount)
+    cell.cameras.append(FIXED_CAMERA)
 
 
 def _carried(
@@ -180,22 +185,16 @@ def _carried(
     x_in_object, normal = _box(points, rng)
     rigs = inverse(true @ gripper_from_object) @ base_from_camera
     truth = {"base_from_camera": effective[0], "gripper_from_object": effective[1]}
-    reported = [disturbed(bent.reported(joints), PRESETS[preset].white, rng)]
-    pictures = [(k, 0) for k in range(count)]
-    return _seen(
+    cell = _Cell(
         kind,
-        reported,
-        rigs,
-        [np.eye(4)],
-        [FIXED_LENS],
-        pictures,
-        x_in_object,
-        normal,
-        truth,
-        [start],
-        noise_px,
-        rng,
+        reported=[disturbed(bent.reported(joints), PRESETS[preset].white, rng)],
+        rigs=[rigs],
+        cameras=[FIXED_CAMERA],
+        images=[(k, 0) for k in range(count)],
+        truth=truth,
+        starts=[start],
     )
+    return _seen(cell, x_in_object, normal, noise_px, rng)
 
 
 def _drawn(preset: PresetName, rng: np.random.Generator) -> BentArm:
@@ -211,56 +210,44 @@ def _box(points: int, rng: np.random.Generator) -> tuple[Float[ndarray, "p 3"], 
 
 
 def _seen(
-    kind: Kind,
-    reported: list[Float[ndarray, "n 4 4"]],
-    rigs: Float[ndarray, "m 4 4"],
-    mounts: list[Float[ndarray, "4 4"]],
-    lenses: list[Intrinsics],
-    pictures: list[tuple[int, int]],
-    x_in_true: Float[ndarray, "p 3"],
+    cell: _Cell,
+    x_in_base: Float[ndarray, "p 3"],
     normal: Float[ndarray, "p 3"] | None,
-    truth: dict[str, Float[ndarray, "4 4"]],
-    starts: list[tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]],
     noise_px: float,
     rng: np.random.Generator,
 ) -> CellProblem:
     """The problem in a frame and unit of its own, every point seen with noise by all cameras that have it in view."""
-    picture, x_px, point = [], [], []
-    for k, (rig, camera) in enumerate(pictures):
-        lens, place = lenses[camera], rigs[rig] @ mounts[camera]
-        x = apply(inverse(place), x_in_true)
-        pixels = project(lens, x)
-        shown = (x[:, 2] > 0) & ((pixels > 0) & (pixels < [lens.width, lens.height])).all(1)
+    image, x_px, point = [], [], []
+    rigs = np.concatenate(cell.rigs)
+    for k, (rig, row) in enumerate(cell.images):
+        camera, place = cell.cameras[row], rigs[rig] @ cell.mounts[row]
+        x = apply(inverse(place), x_in_base)
+        pixels = project(camera, x)
+        shown = (x[:, 2] > 0) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if normal is not None:
-            shown &= ((place[:3, 3] - x_in_true) * normal).sum(1) > 0
+            shown &= ((place[:3, 3] - x_in_base) * normal).sum(1) > 0
         point.append(np.flatnonzero(shown))
-        picture.append(np.full(shown.sum(), k))
+        image.append(np.full(shown.sum(), k))
         x_px.append(pixels[shown] + noise_px * rng.normal(size=(int(shown.sum()), 2)))
-    world_from_true = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+    world_from_base = transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3))
     scale = float(np.exp(rng.uniform(-2, 2)))
-
-    def in_world(true: Float[ndarray, "*k 4 4"]) -> Float[ndarray, "*k 4 4"]:
-        moved = world_from_true @ true
-        return transform(moved[..., :3, :3], moved[..., :3, 3] / scale)
-
-    rig_of, camera_of = np.array(pictures).T
-    true_from_scaled = inverse(world_from_true)
+    rig_of, camera_of = np.array(cell.images).T
     return CellProblem(
-        kind,
-        tuple(reported),
-        Observations(
+        kind=cell.kind,
+        reported=tuple(cell.reported),
+        observations=Observations(
             rig=rig_of,
             camera=camera_of,
-            image=np.concatenate(picture),
+            image=np.concatenate(image),
             x_px=np.concatenate(x_px),
             point=np.concatenate(point),
             std_px=np.ones(sum(map(len, point))),
         ),
-        in_world(rigs),
-        np.stack([transform(mount[:3, :3], mount[:3, 3] / scale) for mount in mounts]),
-        apply_similarity(world_from_true, 1.0, x_in_true) / scale,
-        tuple(lenses),
-        scale,
-        truth,
-        tuple((x, z @ true_from_scaled) for x, z in starts),
+        world_from_rig=scale_translation(world_from_base @ rigs, 1 / scale),
+        rig_from_camera=scale_translation(np.stack(cell.mounts), 1 / scale),
+        points_in_world=apply_similarity(world_from_base, 1.0, x_in_base) / scale,
+        cameras=tuple(cell.cameras),
+        scale=scale,
+        truth=cell.truth,
+        starts=tuple((x, z @ inverse(world_from_base)) for x, z in cell.starts),
     )

@@ -26,7 +26,7 @@ POINTS, NOISE_PX = 500, 0.4
 LOW, HIGH = np.array([0.2, -0.3, 0.0]), np.array([0.8, 0.3, 0.15])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Faults:
     """What is wrong; nothing, by default."""
 
@@ -53,7 +53,7 @@ class Faults:
     lengths: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """By which the reported positions are too long along each axis of the base, relative: a lift, a rail, a gantry."""
     tilt_by_reach: float = 0.0
-    """rad per m: a stand leans towards a gripper as far away as it is, horizontally, and no pose says so."""
+    """rad per m: a stand leans towards a gripper as far away as it is, horizontally, which no reported pose shows."""
     sag: float = 0.0
     """rad by which a level tool rotates towards the floor; of one that points down nothing."""
     delay_s: float = 0.0
@@ -69,7 +69,7 @@ class Faults:
         return any(self.lengths) or bool(self.tilt_by_reach or self.sag)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FaultyCapture:
     """What a user would have, and what was."""
 
@@ -124,7 +124,14 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     tracks = Tracks(np.concatenate(image), np.concatenate(pixels), np.concatenate(point), points)
     if faults.is_bent:
         x, slipped = _effective(x, images, faults, rng), x
-    return FaultyCapture(reported, tracks, cameras, x, slipped, LENS)
+    return FaultyCapture(
+        base_from_gripper=reported,
+        tracks=tracks,
+        base_from_camera=cameras,
+        gripper_from_camera=x,
+        gripper_from_camera_after=slipped,
+        lens=LENS,
+    )
 
 
 def _through_prism(x: Float[ndarray, "p 2"], s: tuple[float, float, float, float]) -> Float[ndarray, "p 2"]:

@@ -34,7 +34,7 @@ GRAVITY = np.array([0.0, 0.0, -1.0])
 """In the base frame."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class View:
     """One image of a capture, as the camera took it."""
 
@@ -52,7 +52,7 @@ Optics = Callable[[View, Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
 """Where the pinhole camera that the user believes in has what the real one shows at a pixel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Drawn:
     """A capture in the making: images, poses as reported, intrinsics as given."""
 
@@ -91,16 +91,16 @@ def draw(scene: Rendered, seed: int, fault: Fault, size: float = 1.0, given: boo
     random = scatter.normal(size=(IMAGES, 2))
     images = []
     for k, row in enumerate(rows.tolist()):
-        view = View(k, IMAGES, scene.camera, float(far[k]), random[k])
+        view = View(number=k, count=IMAGES, camera=scene.camera, far=float(far[k]), random=random[k])
         clean = scene.seen(row, _optics(fault, view), fault.pushed and k >= IMAGES // 2)
         images.append(_noisy(clean, pixels))
     white = size * scene.white[0], size * scene.white[1]
     drawn = Drawn(
-        images,
-        scene.base_from_gripper[rows],
-        scene.camera if given else None,
-        scene.gripper_from_camera[None],
-        names_of_images(),
+        images=images,
+        base_from_gripper=scene.base_from_gripper[rows],
+        camera=scene.camera if given else None,
+        gripper_from_camera=scene.gripper_from_camera[None],
+        names=names_of_images(),
     )
     if fault.change is not None:
         drawn = fault.change(drawn, of_fault)

@@ -1,4 +1,4 @@
-"""Image observations of a hand-eye problem's scene, without images: food for bundle adjustment."""
+"""Image observations of a hand-eye problem's scene, made without rendering."""
 
 import numpy as np
 

@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PRESETS
 from jcr.geometry import transform
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.records import Intrinsics
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
-from jcr.simulate.robots import PRESETS, bend, effective_about, hand_eye_on, patterned, table_center
+from jcr.simulate.robots import bend, effective_about, hand_eye_on, patterned, table_center
 from jcr.simulate.scenes import Scene, make_scene, moved
 
 SIZE, WIDE = (640, 480), (960, 720)
@@ -23,13 +24,13 @@ POSES = 14
 PUSHED, BY_M = 3, (0.04, 0.045, 0.0)
 """How many objects are pushed, and by how much."""
 ARMS: tuple[RobotName | None, ...] = (None, "ur5e", None, "panda", None)
-"""Of the scenes in turn; None: a gripper whose poses have no systematic errors."""
+"""Of the scenes one after the other; None: a gripper whose poses have no systematic errors."""
 
 PxFromPx = Callable[[Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
 """Where the pinhole camera that the user believes in has what the real camera shows at a pixel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rendered:
     """A scene as it is seen from POSES places, and what is true there."""
 
@@ -59,7 +60,9 @@ class Rendered:
 
 def rendered(seed: int) -> Rendered:
     """The table top scene of that seed."""
-    hand_eye, motion, errors, elsewhere, lens = (np.random.default_rng([seed, 20 + k]) for k in range(5))
+    hand_eye, motion, errors, elsewhere, intrinsics = (
+        np.random.default_rng([seed, 20 + k]) for k in range(5)
+    )
     scene = make_scene("tabletop", seed)
     name = ARMS[seed % len(ARMS)]
     if name is None:
@@ -75,7 +78,7 @@ def rendered(seed: int) -> Rendered:
         joints = patterned(arm, "varied", POSES, target, x, motion)
         effective = effective_about(bent, x, POSES, elsewhere, target).gripper_from_camera
         true, reported, white = bent.true(joints), bent.reported(joints), preset.white
-    focal_px = float(lens.uniform(*FOCAL_PX))
+    focal_px = float(intrinsics.uniform(*FOCAL_PX))
     (width, height), (wide, high) = SIZE, WIDE
     wide_camera = Intrinsics(focal_px, focal_px, (wide - 1) / 2, (high - 1) / 2, wide, high)
     first, second = (

@@ -1,6 +1,6 @@
 """A simulated recording: a ROS bag in which an arm goes through a capture's views and stops at each."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -125,7 +125,7 @@ def _messages(
     for camera in capture.others:
         parent = "tool0" if camera.mount == "gripper" else "base_link"
         yield START_NS, "/tf_static", tf(START_NS, parent, camera.name, np.eye(4))
-    pictures = [read_image(capture.folder / name) for name in capture.images]
+    images = [read_image(capture.folder / name) for name in capture.images]
     rng = np.random.default_rng(0)
     events = [(k / tf_hz, "tf") for k in range(round(seconds * tf_hz))]
     events += [((k + 0.5) / fps, "image") for k in range(round(seconds * fps))]
@@ -136,48 +136,52 @@ def _messages(
             poses = disturbed(poses, (jitter, jitter / ARM), rng)
             yield at, "/tf", tf(at, "base_link", "tool0", poses[0])
             continue
-        if capture.depths is not None and (name := capture.depths[round(float(rows[0]))]) is not None:
-            depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
-            fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
-            later = header(at + DEPTH_LATER_NS, "camera")
-            yield (
-                at,
-                "/camera/aligned_depth_to_color/image_raw",
-                types["sensor_msgs/msg/Image"](later, *fields),
-            )
-        for camera in capture.others:
-            k = 0 if camera.frame is None else int(np.abs(camera.frame - float(rows[0])).argmin())
-            data = np.frombuffer((capture.folder / camera.images[k]).read_bytes(), np.uint8)
-            later = header(at + DEPTH_LATER_NS, camera.name)
-            message = types["sensor_msgs/msg/CompressedImage"](later, "png", data)
-            yield at, f"/{camera.name}/image_raw/compressed", message
-        picture = _blurred(pictures[round(float(rows[0]))], float(speeds[0]), rng)
+        yield from _other_images(types, header, capture, at, float(rows[0]))
+        image = _blurred(images[round(float(rows[0]))], float(speeds[0]), rng)
         if compressed:
-            data = np.asarray(cv2.imencode(".jpg", picture[:, :, ::-1])[1]).ravel()
+            data = np.asarray(cv2.imencode(".jpg", image[:, :, ::-1])[1]).ravel()
             message = types["sensor_msgs/msg/CompressedImage"](header(at, "camera"), "jpeg", data)
             yield at, "/camera/image_raw/compressed", message
         else:
-            height, width, _ = picture.shape
-            fields = (height, width, "rgb8", 0, 3 * width, picture.ravel())
+            height, width, _ = image.shape
+            fields = (height, width, "rgb8", 0, 3 * width, image.ravel())
             yield at, "/camera/image_raw", types["sensor_msgs/msg/Image"](header(at, "camera"), *fields)
 
 
+def _other_images(
+    types: dict[str, Any], header: Callable[[int, str], Any], capture: Capture, at: int, row: float
+) -> Iterator[tuple[int, str, Any]]:
+    """Depth and the images of further cameras, a little later than the image at `row` of the capture."""
+    if capture.depths is not None and (name := capture.depths[round(row)]) is not None:
+        depth = (1000 * read_depth(capture.folder / name, capture.image_size)).round().astype("<u2")
+        fields = (*depth.shape, "16UC1", 0, 2 * depth.shape[1], depth.view(np.uint8).ravel())
+        message = types["sensor_msgs/msg/Image"](header(at + DEPTH_LATER_NS, "camera"), *fields)
+        yield at, "/camera/aligned_depth_to_color/image_raw", message
+    for camera in capture.others:
+        k = 0 if camera.frame is None else int(np.abs(camera.frame - row).argmin())
+        data = np.frombuffer((capture.folder / camera.images[k]).read_bytes(), np.uint8)
+        message = types["sensor_msgs/msg/CompressedImage"](
+            header(at + DEPTH_LATER_NS, camera.name), "png", data
+        )
+        yield at, f"/{camera.name}/image_raw/compressed", message
+
+
 def _blurred(
-    picture: UInt8[ndarray, "h w 3"], speed: float, rng: np.random.Generator
+    image: UInt8[ndarray, "h w 3"], speed: float, rng: np.random.Generator
 ) -> UInt8[ndarray, "h w 3"]:
     """The image as a moving camera sees it, with one grey level of noise in places: no two frames are alike."""
     length = 1 + round(BLUR_PX_PER_M * speed)
-    noisy = picture ^ (rng.random(picture.shape[:2]) < 0.02)[..., None].astype(np.uint8)
+    noisy = image ^ (rng.random(image.shape[:2]) < 0.02)[..., None].astype(np.uint8)
     return np.asarray(cv2.blur(noisy, (length, 1)), dtype=np.uint8) if length > 1 else noisy
 
 
 def _camera_info(types: dict[str, Any], header: Any, capture: Capture) -> Any:
-    lens = capture.intrinsics
-    assert lens is not None
-    k, d = lens.matrix.ravel(), np.array(lens.distortion)
-    p = np.column_stack([lens.matrix, np.zeros(3)]).ravel()
+    camera = capture.intrinsics
+    assert camera is not None
+    k, d = camera.matrix.ravel(), np.array(camera.distortion)
+    p = np.column_stack([camera.matrix, np.zeros(3)]).ravel()
     roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    size = (lens.height, lens.width)
+    size = (camera.height, camera.width)
     return types["sensor_msgs/msg/CameraInfo"](
         header, *size, "plumb_bob", d, k, np.eye(3).ravel(), p, 0, 0, roi
     )

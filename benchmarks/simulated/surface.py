@@ -7,11 +7,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.distance import cdist
 
+from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.camera import rays
 from jcr.geometry import apply, inverse, transform
 from jcr.simulate.meshes import Mesh
 from jcr.simulate.scenes import Scene
-from jcr.simulate.truth import read_truth, true_depth, true_labels
 
 
 def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
@@ -23,10 +23,10 @@ def solid_labels(scene: Scene, x_in_base: Float[ndarray, "n 3"]) -> Int[ndarray,
         x_in_solid = apply(inverse(base_from_solid), x_in_base)
         corners = np.concatenate([part.mesh.vertices for part in parts])
         near = ((x_in_solid >= corners.min(0)) & (x_in_solid <= corners.max(0))).all(1)
-        turns = sum(
+        windings = sum(
             (winding_number(part.mesh, x_in_solid[near]) for part in parts), start=np.zeros(near.sum())
         )
-        labels[np.flatnonzero(near)[turns > 0.5]] = label
+        labels[np.flatnonzero(near)[windings > 0.5]] = label
     return labels
 
 
@@ -43,14 +43,14 @@ def winding_number(mesh: Mesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, 
     def dot(p: ndarray, q: ndarray, x: ndarray) -> Float[ndarray, "k f"]:
         return (p * q).sum(-1) - x @ (p + q).T + (x * x).sum(-1, keepdims=True)
 
-    turns = np.empty(len(points))
+    windings = np.empty(len(points))
     # In blocks that stay within the cache.
     for start in range(0, len(points), 128):
         x = points[start : start + 128]
         la, lb, lc = cdist(x, mesh.vertices)[:, mesh.faces].transpose(2, 0, 1)
         cosines = la * lb * lc + dot(a, b, x) * lc + dot(b, c, x) * la + dot(c, a, x) * lb
-        turns[start : start + 128] = np.arctan2(volume - x @ normal.T, cosines).sum(-1) / (2 * np.pi)
-    return turns
+        windings[start : start + 128] = np.arctan2(volume - x @ normal.T, cosines).sum(-1) / (2 * np.pi)
+    return windings
 
 
 def truth_points(folder: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "n"]]:

@@ -36,7 +36,7 @@ RETRIES = 3
 """Of a task whose Ray node died."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BatchOptions:
     """Where and how much to run."""
 
@@ -53,7 +53,7 @@ class BatchOptions:
     """With --ray: GPUs that a capture takes; 0.25 lets four share one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One capture in the table."""
 
@@ -74,7 +74,7 @@ class Row:
     """Why it failed or is rejected, or its first warning."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """A capture to run, and with what."""
 
@@ -102,7 +102,13 @@ def batch(
         raise InputError(f"--processes {options.processes}: give 1 or more")
     report = progress or silent
     tasks = [
-        Task(path.resolve(), out.resolve() / name, run_options, options.calibrate_only, read or ReadOptions())
+        Task(
+            capture=path.resolve(),
+            out=out.resolve() / name,
+            run=run_options,
+            calibrate_only=options.calibrate_only,
+            read=read or ReadOptions(),
+        )
         for path, name in zip(captures, _names(captures), strict=True)
     ]
     out.mkdir(parents=True, exist_ok=True)
@@ -119,7 +125,6 @@ def batch(
 def run_one(task: Task) -> Row:
     """The row of one capture, run unless it was finished before; whatever goes wrong is in the row."""
     start = time.perf_counter()
-    failed = Row(str(task.capture), str(task.out), "failed")
     try:
         capture = read_capture(task.capture, task.read, into=task.out / CAPTURE)
         made_from = fingerprint(capture, task.run.reconstruct.as_json())
@@ -142,9 +147,13 @@ def run_one(task: Task) -> Row:
         )
         return row
     except InputError as error:
-        return replace(failed, reason=str(error))
+        return _failed(task, str(error))
     except Exception as error:  # a bug shows in its row, and does not take the other captures with it
-        return replace(failed, reason=f"{type(error).__name__}: {error}")
+        return _failed(task, f"{type(error).__name__}: {error}")
+
+
+def _failed(task: Task, reason: str) -> Row:
+    return Row(capture=str(task.capture), out=str(task.out), status="failed", reason=reason)
 
 
 def _finished(task: Task, made_from: str) -> Row | None:
@@ -158,12 +167,12 @@ def _finished(task: Task, made_from: str) -> Row | None:
 
 def _row(task: Task, content: CalibrationFile) -> Row:
     row = Row(
-        str(task.capture),
-        str(task.out),
-        verdict_of(content.findings),
-        content.backend,
-        len(content.images),
-        content.images_used,
+        capture=str(task.capture),
+        out=str(task.out),
+        status=verdict_of(content.findings),
+        backend=content.backend,
+        images=len(content.images),
+        used=content.images_used,
     )
     if content.uncertainty is not None:
         uncertainty = content.uncertainty
@@ -210,8 +219,7 @@ def _on_this_machine(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
         # A process that was killed takes its pool along; alone, only the capture that did it fails.
         for task in left:
             if (yield from _over_pool([task], 1)):
-                reason = "its process died: out of memory, or a crash in a library"
-                yield Row(str(task.capture), str(task.out), "failed", reason=reason)
+                yield _failed(task, "its process died: out of memory, or a crash in a library")
 
 
 def _over_pool(tasks: list[Task], processes: int):
@@ -237,7 +245,7 @@ def _over_pool(tasks: list[Task], processes: int):
 
 
 def _dies_on_interrupt() -> None:
-    """Ctrl-C reaches every process of the terminal; only the first one has something to say about it."""
+    """Ctrl-C reaches every process of the terminal; only the first one reports it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -270,8 +278,8 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
             raise InputError(f"--ray {options.ray}: no cluster there ({error})") from None
     try:
         cpus, gpus = options.cpus_per_task, options.gpus_per_task
-        room = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in room):
+        resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in resources):
             # Ray would wait for such a node without end.
             raise InputError(
                 f"--ray {options.ray}: no node has the {cpus} cores and {gpus:g} GPUs that a capture takes; "
@@ -286,7 +294,7 @@ def _on_ray(tasks: list[Task], options: BatchOptions) -> Iterator[Row]:
                 yield ray.get(done)
             except RayError as error:
                 task, reason = task_of[done], " ".join(str(error).split())[:200]
-                yield Row(str(task.capture), str(task.out), "failed", reason=reason)
+                yield _failed(task, reason)
     finally:
         if own:
             ray.shutdown()

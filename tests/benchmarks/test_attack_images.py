@@ -22,13 +22,21 @@ def scene() -> Rendered:
     camera = Intrinsics(FOCAL_PX[0], FOCAL_PX[0], (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)
     poses = gripper_poses("varied", POSES, np.array([0.5, 0.0, 0.0]), x, rng)
     distance = np.linalg.norm((poses @ x)[:, :3, 3] - [0.5, 0.0, 0.0], axis=1)
-    return Rendered((wide,) * POSES, (255 - wide,) * POSES, camera, poses, distance, x, (0.0, 0.0))
+    return Rendered(
+        images=(wide,) * POSES,
+        images_pushed=(255 - wide,) * POSES,
+        camera=camera,
+        base_from_gripper=poses,
+        distance=distance,
+        gripper_from_camera=x,
+        white=(0.0, 0.0),
+    )
 
 
 def test_a_camera_sees_its_part_of_the_wide_image_and_a_fault_of_it_another():
     one = scene()
     assert np.array_equal(one.seen(0, lambda px: px), one.images[0][120:600, 160:800])
-    view = make.View(0, IMAGES, one.camera, 0.5, np.zeros(2))
+    view = make.View(number=0, count=IMAGES, camera=one.camera, far=0.5, random=np.zeros(2))
 
     def red_at_edge(optics: make.Optics) -> float:
         """Column of the wide image that is seen at the right edge of the middle row."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.attack import calibrated, outcome, reconstructed
+from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import bent_problem
 from benchmarks.simulated.faults import LENS, Faults, faulty_capture
 from benchmarks.simulated.observations import LENS as OBSERVED_BY
@@ -25,7 +26,6 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.handeye.systematic import systematic_errors
 from jcr.records import BENT, Capture, Finding, Kind, Reconstruction
 from jcr.records.words import sentence
-from jcr.simulate.robots import PresetName
 
 pytestmark = pytest.mark.slow
 

@@ -20,7 +20,7 @@ from jcr.capture.depth_images import read_depth
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_track import NEVER, pose_track
-from jcr.capture.ros_image import depth_of, picture_of
+from jcr.capture.ros_image import depth_of, image_of
 from jcr.files import write_bytes
 from jcr.geometry import rotation_exp, transform
 from jcr.records import Capture, CellCamera
@@ -354,7 +354,7 @@ def test_colours_of_raw_images(encoding: str):
     message = Message()
     fields = {"encoding": encoding, "height": height, "width": width, "step": 64, "data": padded.ravel()}
     vars(message).update(fields)
-    pixels, ending = picture_of(message, "bag")
+    pixels, ending = image_of(message, "bag")
     assert ending == ".png" and isinstance(pixels, np.ndarray)
     if encoding == "mono8":
         assert (pixels == 200).all()
@@ -363,7 +363,7 @@ def test_colours_of_raw_images(encoding: str):
     assert np.abs(pixels[6, 2:-2].mean(0) - [0, 0, 200]).max() < 20
     vars(message).update(encoding="16UC1")
     with pytest.raises(jcr.InputError, match="encoding '16UC1' is no colour image"):
-        picture_of(message, "bag")
+        image_of(message, "bag")
 
 
 @pytest.mark.slow
@@ -392,8 +392,8 @@ def test_images_that_are_listed_and_not_there_are_refused_in_one_line(tmp_path: 
                 base_from_gripper=poses,
                 speed=np.zeros(30),
                 gap_ns=np.zeros(30, int),
-                pictures=lambda rows: ((row, picture, ".png") for row in rows.tolist()[::2]),
-                lens_of_size=lambda size: None,
+                images_of_rows=lambda rows: ((row, picture, ".png") for row in rows.tolist()[::2]),
+                intrinsics_of_size=lambda size: None,
             ),
             tmp_path / "out",
             lambda stage, share: None,

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import jcr
-from jcr.capture import camera_info, capture_json, colmap_model, lens_json
+from jcr.capture import camera_info, camera_json, capture_json, colmap_model
 from jcr.export import ros
 from jcr.intrinsics_json import IntrinsicsAndStd
 from jcr.records import Intrinsics
@@ -25,7 +25,9 @@ LENSES = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1,
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_lens_survives_capture_json_camera_info_and_calibration_json(lens: Intrinsics, tmp_path: Path):
-    read = lens_json.read_lens(json.loads(json.dumps(lens_json.lens_as_json(lens))), SIZE, tmp_path)
+    read = camera_json.read_intrinsics(
+        json.loads(json.dumps(camera_json.intrinsics_as_json(lens))), SIZE, tmp_path
+    )
     assert read == lens
     mount = ros.camera_mount(np.eye(4), np.eye(7))
     (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount, lens))
@@ -48,7 +50,7 @@ def test_a_lens_survives_colmap(lens: Intrinsics, tmp_path: Path):
     image.frame_id = 1
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     model.write_text(str(tmp_path))
-    found = colmap_model.read_lens(tmp_path, SIZE)
+    found = colmap_model.read_intrinsics(tmp_path, SIZE)
     assert found.model == lens.model and np.allclose(found.distortion, lens.distortion)
     assert np.allclose([found.fx, found.fy, found.cx, found.cy], [lens.fx, lens.fy, lens.cx, lens.cy])
 
@@ -64,7 +66,7 @@ def test_a_lens_survives_colmap(lens: Intrinsics, tmp_path: Path):
 def test_other_lenses_are_refused_by_name(model: str, count: int, words: str):
     k = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
     with pytest.raises(jcr.InputError, match=words):
-        camera_info.lens_of_ros(k, model, [0.1] * count, SIZE, SIZE, "camera_info")
+        camera_info.intrinsics_of_ros(k, model, [0.1] * count, SIZE, SIZE, "camera_info")
 
 
 def test_a_capture_names_the_models_that_there_are():
@@ -72,9 +74,11 @@ def test_a_capture_names_the_models_that_there_are():
     with pytest.raises(
         jcr.InputError, match="distortion model 'omni' is not known; give one of pinhole, rational, fisheye"
     ):
-        lens_json.read_lens(lens | {"model": "omni"}, SIZE, Path("capture.json"))
+        camera_json.read_intrinsics(lens | {"model": "omni"}, SIZE, Path("capture.json"))
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye intrinsics, k1,k2,k3,k4"):
-        lens_json.read_lens(lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json"))
+        camera_json.read_intrinsics(
+            lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json")
+        )
 
 
 def through(lens: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import jcr
 from benchmarks.simulated.surface import solid_labels
+from benchmarks.simulated.truth import read_truth
 from jcr.calibration.calibration_json import read_calibration
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
@@ -35,7 +36,6 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Intrinsics, PointCloud, Tracks
 from jcr.represent.cloud_ply import read_cloud
 from jcr.simulate.scenes import make_scene
-from jcr.simulate.truth import read_truth
 from places import ROOT
 
 if TYPE_CHECKING:
@@ -306,7 +306,14 @@ def views(tmp_path: Path) -> "PosedImages":
     tracks = Tracks(
         np.repeat(np.arange(3), 60)[inside], x_px[inside], np.tile(np.arange(60), 3)[inside], points
     )
-    return PosedImages(folder, images, poses, LENS, tracks, points)
+    return PosedImages(
+        folder=folder,
+        images=images,
+        base_from_camera=poses,
+        intrinsics=LENS,
+        tracks=tracks,
+        points_in_base=points,
+    )
 
 
 @pytest.mark.parametrize("undistorted", [False, True])
@@ -398,7 +405,15 @@ def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
         for image in images[-1]:
             write_bytes(tmp_path / image, (views.folder / views.images[0]).read_bytes())
     return [
-        PosedImages(tmp_path, of, pose, lens, nothing, np.zeros((0, 3)), beside)
+        PosedImages(
+            folder=tmp_path,
+            images=of,
+            base_from_camera=pose,
+            intrinsics=lens,
+            tracks=nothing,
+            points_in_base=np.zeros((0, 3)),
+            beside=beside,
+        )
         for of, pose, beside in zip(images, poses, (None, (0, 2)), strict=True)
     ]
 

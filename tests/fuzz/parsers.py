@@ -38,9 +38,7 @@ def main() -> None:
         (corpus / "valid").write_bytes(b'{"base_from_gripper": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}\n')
 
         def feed(data: bytes) -> None:
-            message = parsed(data)
-            if isinstance(message, dict):
-                pose_of(message)
+            pose_of(parsed(data))
     else:
         target = targets(folder / "targets")[name]
         (corpus / "valid").write_bytes(target.file.read_bytes())

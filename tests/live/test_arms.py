@@ -20,7 +20,8 @@ from jcr.camera import project
 from jcr.geometry import inverse, rotation_exp, transform
 from jcr.handeye.arms import arm_named
 from jcr.handeye.robots import forward_kinematics
-from jcr.live.camera import CameraOptions, keep_to
+from jcr.live.camera import CameraOptions
+from jcr.live.devices import keep_to
 from jcr.records import Intrinsics
 from places import ROOT
 
@@ -115,7 +116,7 @@ FILMED = """
     import numpy as np
     import pyrealsense2 as rs
     import record_realsense
-    from jcr.live.camera import opened
+    from jcr.live.devices import opened
     with opened("realsense:" + sys.argv[1]) as camera:
         frames = list(camera.frames)
     rays = [rs.rs2_deproject_pixel_to_point(record_realsense.lens(rs), x, 1.0) for x in json.loads(sys.argv[2])]

@@ -21,8 +21,9 @@ from benchmarks.simulated.ur import SimulatedUr
 from jcr.capture.images import read_image
 from jcr.live import line_server, ur
 from jcr.live.asks import Ask, pose_of_numbers
-from jcr.live.camera import Frame, opened
+from jcr.live.camera import Frame
 from jcr.live.collect import CollectOptions, collect
+from jcr.live.devices import opened
 from jcr.live.folder import LiveFolder
 from jcr.live.line_server import MAX_LINE, MOST_REFUSED, Listen, bound, served_poses
 from jcr.live.look import picture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from jcr.export.board_sheet import board_sheet
+from jcr.export.board_sheet import PAPERS_MM, board_sheet
 from jcr.reconstruct.board_in_view import board_in_view, proposed
 from jcr.records.words import sentence
 
@@ -14,11 +14,9 @@ PX_PER_MM = 5
 
 def seen(spec: str, views: int = 3) -> list[ndarray]:
     """Photographs of the printed sheet, each from another direction."""
-    sheet = board_sheet(spec)
-    width, height = (round(PX_PER_MM * side) for side in sheet.paper_mm)
-    paper = np.full((height, width), 245, np.uint8)
-    for x, y, w, h in PX_PER_MM * sheet.rectangles_mm:
-        paper[round(y) : round(y + h), round(x) : round(x + w)] = 15
+    printed = board_sheet(spec).pixels
+    width, height = (round(PX_PER_MM * side) for side in PAPERS_MM["a4"])
+    paper = np.where(np.asarray(printed.convert("L").resize((width, height))) > 127, 245, 15).astype(np.uint8)
     rng = np.random.default_rng(0)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     photographs = []

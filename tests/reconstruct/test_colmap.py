@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
+from benchmarks.simulated.truth import read_truth
 from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify, undistorted
@@ -22,7 +23,6 @@ from jcr.progress import silent
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
 from jcr.reconstruct.sfm import extract, log_level
 from jcr.records import Capture, Intrinsics, Reconstruction
-from jcr.simulate.truth import read_truth
 
 pytestmark = pytest.mark.slow
 

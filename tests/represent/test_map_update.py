@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated.truth import read_truth, true_depth
 from jcr.camera import rays, resized, undistort_image
 from jcr.capture.added import read_added, read_pose, with_images, write_added
 from jcr.capture.read import read_capture
@@ -35,7 +36,7 @@ from jcr.represent.options import CloudOptions, MapOptions
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.render import render
 from jcr.simulate.scenes import Scene, make_scene
-from jcr.simulate.truth import Truth, read_truth, true_depth
+from jcr.simulate.truth import Truth
 
 if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap

@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 
 import jcr
+from benchmarks.simulated.arm_errors import PRESETS, ArmErrors
 from benchmarks.simulated.bent import bent_problem
+from benchmarks.simulated.truth import read_truth, true_depth, true_labels
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse, rotation_angle, rotation_exp, rotation_log, transform
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import ErrorSizes, error_names, error_std, forward_kinematics
 from jcr.records import Intrinsics
-from jcr.simulate.capture import SimulateOptions, simulate, with_lens_error
+from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.robots import (
     ALL_KINDS,
-    PRESETS,
-    ArmErrors,
     BentArm,
+    about_posture,
     bend,
     effective_about,
     hand_eye_on,
@@ -27,7 +28,7 @@ from jcr.simulate.robots import (
     table_center,
     views,
 )
-from jcr.simulate.truth import read_truth, true_depth, true_labels
+from jcr.simulate.taken import with_lens_error
 
 
 def only(arm, name: str, value: float) -> BentArm:
@@ -54,6 +55,13 @@ def test_every_arm_sees_its_table_from_varied_sides(name):
     # Relative rotations about all axes: what a hand-eye calibration lives on.
     turns = rotation_log(cameras[:1, :3, :3].swapaxes(1, 2) @ cameras[1:, :3, :3])
     assert np.linalg.svd(turns, compute_uv=False)[2] / np.sqrt(len(turns)) > np.radians(5)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_every_arm_moves_about_a_posture(name):
+    arm = arm_named(name)
+    joints = about_posture(arm, arm.rest, 5, np.random.default_rng(0))
+    assert joints.shape == (5, arm.dof) and 0.0 < np.abs(joints - arm.rest).max() < 0.85
 
 
 def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():

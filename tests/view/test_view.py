@@ -15,11 +15,12 @@ import pytest
 from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulated.truth import read_truth
 from chromium import Chromium
 from jcr.camera import project
 from jcr.errors import InputError
 from jcr.geometry import apply, inverse
-from jcr.simulate.truth import Truth, read_truth
+from jcr.simulate.truth import Truth
 from jcr.view.robot import read_joints, read_urdf, solve_joints
 from waiting import until
 
@@ -134,9 +135,9 @@ def test_click_finds_the_first_point_and_says_what_is_there(viewer: "Viewer", tr
 def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
     viewer.image.value, viewer.photo.value = 3, 40
     viewer.choose_image()
-    camera, photo, lens = viewer._camera_of_image(), viewer._photo, viewer.run.lens
+    camera, photo, lens = viewer._camera_of_image(), viewer._photo, viewer.run.intrinsics
     assert camera is not None and photo.visible and photo.image.shape[2] == 4
-    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.run.pictures[camera]).all()
+    assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.run.pixels[camera]).all()
     half = np.array([photo.render_width, photo.render_height]) / 2
     axes = Rotation.from_quat(np.asarray(photo.wxyz)[[1, 2, 3, 0]]).as_matrix()
     for sign in ((-1, -1), (1, 1)):

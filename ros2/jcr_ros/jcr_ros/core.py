@@ -15,9 +15,9 @@ import numpy as np
 from numpy import ndarray
 
 import jcr
-from jcr.capture.camera_info import lens_of_ros
-from jcr.capture.lens_json import lens_as_json
-from jcr.capture.ros_image import picture_of
+from jcr.capture.camera_info import intrinsics_of_ros
+from jcr.capture.camera_json import intrinsics_as_json
+from jcr.capture.ros_image import image_of
 from jcr.errors import InputError
 from jcr.export.ros import CameraMount, camera_mount
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
@@ -103,7 +103,7 @@ class Session:
         """A sensor_msgs/Image or CompressedImage."""
         import cv2
 
-        pixels, _ = picture_of(message, "image")
+        pixels, _ = image_of(message, "image")
         if isinstance(pixels, bytes):
             pixels = cv2.cvtColor(
                 cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB
@@ -113,11 +113,11 @@ class Session:
     def camera_info(self, message: Any) -> None:
         """A sensor_msgs/CameraInfo; refused in words where jcr does not know its intrinsics."""
         size = (message.width, message.height)
-        lens = lens_of_ros(
+        lens = intrinsics_of_ros(
             list(message.k), message.distortion_model, list(message.d), size, size, "camera_info"
         )
         if lens is not None:
-            self.lens = lens_as_json(lens)
+            self.lens = intrinsics_as_json(lens)
 
     def start(self) -> None:
         """Begin to take samples, in a thread of its own."""

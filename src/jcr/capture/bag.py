@@ -10,14 +10,20 @@ import numpy as np
 from jaxtyping import Float, Int, UInt16
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jcr.capture.camera_info import lens_of_ros, read_camera_info
+from jcr.capture.camera_info import intrinsics_of_ros, read_camera_info
 from jcr.capture.joints import JointTrack, read_arm
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import first_fault, read_yaml
 from jcr.capture.pose_track import PosesAt, speed
-from jcr.capture.recorded_cameras import Lens, Pictures, RecordedCamera, asked_cameras, camera_names
+from jcr.capture.recorded_cameras import (
+    ImagesOfRows,
+    IntrinsicsOfSize,
+    RecordedCamera,
+    asked_cameras,
+    camera_names,
+)
 from jcr.capture.recording import Recording, capture_of_recording
-from jcr.capture.ros_image import depth_of, picture_of
+from jcr.capture.ros_image import depth_of, image_of
 from jcr.capture.tf_tree import TfTree
 from jcr.errors import InputError
 from jcr.extras import extra
@@ -40,7 +46,7 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capture:
-    """The best frames of a bag in the folder `into`; the bag is streamed, never held.
+    """The best frames of a bag in the folder `into`; the bag is streamed and never in memory whole.
 
     Raises InputError with the topics or frames that there are where those of the options are not, and for images
     whose poses are stale.
@@ -74,13 +80,13 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
             base_from_gripper=poses,
             speed=speed(poses_at, stamps),
             gap_ns=gap_ns,
-            pictures=frames.pictures_of(topic),
-            lens_of_size=frames.lens,
+            images_of_rows=frames.images_of(topic),
+            intrinsics_of_size=frames.intrinsics,
             joints=None if arm is None else arm.angles(stamps),
             depth_at=frames.depth_at if heard.aligned else None,
             camera_name=own,
             others=[
-                RecordedCamera(name, mount, frames.pictures_of(other), frames.lens_of(other))
+                RecordedCamera(name, mount, frames.images_of(other), frames.intrinsics_of(other))
                 for name, other in zip(further, others, strict=True)
                 if (mount := mounts[other]) is not None
             ],
@@ -125,7 +131,7 @@ class _Heard:
     recorded: dict[str, _Recorded]
     infos: dict[str, Any]
     """By camera topic the connection of its CameraInfo."""
-    lenses: dict[str, Any]
+    camera_infos: dict[str, Any]
     """By the topic of a CameraInfo its first message."""
     tree: TfTree
     joint_states: list[Any]
@@ -141,7 +147,7 @@ def _heard(
     pose_connections = _pose_connections(reader, options, path)
     wanted = [*cameras, *{info.topic: info for info in infos.values()}.values(), *pose_connections]
     _refuse_other_definitions(reader, [*wanted, *aligned], path)
-    recorded, lenses = {topic: _Recorded() for topic in topics}, dict[str, Any]()
+    recorded, camera_infos = {topic: _Recorded() for topic in topics}, dict[str, Any]()
     tree, joint_states = TfTree(), list[Any]()
     span = max(reader.end_time - reader.start_time, 1)
     for connection, at, message in _messages(reader, wanted, path):
@@ -150,7 +156,7 @@ def _heard(
         elif connection.msgtype == JOINTS:
             joint_states.append((_stamp(message, at), message.name, message.position))
         elif connection.msgtype == INFO:
-            lenses.setdefault(connection.topic, message)
+            camera_infos.setdefault(connection.topic, message)
         else:
             recorded[connection.topic].add(_stamp(message, at), at, message.header.frame_id)
             report("frames", 0.1 * (at - reader.start_time) / span)
@@ -160,7 +166,7 @@ def _heard(
         aligned=aligned,
         recorded=recorded,
         infos=infos,
-        lenses=lenses,
+        camera_infos=camera_infos,
         tree=tree,
         joint_states=joint_states,
     )
@@ -195,10 +201,10 @@ class _Frames:
     stamps: Int[np.ndarray, " n"]
     base_from_gripper: Float[np.ndarray, "n 4 4"]
 
-    def pictures_of(self, topic: str) -> Pictures:
+    def images_of(self, topic: str) -> ImagesOfRows:
         """Of a camera those that were taken where the arm was at the chosen camera's."""
 
-        def pictures(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
+        def images(rows: Int[np.ndarray, " k"]) -> Iterator[tuple[int, Any, str]]:
             of_topic = [c for c in self.heard.cameras if c.topic == topic]
             all_stamps, all_logs = self.heard.recorded[topic].sorted()
             nearest = _nearest(all_stamps, self.stamps[rows])
@@ -212,10 +218,10 @@ class _Frames:
                 at = int(all_logs[k])
                 for _, _, message in _messages(self.reader, of_topic, self.path, start=at, stop=at + 1):
                     if _stamp(message, at) == all_stamps[k]:
-                        yield row, *picture_of(message, f"{self.path}: {topic}")
+                        yield row, *image_of(message, f"{self.path}: {topic}")
                         break
 
-        return pictures
+        return images
 
     def depth_at(self, row: int) -> UInt16[np.ndarray, "h w"] | None:
         """Of the exposure nearest to the frame's; None where it has none."""
@@ -227,21 +233,23 @@ class _Frames:
                 found, off = depth_of(message, f"{self.path}: {connection.topic}"), apart
         return found
 
-    def lens_of(self, topic: str) -> Lens:
+    def intrinsics_of(self, topic: str) -> IntrinsicsOfSize:
         """By the CameraInfo that belongs to a topic."""
 
-        def lens(size: tuple[int, int]) -> Intrinsics | None:
+        def intrinsics(size: tuple[int, int]) -> Intrinsics | None:
             name = self.heard.infos[topic].topic if topic in self.heard.infos else ""
-            messages = self.heard.lenses
-            return _lens(messages[name], topic, size, f"{self.path}: {name}") if name in messages else None
+            messages = self.heard.camera_infos
+            return (
+                _intrinsics(messages[name], topic, size, f"{self.path}: {name}") if name in messages else None
+            )
 
-        return lens
+        return intrinsics
 
-    def lens(self, size: tuple[int, int]) -> Intrinsics | None:
+    def intrinsics(self, size: tuple[int, int]) -> Intrinsics | None:
         """Of the chosen camera: as asked for, else by its CameraInfo."""
         if self.options.camera_info is not None:
             return read_camera_info(self.options.camera_info, size)
-        return self.lens_of(self.topic)(size)
+        return self.intrinsics_of(self.topic)(size)
 
 
 def _with_images(
@@ -455,10 +463,10 @@ def _stamp(message: Any, log_ns: int) -> int:
     return stamp.sec * 10**9 + stamp.nanosec or log_ns
 
 
-def _lens(info: Any, topic: str, size: tuple[int, int], where: str) -> Intrinsics | None:
+def _intrinsics(info: Any, topic: str, size: tuple[int, int], where: str) -> Intrinsics | None:
     """Intrinsics of the topic's images: K and D, or P of rectified ones. ROS 1 writes these in capitals."""
     k, d, p = (list(getattr(info, name if hasattr(info, name) else name.upper())) for name in "kdp")
     calibrated = (info.width, info.height)
     if "image_rect" in topic:
-        return lens_of_ros([*p[:3], *p[4:7], *p[8:11]], "", (), calibrated, size, where)
-    return lens_of_ros(k, info.distortion_model, d, calibrated, size, where)
+        return intrinsics_of_ros([*p[:3], *p[4:7], *p[8:11]], "", (), calibrated, size, where)
+    return intrinsics_of_ros(k, info.distortion_model, d, calibrated, size, where)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jcr.capture.checks import checked_lens
+from jcr.capture.checks import checked_intrinsics
 from jcr.capture.plain_files import read_yaml, shown
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Intrinsics, LensModel
@@ -21,7 +21,7 @@ _MODELS: dict[Any, LensModel] = {
 
 
 def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
-    """The intrinsics in a camera_info YAML, for images of `size`; None where it says "not calibrated"."""
+    """The intrinsics in a camera_info YAML, for images of `size`; None of a camera not calibrated."""
     content = read_yaml(file)
     try:
         matrix, model = content["camera_matrix"]["data"], content["distortion_model"]
@@ -34,10 +34,10 @@ def read_camera_info(file: Path, size: tuple[int, int]) -> Intrinsics | None:
         ) from None
     if not isinstance(matrix, list) or not isinstance(coefficients, list):
         raise InputError(f"{file}: the camera matrix and the distortion must be lists of numbers")
-    return lens_of_ros(matrix, model, coefficients, calibrated, size, str(file))
+    return intrinsics_of_ros(matrix, model, coefficients, calibrated, size, str(file))
 
 
-def lens_of_ros(
+def intrinsics_of_ros(
     matrix: Sequence[Any],
     model: Any,
     coefficients: Sequence[Any],
@@ -73,4 +73,4 @@ def lens_of_ros(
         known = "pinhole"
     count = len(COEFFICIENTS[known])
     padded = [*coefficients[:count], *[0.0] * (count - len(coefficients))]
-    return checked_lens(focal_and_centre, padded, size, where, known)
+    return checked_intrinsics(focal_and_centre, padded, size, where, known)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics, read_std, std_as_json
 from jcr.capture.cell_cameras import cameras_as_json, with_cameras
 from jcr.capture.checks import checked_capture, first_few, read_rigid, require_frames, require_images
 from jcr.capture.depth_images import depth_of_frames
-from jcr.capture.lens_json import lens_as_json, read_lens, read_std, std_as_json
 from jcr.capture.options import MAX_FRAMES, ReadOptions
 from jcr.capture.plain_files import contained, read_json, shown
 from jcr.capture.robot_poses import CONVENTIONS
@@ -24,7 +24,7 @@ from jcr.records import Capture
 FILE, URDF = "capture.json", "robot.urdf"
 MAX_BYTES = 32_000_000
 """More takes long to read, and is no capture."""
-MOST_TURNS = 6 * np.pi + 0.01
+MOST_ROTATION = 6 * np.pi + 0.01
 """rad: no joint rotates farther to either side."""
 
 
@@ -59,13 +59,13 @@ def read(path: Path, options: ReadOptions | None = None) -> Capture:
     capture = checked_capture(folder, images, np.reshape(poses, (-1, 4, 4)), str(file))
     joints = _joints(frames, images, file)
     robot, notes = _robot(content.get("robot"), joints, file)
-    lens = read_lens(content.get("intrinsics"), capture.image_size, file)
+    intrinsics = read_intrinsics(content.get("intrinsics"), capture.image_size, file)
     convention = content.get("pose_convention")
     capture = replace(
         capture,
         pose_convention=convention if isinstance(convention, str) and convention in CONVENTIONS else None,
-        intrinsics=lens,
-        intrinsics_std=read_std(content.get("intrinsics_std"), lens, file),
+        intrinsics=intrinsics,
+        intrinsics_std=read_std(content.get("intrinsics_std"), intrinsics, file),
         notes=notes,
         joints=joints,
         robot=robot,
@@ -93,8 +93,8 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
         if capture.urdf.resolve() != (folder / URDF).resolve():
             write_bytes(folder / URDF, capture.urdf.read_bytes())
         arm["urdf"] = URDF
-    lens = None if capture.intrinsics is None else lens_as_json(capture.intrinsics)
-    stated: dict[str, Any] = {"frames": frames, "intrinsics": lens}
+    intrinsics = None if capture.intrinsics is None else intrinsics_as_json(capture.intrinsics)
+    stated: dict[str, Any] = {"frames": frames, "intrinsics": intrinsics}
     if capture.intrinsics_std is not None:
         stated["intrinsics_std"] = std_as_json(capture.intrinsics_std)
     if capture.pose_convention is not None:
@@ -152,7 +152,7 @@ def read_joints(value: Any, where: str) -> Float[ndarray, " dof"]:
         raise InputError(f"{where}: not numbers; write a list of angles in radians") from None
     if row.ndim != 1 or len(row) == 0 or not np.isfinite(row).all():
         raise InputError(f"{where}: must be a list of finite angles in radians")
-    if np.abs(row).max() > MOST_TURNS:
+    if np.abs(row).max() > MOST_ROTATION:
         raise InputError(f"{where}: up to {np.abs(row).max():.4g} rad; these look like degrees: convert them")
     return row
 

@@ -2,7 +2,7 @@
 
 A camera bolted to the gripper or watching it has one image for each frame, or null; a fixed one that sees the scene
 has any number; one on another arm has frames of its own. The entry without images names the camera of the capture's
-own frames and says what it is bolted to.
+own frames and what it is bolted to.
 """
 
 import re
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.capture.camera_json import intrinsics_as_json, read_intrinsics_of_size, read_std, std_as_json
 from jcr.capture.checks import first_few, image_sizes, read_rigid, require_images
-from jcr.capture.lens_json import lens_as_json, read_lens_of_these, read_std, std_as_json
 from jcr.capture.plain_files import shown
 from jcr.errors import InputError
 from jcr.records import Capture, CellCamera, Mount
@@ -27,7 +27,7 @@ MOUNTS: tuple[Mount, ...] = ("gripper", "base")
 
 
 def with_cameras(capture: Capture, cameras: Any, file: Path) -> Capture:
-    """The capture with what "cameras" says; InputError where that cannot be."""
+    """The capture with the cameras of "cameras"; InputError where they cannot be."""
     if cameras is None:
         return capture
     if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
@@ -109,14 +109,14 @@ def _camera(name: str, camera: dict[str, Any], capture: Capture, where: str) -> 
             f"{where}: {images[k]} has {sizes[k][0]}x{sizes[k][1]} pixels, {images[0]} {sizes[0][0]}x{sizes[0][1]}; "
             "all images of a camera must have one size"
         )
-    lens = read_lens_of_these(camera.get("intrinsics"), sizes[0], where)
-    std = read_std(camera.get("intrinsics_std"), lens, where)
+    intrinsics = read_intrinsics_of_size(camera.get("intrinsics"), sizes[0], where)
+    std = read_std(camera.get("intrinsics_std"), intrinsics, where)
     return CellCamera(
         name,
         camera["mount"],
         tuple(images),
         sizes[0],
-        lens,
+        intrinsics,
         std,
         frame=frame,
         arm=None if arm is None else str(arm),
@@ -160,7 +160,7 @@ def cameras_as_json(capture: Capture) -> dict[str, Any]:
             ]
         else:
             entry["images"] = _listed(camera, len(capture))
-        entry["intrinsics"] = None if camera.intrinsics is None else lens_as_json(camera.intrinsics)
+        entry["intrinsics"] = None if camera.intrinsics is None else intrinsics_as_json(camera.intrinsics)
         if camera.intrinsics_std is not None:
             entry["intrinsics_std"] = std_as_json(camera.intrinsics_std)
         out[camera.name] = entry

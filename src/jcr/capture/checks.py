@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.capture.images import TURNED, how_stored, read_image
+from jcr.capture.images import ROTATED, how_stored, read_image
 from jcr.capture.options import MAX_FRAMES, MIN_FRAMES
 from jcr.capture.plain_files import LONGEST, contained
 from jcr.capture.robot_poses import likely_unit
@@ -20,7 +20,7 @@ from jcr.geometry import require_rigid, step_between
 from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
 
 NAMED = 10
-"""Images that a message names; of more it says how many."""
+"""Images that a message names; of more it gives the number."""
 MIRRORED = (2, 4, 5, 7)
 SAME_POSE = (0.5e-3, np.radians(0.05))
 """m, rad: within this, poses are one at which the arm rests."""
@@ -92,7 +92,7 @@ def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> No
         )
 
 
-def checked_lens(
+def checked_intrinsics(
     focal_and_centre: Sequence[Any],
     distortion: Sequence[Any],
     size: tuple[int, int],
@@ -185,13 +185,13 @@ def _common_orientation(folder: Path, images: Sequence[str]) -> int:
             )
     if first in MIRRORED:
         raise InputError(
-            f"{folder / images[0]}: EXIF orientation {first}: {TURNED[first]}, and no camera sees a mirrored world; "
+            f"{folder / images[0]}: EXIF orientation {first}: {ROTATED[first]}, and no camera sees a mirrored world; "
             "remove the tag (exiftool -Orientation= FILES)"
         )
     return first
 
 
-def how_turned(capture: Capture) -> Finding | None:
+def how_rotated(capture: Capture) -> Finding | None:
     """What a user must know of a capture whose images are rotated to be shown."""
     if capture.orientation == 1:
         return None
@@ -199,7 +199,7 @@ def how_turned(capture: Capture) -> Finding | None:
         kind=Kind.IMAGES_ROTATED,
         severity="warns",
         value=float(capture.orientation),
-        details={"rotated": TURNED[capture.orientation]},
+        details={"rotated": ROTATED[capture.orientation]},
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_lens
+from jcr.capture.checks import checked_intrinsics
 from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
@@ -67,7 +67,7 @@ def _cameras(folder: Path, root: Path) -> list[ModelCamera]:
     if one_each([len(images) for images in of_camera.values()]) and all(map(_is_ref, images)):
         # COLMAP without --ImageReader.single_camera: they must be alike.
         first = model.camera(images[0].camera_id)
-        read_lens(folder, (first.width, first.height))
+        read_intrinsics(folder, (first.width, first.height))
         of_camera = {images[0].camera_id: images}
 
     def rank(number: int) -> tuple[bool, int, int]:
@@ -85,11 +85,11 @@ def _cameras(folder: Path, root: Path) -> list[ModelCamera]:
         name = parents.pop() if len(parents) == 1 else ""
         out.append(
             ModelCamera(
-                name or f"camera_{number}",
-                tuple(located),
-                np.stack([pose_of[image.name] for image in images]),
-                tuple(image.frame_id for image in images),
-                partial(_lens, model.camera(number), folder),
+                name=name or f"camera_{number}",
+                images=tuple(located),
+                recon_from_camera=np.stack([pose_of[image.name] for image in images]),
+                moment=tuple(image.frame_id for image in images),
+                intrinsics_of_size=partial(_intrinsics, model.camera(number), folder),
             )
         )
     return out
@@ -161,7 +161,7 @@ def _posed(model: "pycolmap.Reconstruction", folder: Path) -> tuple[list[str], F
     return [image.name for image in images], inverse(np.stack(camera_from_recon))
 
 
-def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
+def read_intrinsics(folder: Path, size: tuple[int, int]) -> Intrinsics:
     """The one set of intrinsics of all images, of the given size; InputError when there are several, or a strange
     one."""
     found = read_model(folder)
@@ -173,10 +173,10 @@ def read_lens(folder: Path, size: tuple[int, int]) -> Intrinsics:
         raise InputError(
             f"{folder}: {len(kinds)} different cameras; reconstruct with a single camera (--ImageReader.single_camera)"
         )
-    return _lens(cameras[0], folder, size)
+    return _intrinsics(cameras[0], folder, size)
 
 
-def _lens(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Intrinsics:
+def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Intrinsics:
     name, width, height, params = camera.model.name, camera.width, camera.height, [*map(float, camera.params)]
     if name not in _COEFFICIENTS:
         raise InputError(
@@ -193,4 +193,4 @@ def _lens(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) -> Int
     value = dict(zip(wanted, rest, strict=True))
     model: LensModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
     distortion = [value.get(key, 0.0) for key in COEFFICIENTS[model]]
-    return checked_lens([*focals, *centre], distortion, size, str(folder), model)
+    return checked_intrinsics([*focals, *centre], distortion, size, str(folder), model)

@@ -47,16 +47,14 @@ def depth_of_frames(frames: Sequence[dict[str, object]], folder: Path, where: st
     names = [frame.get("depth") for frame in frames]
     if all(name is None for name in names):
         return None
-    kept: list[str | None] = []
     for i, name in enumerate(names):
-        if name is not None and not isinstance(name, str):
+        if name is None:
+            continue
+        if not isinstance(name, str):
             raise InputError(f"{where}: depth of frame {i} is {shown(name)}; give the image's path as text")
-        if name is not None:
-            contained(folder, name, f"{where}: depth of frame {i}")
-            if not (folder / name).is_file():
-                raise InputError(f"{where}: depth image {name} is not there; add it, or remove the key")
-        kept.append(name)
-    return tuple(kept)
+        if not contained(folder, name, f"{where}: depth of frame {i}").is_file():
+            raise InputError(f"{where}: depth image {name} is not there; add it, or remove the key")
+    return tuple(None if name is None else str(name) for name in names)
 
 
 def depth_beside(folder: Path, images: Sequence[str]) -> Names | None:

@@ -22,7 +22,7 @@ BLURRED = 0.25
 """Share of the usual sharpness below which an image is called blurred."""
 ORIENTATION = 0x0112
 """The EXIF tag."""
-TURNED = {
+ROTATED = {
     2: "mirrored",
     3: "rotated by 180°",
     4: "mirrored and rotated by 180°",
@@ -33,7 +33,7 @@ TURNED = {
 }
 """What is done to show an image of that orientation (EXIF 2.32, tag 274)."""
 PNG_DEPTH = 24
-"""Byte of a PNG's header that says how many bits a sample has."""
+"""Byte of a PNG's header with the bits of a sample."""
 BITS_PER_SAMPLE = 258
 """The TIFF tag."""
 DEFECTIVE = 10_000
@@ -60,10 +60,10 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
             warnings.simplefilter("ignore")
             with Image.open(path) as opened:
                 _refuse_size(path, opened.size)
-                # Phones write MPO: a JPEG with previews behind it, whose first picture is the photograph.
-                pictures = getattr(opened, "n_frames", 1)
-                if opened.format != "MPO" and pictures > 1:
-                    raise InputError(f"{path}: holds {pictures} images; save one as PNG or JPEG")
+                # Phones write MPO: a JPEG with previews behind it, whose first image is the photograph.
+                count = getattr(opened, "n_frames", 1)
+                if opened.format != "MPO" and count > 1:
+                    raise InputError(f"{path}: holds {count} images; save one as PNG or JPEG")
                 opened.load()
                 if (deep := _sixteen_bit(path, opened)) is not None:
                     eight = np.minimum(deep >> (_bits(deep) - 8), 255)
@@ -84,7 +84,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w 3"]:
 def _sixteen_bit(path: Path, opened: Image.Image) -> UInt16[ndarray, "h w *rgb"] | None:
     """Pixels of an image of 16 bits, grey or RGB; None of any other. Pillow keeps the upper eight of coloured ones.
 
-    Raises InputError for fractions and for more than 16 bits: what is black and what is white there, no file says.
+    Raises InputError for fractions and for more than 16 bits: which values are black and white is not in the file.
     """
     if opened.mode == "F":
         raise InputError(f"{path}: pixels that are fractions; save it with 8 or 16 bits")
@@ -113,7 +113,7 @@ def _depth(path: Path, opened: Image.Image) -> int:
 def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
     """Bits that an image of 16 uses: sensors of 8, 10, 12 or 14 fill the lower ones, and black is what they show.
 
-    Single defective pixels, which may say anything, do not count.
+    Single defective pixels, which may have any value, do not count.
     """
     rank = -2 - deep.size // DEFECTIVE
     largest = int(np.partition(deep, rank, axis=None)[rank])
@@ -122,7 +122,7 @@ def _bits(deep: UInt16[ndarray, "h w *rgb"]) -> int:
 
 @dataclass(frozen=True)
 class HowStored:
-    """What a file says of its pixels beside what they show."""
+    """How a file stores its pixels."""
 
     orientation: int
     """EXIF: 1 as the sensor has it; others are rotated, or mirrored, to be shown."""
@@ -137,7 +137,7 @@ def how_stored(path: Path) -> HowStored:
         with Image.open(path) as opened:
             orientation = opened.getexif().get(ORIENTATION, 1)
             deep = _sixteen_bit(path, opened)
-    known = orientation if isinstance(orientation, int) and orientation in TURNED else 1
+    known = orientation if isinstance(orientation, int) and orientation in ROTATED else 1
     return HowStored(known, 8 if deep is None else _bits(deep))
 
 
@@ -196,7 +196,7 @@ def exposure_fault(brightness: float) -> str | None:
 
 
 def encode_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"]) -> bytes:
-    """A PNG of grey (h,w) or RGB (h,w,3) pixels, without loss; not compressed where `deflate` says it is not safe."""
+    """A PNG of grey (h,w) or RGB (h,w,3) pixels, without loss; not compressed where that is not safe (`deflate`)."""
     if not deflate.WORKS:
         return _uncompressed_png(pixels)
     bgr = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
@@ -224,9 +224,9 @@ def _uncompressed_png(pixels: UInt8[ndarray, "h w *rgb"] | UInt16[ndarray, "h w"
     )
 
 
-def sharpness(picture: bytes | UInt8[ndarray, "h w 3"]) -> float:
+def sharpness(image: bytes | UInt8[ndarray, "h w 3"]) -> float:
     """The same variance of RGB pixels or of an encoded file; none of a file that cannot be decoded."""
-    if not isinstance(picture, bytes):
-        return brightness_and_sharpness(picture)[1]
-    bgr = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    if not isinstance(image, bytes):
+        return brightness_and_sharpness(image)[1]
+    bgr = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     return 0.0 if bgr is None else brightness_and_sharpness(np.asarray(bgr[..., ::-1], dtype=np.uint8))[1]

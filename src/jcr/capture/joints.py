@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import yourdfpy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arm:
     """A chain of links from the robot's base to its gripper."""
 
@@ -72,8 +72,8 @@ def read_arm(options: ReadOptions) -> Arm:
     base = str(options.base_frame or urdf.base_link)
     for option, link in (("--base-frame", base), ("--gripper-frame", options.gripper_frame)):
         if link not in urdf.link_map:
-            said = "is not given" if link is None else f"{link} is not in it"
-            raise InputError(f"{file}: {option} {said}; its links are {', '.join(urdf.link_map)}")
+            given = "is not given" if link is None else f"{link} is not in it"
+            raise InputError(f"{file}: {option} {given}; its links are {', '.join(urdf.link_map)}")
     gripper = link = str(options.gripper_frame)
     chain = []
     while link != base and link in by_child:
@@ -93,7 +93,7 @@ def read_arm(options: ReadOptions) -> Arm:
     angle = np.radians(1.0) if options.pose_units.endswith("deg") else 1.0
     length = 1e-3 if options.pose_units.startswith("mm") else 1.0
     unit = [length if urdf.joint_map[name].type == "prismatic" else angle for name in names]
-    return Arm(urdf, base, gripper, tuple(names), np.array(unit))
+    return Arm(urdf=urdf, base=base, gripper=gripper, joints=tuple(names), unit=np.array(unit))
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from numpy import ndarray
 
 from jcr.capture.camera_info import read_camera_info
 from jcr.capture.joints import read_arm
-from jcr.capture.lerobot_files import Episode, Feature, pictures_in_table, read_episode, read_info
+from jcr.capture.lerobot_files import Episode, Feature, images_in_table, read_episode, read_info
 from jcr.capture.options import ReadOptions
 from jcr.capture.pose_table import poses_of_columns
 from jcr.capture.pose_track import pose_track, speed
-from jcr.capture.recorded_cameras import Pictures, RecordedCamera, asked_cameras, camera_names
+from jcr.capture.recorded_cameras import ImagesOfRows, RecordedCamera, asked_cameras, camera_names
 from jcr.capture.recording import Recording, capture_of_recording
 from jcr.capture.robot_poses import CONVENTIONS
 from jcr.capture.video import frames_at
@@ -55,7 +55,7 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
                 f"fixed camera, {other}=gripper for one on the gripper"
             )
         theirs = [read_episode(path, info, other, key, index) for index in options.episode]
-        others.append(RecordedCamera(name, mount, _pictures(theirs, other, info.fps), lambda _: None))
+        others.append(RecordedCamera(name, mount, _images_of(theirs, other, info.fps), lambda _: None))
     recording = Recording(
         source=path,
         options=options,
@@ -63,8 +63,8 @@ def read(path: Path, options: ReadOptions, into: Path, report: Progress) -> Capt
         base_from_gripper=poses,
         speed=motion,
         gap_ns=np.zeros(len(state), np.int64),  # a row is one instant
-        pictures=_pictures(episodes, camera, info.fps),
-        lens_of_size=lambda size: (
+        images_of_rows=_images_of(episodes, camera, info.fps),
+        intrinsics_of_size=lambda size: (
             None if options.camera_info is None else read_camera_info(options.camera_info, size)
         ),
         joints=joints,
@@ -80,16 +80,16 @@ def _rows(episodes: list[Episode]) -> list[Int[ndarray, " k"]]:
     return np.split(np.arange(ends[-1]), ends[:-1])
 
 
-def _pictures(episodes: list[Episode], key: str, fps: float) -> Pictures:
+def _images_of(episodes: list[Episode], key: str, fps: float) -> ImagesOfRows:
     """Of the camera of a key."""
 
-    def pictures(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
+    def images(rows: Int[ndarray, " k"]) -> Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]:
         for episode, part in zip(episodes, _rows(episodes), strict=True):
             mine = rows[np.isin(rows, part)]
             if len(mine) == 0:
                 continue
             if episode.video is None:
-                files = pictures_in_table(episode, key, mine - part[0])
+                files = images_in_table(episode, key, mine - part[0])
                 for row, file in zip(mine.tolist(), files, strict=True):
                     yield row, file, ".jpg" if file.startswith(b"\xff\xd8") else ".png"
                 continue
@@ -98,7 +98,7 @@ def _pictures(episodes: list[Episode], key: str, fps: float) -> Pictures:
             for row, rgb in zip(mine.tolist(), frames, strict=True):
                 yield row, rgb, ".png"
 
-    return pictures
+    return images
 
 
 def _camera(features: dict[str, Feature], options: ReadOptions, asked: list[str], path: Path) -> str:

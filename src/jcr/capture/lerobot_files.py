@@ -78,7 +78,7 @@ def read_info(path: Path) -> Info:
         raise InputError(f"{file}: {first_fault(error)}; correct it there or download it again") from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Episode:
     """One recording of the set: its rows, and where its images are."""
 
@@ -93,46 +93,46 @@ class Episode:
 
 def read_episode(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
     """Episode `index` with the state and the camera of those keys; InputError when it is not there or damaged."""
-    return (_episode_v3 if info.codebase_version.startswith("v3") else _episode_v2)(
-        path, info, camera, key, index
-    )
+    is_v3 = info.codebase_version.startswith("v3")
+    table, video, start_s = (_files_v3 if is_v3 else _files_v2)(path, info, camera, index)
+    time_s, state = _rows(table, key, index if is_v3 else None)
+    return Episode(index=index, time_s=time_s, state=state, table=table, video=video, video_start_s=start_s)
 
 
-def _episode_v2(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """v2.1: a table and a video per episode."""
+def _files_v2(path: Path, info: Info, camera: str, index: int) -> tuple[Path, Path | None, float]:
+    """v2.1: a table and a video per episode; with the time (s) at which it begins in the video."""
     total = index + 1 if info.total_episodes is None else info.total_episodes
     if not 0 <= index < total:
         raise InputError(f"{path}: no episode {index}; there are {total}, counted from 0")
     chunk = index // info.chunks_size
     fields = {"episode_chunk": chunk, "episode_index": index, "video_key": camera}
-    data = _file(path, info.data_path, fields)
     video = _file(path, info.video_path, fields) if _is_video(info, camera) else None
-    return Episode(index, *_rows(data, key), data, video, 0.0)
+    return _file(path, info.data_path, fields), video, 0.0
 
 
-def _episode_v3(path: Path, info: Info, camera: str, key: str, index: int) -> Episode:
-    """v3.0: many episodes in one table and one video; meta/episodes says where."""
+def _files_v3(path: Path, info: Info, camera: str, index: int) -> tuple[Path, Path | None, float]:
+    """v3.0: likewise, where one table and one video have many episodes; meta/episodes lists them."""
     parquet = extra("pyarrow.parquet", "lerobot", "a LeRobot data set")
     columns = ["episode_index", "data/chunk_index", "data/file_index"]
     if _is_video(info, camera):
         columns += [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
     found = 0
     for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
-        table = _table(parquet, file, columns)
-        found += len(table["episode_index"])
-        if index in table["episode_index"]:
-            row = table["episode_index"].index(index)
-            chunk, number, *of_video = (table[name][row] for name in columns[1:])
-            data = _file(path, info.data_path, {"chunk_index": chunk, "file_index": number})
-            video, start = None, 0.0
-            if of_video:
-                fields = {"video_key": camera, "chunk_index": of_video[0], "file_index": of_video[1]}
-                video, start = _file(path, info.video_path, fields), float(of_video[2])
-            return Episode(index, *_rows(data, key, index), data, video, start)
+        listed = _table(parquet, file, columns)
+        found += len(listed["episode_index"])
+        if index not in listed["episode_index"]:
+            continue
+        row = listed["episode_index"].index(index)
+        chunk, number, *of_video = (listed[name][row] for name in columns[1:])
+        table = _file(path, info.data_path, {"chunk_index": chunk, "file_index": number})
+        if not of_video:
+            return table, None, 0.0
+        fields = {"video_key": camera, "chunk_index": of_video[0], "file_index": of_video[1]}
+        return table, _file(path, info.video_path, fields), float(of_video[2])
     raise InputError(f"{path}: no episode {index}; meta/episodes knows {found}, counted from 0")
 
 
-def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
+def images_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -> Iterator[bytes]:
     """The image files of ascending rows of an episode that has them in its table, read a few rows at a time.
 
     Raises InputError where one cannot be read or is not in the table.
@@ -142,11 +142,11 @@ def pictures_in_table(episode: Episode, camera: str, rows: Int[ndarray, " k"]) -
     try:
         with parquet.ParquetFile(episode.table) as file:
             for batch in file.iter_batches(32, columns=["episode_index", camera]):
-                for index, picture in zip(batch["episode_index"].to_pylist(), batch[camera], strict=True):
+                for index, image in zip(batch["episode_index"].to_pylist(), batch[camera], strict=True):
                     if index != episode.index:
                         continue
                     if row in wanted:
-                        file_of_row = picture["bytes"].as_py()
+                        file_of_row = image["bytes"].as_py()
                         if not file_of_row:
                             raise InputError(
                                 f"{episode.table}: holds no {camera} of frame {row}; write the data set again with "

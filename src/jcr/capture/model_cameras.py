@@ -24,7 +24,7 @@ ONE_PLACE = (0.02, np.radians(1.0))
 """Of the model's extent, and rad: images of one fixed camera differ by less."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelCamera:
     """One camera of a model and its images."""
 
@@ -34,7 +34,7 @@ class ModelCamera:
     recon_from_camera: Float[ndarray, "k 4 4"]
     moment: tuple[int, ...]
     """Of each image; the same number where cameras of a rig were triggered together."""
-    lens_of_size: Callable[[tuple[int, int]], Intrinsics]
+    intrinsics_of_size: Callable[[tuple[int, int]], Intrinsics]
 
 
 def capture_of_cameras(
@@ -70,7 +70,7 @@ def capture_of_cameras(
                 others.append(other)
         return replace(
             capture,
-            intrinsics=own.lens_of_size(capture.image_size),
+            intrinsics=own.intrinsics_of_size(capture.image_size),
             source=model,
             cameras=model,
             notes=(*notes, *left_out),
@@ -104,4 +104,4 @@ def _other(
     (size,) = sizes
     frame = np.array([row_of[camera.moment[k]] for k in in_rig]) if in_rig else None
     mount = "gripper" if in_rig else "base"
-    return CellCamera(name, mount, images, size, camera.lens_of_size(size), frame=frame)
+    return CellCamera(name, mount, images, size, camera.intrinsics_of_size(size), frame=frame)

@@ -12,39 +12,16 @@ MAX_FRAMES = 1000
 """More is a video: every image is compared with others, and every pose's errors with all the others'."""
 
 FormatName = Literal[
-    "auto",
-    "capture",
-    "table",
-    "industrial",
-    "moveit",
-    "easy_handeye2",
-    "transforms",
-    "colmap",
-    "bag",
-    "lerobot",
-]
+    "auto", "capture", "table", "industrial", "moveit", "easy_handeye2", "transforms", "colmap", "bag", "lerobot",
+]  # fmt: skip
 ConventionName = Literal[
-    "auto",
-    "matrix",
-    "quat-xyzw",
-    "quat-wxyz",
-    "rotation-vector",
-    "rpy",
-    "ur",
-    "franka",
-    "xarm",
-    "xarm-axis-angle",
-    "kuka",
-    "fanuc",
-    "yaskawa",
-    "abb",
-    "unitree",
-    "realman",
-]
+    "auto", "matrix", "quat-xyzw", "quat-wxyz", "rotation-vector", "rpy", "ur", "franka", "xarm", "xarm-axis-angle",
+    "kuka", "fanuc", "yaskawa", "abb", "unitree", "realman",
+]  # fmt: skip
 UnitsName = Literal["auto", "m-rad", "m-deg", "mm-rad", "mm-deg", "cm-rad", "cm-deg"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReadOptions:
     """How the capture is read; a capture.json needs none of these."""
 

@@ -17,16 +17,8 @@ from jcr.capture.table_cells import Cells, is_number, read_cells
 from jcr.errors import InputError
 
 _IMAGE = (
-    "image",
-    "image_name",
-    "image_path",
-    "file",
-    "filename",
-    "file_name",
-    "file_path",
-    "name",
-    "picture",
-)
+    "image", "image_name", "image_path", "file", "filename", "file_name", "file_path", "name", "picture",
+)  # fmt: skip
 _STAMP = ("timestamp", "stamp", "time", "t")
 _SHOWN: tuple[ConventionName, ...] = ("quat-xyzw", "rpy", "kuka", "fanuc", "abb", "matrix")
 """Conventions that the names of columns give away; rx, ry, rz may be a rotation vector or angles."""
@@ -38,7 +30,7 @@ _LATEST_NS = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class PoseTable:
-    """What a table says, row by row."""
+    """The rows of a table."""
 
     base_from_gripper: Float[ndarray, "n 4 4"]
     images: tuple[str, ...] | None
@@ -153,13 +145,13 @@ def _shown(columns: dict[str, tuple[str, ...]], where: str) -> ConventionName:
     )
 
 
-def _units(convention: str, said: frozenset[str], options: ReadOptions) -> UnitsName:
-    """Units that were asked for, or else those that the columns' names say beside those of the convention."""
-    if options.pose_units != "auto" or not said:
+def _units(convention: str, named: frozenset[str], options: ReadOptions) -> UnitsName:
+    """Units that were asked for, or else those that the names of the columns give, and for the rest the convention."""
+    if options.pose_units != "auto" or not named:
         return options.pose_units
-    form = CONVENTIONS[convention]
-    length = next((unit for unit in ("mm", "cm", "m") if unit in said), "mm" if form.millimetres else "m")
-    angle = next((unit for unit in ("deg", "rad") if unit in said), "deg" if form.degrees else "rad")
+    length, angle = CONVENTIONS[convention].units()
+    length = next((unit for unit in ("mm", "cm", "m") if unit in named), length)
+    angle = next((unit for unit in ("deg", "rad") if unit in named), angle)
     return next(units for units in get_args(UnitsName) if units == f"{length}-{angle}")
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from jcr.capture import capture_json
-from jcr.capture.checks import how_scaled, how_turned, require_frames, require_motion
+from jcr.capture.checks import how_rotated, how_scaled, require_frames, require_motion
 from jcr.capture.colmap_model import find_model
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.capture.plain_files import read_json, read_yaml
-from jcr.capture.table import find_table, pictures
+from jcr.capture.table import find_table, image_names
 from jcr.capture.table_cells import SUFFIXES
 from jcr.errors import InputError
 from jcr.geometry import inverse
@@ -102,8 +102,8 @@ def read_source(
             return found
         require_frames(len(found), str(path), at_least)
         require_motion(found.base_from_gripper, str(path))
-        turned = how_turned(found)
-        remarks = (None if turned is None else sentence(turned), how_scaled(found))
+        rotated = how_rotated(found)
+        remarks = (None if rotated is None else sentence(rotated), how_scaled(found))
         return replace(found, notes=(*found.notes, *filter(None, remarks)))
     if into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
@@ -153,7 +153,7 @@ def _of_folder(folder: Path, options: ReadOptions) -> str:
         return "table"
     if any(file.suffix in BAGS for file in folder.iterdir()):
         raise InputError(f"{folder}: holds bags; name one of them")
-    if taken := pictures(folder):
+    if taken := image_names(folder):
         raise InputError(
             f"{folder}: no capture.json and no poses.csv beside its {len(taken)} images ({taken[0]} … {taken[-1]}); "
             "add a table of gripper poses with the columns image,x,y,z,qx,qy,qz,qw (m), or name one with --poses"

@@ -17,9 +17,9 @@ from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.records import CellCamera, Intrinsics, Mount
 
-Pictures = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
+ImagesOfRows = Callable[[Int[ndarray, " k"]], Iterator[tuple[int, bytes | UInt8[ndarray, "h w 3"], str]]]
 """Frames of ascending rows, one by one: row, an encoded file's bytes or RGB pixels, and the file's ending."""
-Lens = Callable[[tuple[int, int]], Intrinsics | None]
+IntrinsicsOfSize = Callable[[tuple[int, int]], Intrinsics | None]
 """Intrinsics of images of a size."""
 OF_FIXED = 3
 """Images of a fixed camera: more show the same again, fewer may have the arm in the way."""
@@ -36,20 +36,20 @@ class RecordedCamera:
 
     name: str
     mount: Mount
-    pictures: Pictures
+    images_of_rows: ImagesOfRows
     """Of rows of the chosen camera's frames, those that it has."""
-    lens_of_size: Lens
+    intrinsics_of_size: IntrinsicsOfSize
 
 
 def asked_cameras(options: ReadOptions) -> dict[str, Mount | None]:
     """What --further-cameras names: by topic or key what carries the camera, None where the recording is to tell."""
     asked: dict[str, Mount | None] = {}
     for text in options.further_cameras:
-        key, _, said = text.partition("=")
+        key, _, given = text.partition("=")
         mount: Mount | None = None
         for known in MOUNTS:
-            mount = known if said == known else mount
-        if said and mount is None:
+            mount = known if given == known else mount
+        if given and mount is None:
             raise InputError(
                 f"--further-cameras {text}: write {key}=gripper for a camera on the gripper, {key}=base for a fixed one"
             )
@@ -70,7 +70,7 @@ def camera_names(keys: Sequence[str]) -> list[str]:
     return names
 
 
-def kept_pictures(
+def further_cameras(
     cameras: Sequence[RecordedCamera], rows: Int[ndarray, " n"], names: Sequence[str], into: Path, where: str
 ) -> tuple[CellCamera, ...]:
     """The cameras with images in the folder `into`: of one on the gripper at each of the chosen `rows` that it has, of
@@ -82,10 +82,10 @@ def kept_pictures(
         if camera.mount == "base":
             wanted = np.unique(rows[np.linspace(0, len(rows) - 1, OF_FIXED).round().astype(int)])
         images, found = [], []
-        for row, picture, ending in camera.pictures(wanted):
+        for row, image, ending in camera.images_of_rows(wanted):
             images.append(f"{FOLDER}/{camera.name}/{names[row]}{ending}")
             found.append(row)
-            write_bytes(into / images[-1], picture if isinstance(picture, bytes) else encode_png(picture))
+            write_bytes(into / images[-1], image if isinstance(image, bytes) else encode_png(image))
         if not images:
             raise InputError(
                 f"{where}: camera {camera.name} has no image of a moment at which the frames were taken; leave it out"
@@ -97,6 +97,6 @@ def kept_pictures(
             )
         (size,) = sizes
         frame = np.searchsorted(rows, found) if camera.mount == "gripper" else None
-        lens = camera.lens_of_size(size)
-        out.append(CellCamera(camera.name, camera.mount, tuple(images), size, lens, frame=frame))
+        intrinsics = camera.intrinsics_of_size(size)
+        out.append(CellCamera(camera.name, camera.mount, tuple(images), size, intrinsics, frame=frame))
     return tuple(out)

@@ -13,7 +13,7 @@ from jcr.capture.checks import checked_capture
 from jcr.capture.depth_images import FOLDER as DEPTH
 from jcr.capture.images import encode_png, sharpness
 from jcr.capture.options import ReadOptions
-from jcr.capture.recorded_cameras import Lens, Pictures, RecordedCamera, kept_pictures
+from jcr.capture.recorded_cameras import ImagesOfRows, IntrinsicsOfSize, RecordedCamera, further_cameras
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.progress import Progress
@@ -36,8 +36,8 @@ class Recording:
     """m/s, rotation counted as jcr.geometry.motion_length does."""
     gap_ns: Int[ndarray, " n"]
     """Between the two poses around each frame; 0 where none is interpolated."""
-    pictures: Pictures
-    lens_of_size: Lens
+    images_of_rows: ImagesOfRows
+    intrinsics_of_size: IntrinsicsOfSize
     joints: Float[ndarray, "n j"] | None = None
     """rad, of the arm in `options.urdf`, where they are known."""
     depth_at: Callable[[int], UInt16[ndarray, "h w"] | None] | None = None
@@ -73,11 +73,11 @@ def capture_of_recording(recording: Recording, into: Path, report: Progress) -> 
     if any(depths):
         capture = replace(capture, depths=tuple(depths))
     if recording.others:
-        further = kept_pictures(recording.others, rows, recording.names, into, source)
+        further = further_cameras(recording.others, rows, recording.names, into, source)
         capture = replace(capture, camera_name=recording.camera_name or capture.camera_name, others=further)
     return replace(
         capture,
-        intrinsics=recording.lens_of_size(capture.image_size),
+        intrinsics=recording.intrinsics_of_size(capture.image_size),
         notes=(f"{len(rows)} of {len(fresh)} frames chosen", *notes, *remarks),
     )
 
@@ -107,8 +107,8 @@ def _stale(recording: Recording) -> list[str]:
 
 def _sharpness(recording: Recording, rows: Int[ndarray, " k"], report: Progress) -> Float[ndarray, " k"]:
     values = []
-    for k, (_, picture, _) in enumerate(recording.pictures(rows)):
-        values.append(sharpness(picture))
+    for k, (_, image, _) in enumerate(recording.images_of_rows(rows)):
+        values.append(sharpness(image))
         report("frames", 0.1 + 0.7 * k / len(rows))
     if len(values) < len(rows):
         raise InputError(
@@ -123,10 +123,10 @@ def _written(
 ) -> tuple[list[str], list[str | None]]:
     """Files of the images of these rows and of their depth, None where there is none."""
     images, depths = list[str](), list[str | None]()
-    for k, (row, picture, ending) in enumerate(recording.pictures(rows)):
+    for k, (row, image, ending) in enumerate(recording.images_of_rows(rows)):
         name = recording.names[row]
         images.append(f"images/{name}{ending}")
-        write_bytes(into / images[-1], picture if isinstance(picture, bytes) else encode_png(picture))
+        write_bytes(into / images[-1], image if isinstance(image, bytes) else encode_png(image))
         depth = None if recording.depth_at is None else recording.depth_at(row)
         depths.append(None if depth is None else f"{DEPTH}/{name}.png")
         if depth is not None:

@@ -1,6 +1,5 @@
 """Poses as robots and their controllers write them: rows of numbers to transforms, and nothing of files."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,48 +23,31 @@ METRES_LIMIT = 10.0
 """No position in metres is larger, and no gripper is always within 1 cm of its base in millimetres."""
 
 
+QUATERNIONS = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+"""Notations of quaternions, and where x, y, z, w stand in each."""
+
+
 @dataclass(frozen=True)
 class Convention:
     """How one kind of controller writes a pose."""
 
     columns: tuple[str, ...]
     """Names of its numbers, in order: position first, unless it is a whole matrix."""
-    millimetres: bool = False
-    degrees: bool = False
-    rotation: Callable[[Float[ndarray, "n k"]], Float[ndarray, "n 3 3"]] | None = None
-    """Of the numbers after the position, angles in radians; None: a matrix."""
-    quaternion: bool = False
-    numbers: Callable[[Rotation], Float[ndarray, "n k"]] | None = None
-    """The way back: `rotation`'s numbers of rotations."""
+    rotation: str
+    """Notation after the position: one of QUATERNIONS, `rotvec`, or SciPy's order of Euler angles, lower case about
+    fixed axes, upper case about moving ones; `rows` or `columns` of a whole matrix."""
+    length: str = "m"
+    angle: str = "rad"
 
+    @property
+    def has_angles(self) -> bool:
+        """Whether it has angles, which have a unit."""
+        return self.rotation not in (*QUATERNIONS, "rows", "columns")
 
-def _euler(order: str) -> Callable[[Float[ndarray, "n 3"]], Float[ndarray, "n 3 3"]]:
-    """SciPy's order: lower case about fixed axes, upper case about moving ones."""
-    return lambda angles: Rotation.from_euler(order, angles).as_matrix()
-
-
-def _as_euler(order: str) -> Callable[[Rotation], Float[ndarray, "n 3"]]:
-    return lambda rotation: rotation.as_euler(order)
-
-
-def _as_quat_wxyz(rotation: Rotation) -> Float[ndarray, "n 4"]:
-    return rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
-
-
-def _as_quat_xyzw(rotation: Rotation) -> Float[ndarray, "n 4"]:
-    return rotation.as_quat(canonical=True)
-
-
-def _quat_xyzw(quat_xyzw: Float[ndarray, "n 4"]) -> Float[ndarray, "n 3 3"]:
-    return Rotation.from_quat(quat_xyzw).as_matrix()
-
-
-def _quat_wxyz(quat_wxyz: Float[ndarray, "n 4"]) -> Float[ndarray, "n 3 3"]:
-    return Rotation.from_quat(quat_wxyz[:, [1, 2, 3, 0]]).as_matrix()
-
-
-def _rotation_vector(vector: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-    return Rotation.from_rotvec(vector).as_matrix()
+    def units(self, asked: UnitsName = "auto") -> tuple[str, str]:
+        """Names of the units of positions and angles, its own or those that are asked for: ("mm", "deg")."""
+        length, _, angle = (f"{self.length}-{self.angle}" if asked == "auto" else asked).partition("-")
+        return length, angle
 
 
 _XYZ = ("x", "y", "z")
@@ -76,21 +58,21 @@ _COLUMNS = tuple(f"m{row}{column}" for column in range(4) for row in range(4))
 
 # "xyz" about fixed axes is Rz(yaw)·Ry(pitch)·Rx(roll); "ZYX" about moving ones is Rz(A)·Ry(B)·Rx(C).
 CONVENTIONS = {
-    "matrix": Convention(_ROWS),
-    "quat-xyzw": Convention(_XYZ + _XYZW, rotation=_quat_xyzw, quaternion=True, numbers=_as_quat_xyzw),
-    "quat-wxyz": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True, numbers=_as_quat_wxyz),
-    "rotation-vector": Convention(_XYZ + _VECTOR, rotation=_rotation_vector, numbers=Rotation.as_rotvec),
-    "rpy": Convention(_XYZ + _RPY, rotation=_euler("xyz"), numbers=_as_euler("xyz")),
-    "ur": Convention(_XYZ + _VECTOR, rotation=_rotation_vector, numbers=Rotation.as_rotvec),
-    "franka": Convention(_COLUMNS),
-    "xarm": Convention(_XYZ + _RPY, True, True, _euler("xyz"), numbers=_as_euler("xyz")),
-    "xarm-axis-angle": Convention(_XYZ + _VECTOR, True, True, _rotation_vector, numbers=Rotation.as_rotvec),
-    "kuka": Convention((*_XYZ, "a", "b", "c"), True, True, _euler("ZYX"), numbers=_as_euler("ZYX")),
-    "fanuc": Convention((*_XYZ, "w", "p", "r"), True, True, _euler("xyz"), numbers=_as_euler("xyz")),
-    "yaskawa": Convention(_XYZ + _VECTOR, True, True, _euler("xyz"), numbers=_as_euler("xyz")),
-    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), True, False, _quat_wxyz, True, numbers=_as_quat_wxyz),
-    "unitree": Convention(_XYZ + _RPY, rotation=_euler("xyz"), numbers=_as_euler("xyz")),
-    "realman": Convention(_XYZ + _WXYZ, rotation=_quat_wxyz, quaternion=True, numbers=_as_quat_wxyz),
+    "matrix": Convention(_ROWS, "rows"),
+    "quat-xyzw": Convention(_XYZ + _XYZW, "xyzw"),
+    "quat-wxyz": Convention(_XYZ + _WXYZ, "wxyz"),
+    "rotation-vector": Convention(_XYZ + _VECTOR, "rotvec"),
+    "rpy": Convention(_XYZ + _RPY, "xyz"),
+    "ur": Convention(_XYZ + _VECTOR, "rotvec"),
+    "franka": Convention(_COLUMNS, "columns"),
+    "xarm": Convention(_XYZ + _RPY, "xyz", "mm", "deg"),
+    "xarm-axis-angle": Convention(_XYZ + _VECTOR, "rotvec", "mm", "deg"),
+    "kuka": Convention((*_XYZ, "a", "b", "c"), "ZYX", "mm", "deg"),
+    "fanuc": Convention((*_XYZ, "w", "p", "r"), "xyz", "mm", "deg"),
+    "yaskawa": Convention(_XYZ + _VECTOR, "xyz", "mm", "deg"),
+    "abb": Convention((*_XYZ, "q1", "q2", "q3", "q4"), "wxyz", "mm"),
+    "unitree": Convention(_XYZ + _RPY, "xyz"),
+    "realman": Convention(_XYZ + _WXYZ, "wxyz"),
 }
 
 
@@ -112,10 +94,7 @@ OF_ARM = {
 def units_of(convention: str) -> str:
     """The units of a convention's numbers, for people: "m, rad", "mm, °", or "m" where no angle is among them."""
     form = CONVENTIONS[convention]
-    length = "mm" if form.millimetres else "m"
-    return (
-        length if form.rotation is None or form.quaternion else f"{length}, {'°' if form.degrees else 'rad'}"
-    )
+    return f"{form.length}, {form.angle.replace('deg', '°')}" if form.has_angles else form.length
 
 
 def numbers_from_poses(
@@ -123,15 +102,17 @@ def numbers_from_poses(
 ) -> Float[ndarray, "n k"]:
     """Rows in a convention's columns, the inverse of `poses_from_numbers`; `units` likewise."""
     form = CONVENTIONS[convention]
-    position_unit, angle_unit = _units(form, units)
-    if form.numbers is None:
-        matrices = base_from_gripper.copy()
-        matrices[:, :3, 3] /= position_unit
-        return (np.swapaxes(matrices, 1, 2) if convention == "franka" else matrices).reshape(-1, 16)
-    turn = form.numbers(Rotation.from_matrix(base_from_gripper[:, :3, :3]))
-    return np.hstack(
-        [base_from_gripper[:, :3, 3] / position_unit, turn / (1.0 if form.quaternion else angle_unit)]
-    )
+    position_unit, angle_unit = _in_metres_and_radians(form, units)
+    position = base_from_gripper[:, :3, 3] / position_unit
+    if form.rotation in ("rows", "columns"):
+        matrices = transform(base_from_gripper[:, :3, :3], position)
+        return (np.swapaxes(matrices, 1, 2) if form.rotation == "columns" else matrices).reshape(-1, 16)
+    rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
+    if form.rotation in QUATERNIONS:
+        order = np.argsort(QUATERNIONS[form.rotation])
+        return np.hstack([position, rotation.as_quat(canonical=True)[:, order]])
+    angles = rotation.as_rotvec() if form.rotation == "rotvec" else rotation.as_euler(form.rotation)
+    return np.hstack([position, angles / angle_unit])
 
 
 def poses_from_numbers(
@@ -148,38 +129,42 @@ def poses_from_numbers(
         raise InputError(
             f"{where}: pose {row + 1} holds NaN or infinity (or beyond {HUGE:.0e}); record it again or drop the row"
         )
-    position_unit, angle_unit = _units(form, units)
-    if form.rotation is None:
-        matrices = numbers.reshape(-1, 4, 4)
-        if convention == "franka":
-            matrices = np.swapaxes(matrices, 1, 2)
-        elif np.allclose(matrices[:, :, 3], [0, 0, 0, 1], atol=1e-9) and not np.allclose(
-            matrices[:, 3], [0, 0, 0, 1], atol=1e-9
-        ):
-            raise InputError(
-                f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
-                "--pose-convention franka"
-            )
-        matrices = matrices.copy()
+    position_unit, angle_unit = _in_metres_and_radians(form, units)
+    if form.rotation in ("rows", "columns"):
+        matrices = _matrices(numbers.reshape(-1, 4, 4), form, where)
         matrices[:, :3, 3] *= position_unit
         _check_position(matrices[:, :3, 3], position_unit, units, where)
         rigid = [require_rigid(matrix, f"{where}: pose {i + 1}") for i, matrix in enumerate(matrices)]
         return np.reshape(rigid, (-1, 4, 4))
-    position, turn = numbers[:, :3] * position_unit, numbers[:, 3:]
+    position, rest = numbers[:, :3] * position_unit, numbers[:, 3:]
     _check_position(position, position_unit, units, where)
-    if form.quaternion:
-        _check_quaternion(turn, where)
-    else:
-        _check_angles(turn, angle_unit, units, where)
-        turn = turn * angle_unit
-    return transform(form.rotation(turn), position)
+    if form.rotation in QUATERNIONS:
+        _check_quaternion(rest, where)
+        rotation = Rotation.from_quat(rest[:, QUATERNIONS[form.rotation]])
+        return transform(rotation.as_matrix(), position)
+    _check_angles(rest, angle_unit, units, where)
+    angles = rest * angle_unit
+    vector = form.rotation == "rotvec"
+    rotation = Rotation.from_rotvec(angles) if vector else Rotation.from_euler(form.rotation, angles)
+    return transform(rotation.as_matrix(), position)
 
 
-def _units(form: Convention, units: UnitsName) -> tuple[float, float]:
+def _matrices(numbers: Float[ndarray, "n 4 4"], form: Convention, where: str) -> Float[ndarray, "n 4 4"]:
+    """A copy by rows; InputError where numbers that should be rows are columns."""
+    if form.rotation == "columns":
+        return np.swapaxes(numbers, 1, 2).copy()
+    last = [0, 0, 0, 1]
+    if np.allclose(numbers[:, :, 3], last, atol=1e-9) and not np.allclose(numbers[:, 3], last, atol=1e-9):
+        raise InputError(
+            f"{where}: the 16 numbers of a pose are a matrix by columns, as a Franka gives them: add "
+            "--pose-convention franka"
+        )
+    return numbers.copy()
+
+
+def _in_metres_and_radians(form: Convention, units: UnitsName) -> tuple[float, float]:
     """Metres per unit of position, radians per unit of angle."""
-    length, angle = ("mm" if form.millimetres else "m", "deg" if form.degrees else "rad")
-    if units != "auto":
-        length, angle = units.split("-")
+    length, angle = form.units(units)
     return METRES[length], np.radians(1.0) if angle == "deg" else 1.0
 
 

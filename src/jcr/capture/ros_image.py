@@ -29,7 +29,7 @@ _TO_RGB = {
 }
 
 
-def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
+def image_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"], str]:
     """An encoded file's bytes as they are, or RGB pixels; and the file's ending.
 
     Raises InputError for encodings that are no image (depth) or that jcr does not know.
@@ -46,14 +46,10 @@ def picture_of(message: Any, where: str) -> tuple[bytes | UInt8[ndarray, "h w 3"
             f"{where}: encoding {encoding!r} is no colour image that jcr knows; choose another topic"
         )
     channels = _CHANNELS.get(encoding, 2 if "yu" in encoding else 1)
-    used = message.width * channels
-    if message.step < used or message.data.size < message.height * message.step:
-        raise InputError(
-            f"{where}: an image of {message.width}x{message.height} {encoding} is cut short; record again"
-        )
-    # Rows may be padded to `step` bytes.
-    rows = message.data[: message.height * message.step].reshape(message.height, message.step)[:, :used]
-    pixels = np.ascontiguousarray(rows).reshape(message.height, message.width, channels)
+    rows = _rows(
+        message, message.width * channels, f"an image of {message.width}x{message.height} {encoding}", where
+    )
+    pixels = rows.reshape(message.height, message.width, channels)
     if encoding == "rgb8":
         return pixels, ".png"
     return np.asarray(cv2.cvtColor(pixels, _TO_RGB[encoding]), dtype=np.uint8), ".png"
@@ -76,11 +72,16 @@ def depth_of(message: Any, where: str) -> UInt16[ndarray, "h w"]:
         )
     kind, to_mm = kinds[message.encoding]
     order = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    used = message.width * order.itemsize
-    if message.step < used or message.data.size < message.height * message.step:
-        raise InputError(
-            f"{where}: a depth image of {message.width}x{message.height} is cut short; record again"
-        )
-    rows = message.data[: message.height * message.step].reshape(message.height, message.step)[:, :used]
-    values = np.ascontiguousarray(rows).view(order).astype(np.float64) * to_mm
+    what = f"a depth image of {message.width}x{message.height}"
+    values = (
+        _rows(message, message.width * order.itemsize, what, where).view(order).astype(np.float64) * to_mm
+    )
     return np.nan_to_num(values, posinf=0.0, neginf=0.0).clip(0, 65535).round().astype(np.uint16)
+
+
+def _rows(message: Any, used: int, what: str, where: str) -> UInt8[ndarray, "h used"]:
+    """The `used` bytes of each row, which may be padded to `step`; InputError where some are missing."""
+    if message.step < used or message.data.size < message.height * message.step:
+        raise InputError(f"{where}: {what} is cut short; record again")
+    rows = message.data[: message.height * message.step].reshape(message.height, message.step)
+    return np.ascontiguousarray(rows[:, :used])

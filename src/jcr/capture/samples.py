@@ -3,6 +3,7 @@
 A marker that stands still is a reconstruction's frame: recon_from_camera is the inverse of camera_from_marker.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,7 @@ def read_moveit(path: Path, options: ReadOptions) -> PosePairs:
         raise InputError(
             f"{path}: no list of effector_wrt_world and object_wrt_sensor; name MoveIt's samples file"
         )
-    gripper = [
-        _row_major(entry, "effector_wrt_world", f"{path}: sample {k}") for k, entry in enumerate(content, 1)
-    ]
-    marker = [
-        _row_major(entry, "object_wrt_sensor", f"{path}: sample {k}") for k, entry in enumerate(content, 1)
-    ]
-    return _pairs(path, gripper, marker, ())
+    return _pairs(path, content, ("effector_wrt_world", "object_wrt_sensor"), _row_major)
 
 
 def read_easy_handeye2(path: Path, options: ReadOptions) -> PosePairs:
@@ -53,21 +48,27 @@ def read_easy_handeye2(path: Path, options: ReadOptions) -> PosePairs:
             f"{path}: calibration_type eye_on_base, a camera beside the robot; jcr calibrates cameras on the gripper"
         )
     notes = () if kind == "eye_in_hand" else ("calibration_type is not given; taken as eye_in_hand",)
-    gripper = [_parts(entry, "robot", f"{path}: sample {k}") for k, entry in enumerate(samples, 1)]
-    marker = [_parts(entry, "tracking", f"{path}: sample {k}") for k, entry in enumerate(samples, 1)]
-    return _pairs(path, gripper, marker, notes)
+    return _pairs(path, samples, ("robot", "tracking"), _parts, notes)
 
 
 def _pairs(
-    path: Path, gripper: list[ndarray], camera_from_marker: list[ndarray], notes: tuple[str, ...]
+    path: Path,
+    samples: list[Any],
+    keys: tuple[str, str],
+    read: Callable[[Any, str, str], Float[ndarray, "4 4"]],
+    notes: tuple[str, ...] = (),
 ) -> PosePairs:
+    """Poses of the gripper and of the marker in the camera, below these keys of each sample."""
+    gripper, marker = (
+        np.reshape([read(one, key, f"{path}: sample {k}") for k, one in enumerate(samples, 1)], (-1, 4, 4))
+        for key in keys
+    )
     if len(gripper) < 3:
         raise InputError(f"{path}: {len(gripper)} samples; at least 3 are needed, 12 are good")
-    base_from_gripper = np.stack(gripper)
-    check_metres(base_from_gripper, str(path))
-    check_metres(np.stack(camera_from_marker), f"{path}: the marker")
+    check_metres(gripper, str(path))
+    check_metres(marker, f"{path}: the marker")
     names = tuple(f"sample {k}" for k in range(1, len(gripper) + 1))
-    return PosePairs(path, names, base_from_gripper, inverse(np.stack(camera_from_marker)), True, notes)
+    return PosePairs(path, names, gripper, inverse(marker), True, notes)
 
 
 def _row_major(entry: Any, key: str, where: str) -> Float[ndarray, "4 4"]:

@@ -20,7 +20,7 @@ from jcr.capture.table_cells import SUFFIXES, is_number
 from jcr.errors import InputError
 from jcr.records import Capture
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 TABLES = tuple(f"{stem}{suffix}" for stem in ("poses", "gripper_poses", "robot_poses") for suffix in SUFFIXES)
 
 
@@ -102,7 +102,7 @@ def _paired(
             found = " is ".join(other[0])
             notes = (f"{len(other)} names in {file.name} are not those of files: {found}, and so on", *notes)
         return located, table.base_from_gripper, notes
-    taken = pictures(folder)
+    taken = image_names(folder)
     if not taken:
         raise InputError(f"{folder}: holds no images, nor does {folder / 'images'}; put them there")
     stems = [Path(name).stem for name in taken]
@@ -132,7 +132,7 @@ def _paired(
 
 def _without_pose(folder: Path, named: list[str], file: Path) -> tuple[str, ...]:
     """A note on images that the table does not name; InputError where it names images that are not there."""
-    here = [name for name in pictures(folder) if name not in named]
+    here = [name for name in image_names(folder) if name not in named]
     left_out = (
         f"{len(here)} images have no pose in {file.name} and are left out: {_listed(here)}" if here else ""
     )
@@ -155,9 +155,9 @@ def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
     A name that more than one image has decides nothing.
     """
     own: dict[str, list[str]] = {}
-    for picture in pictures(folder):
-        for key in {Path(picture).name.casefold(), Path(picture).stem.casefold()}:
-            own.setdefault(key, []).append(picture)
+    for image in image_names(folder):
+        for key in {Path(image).name.casefold(), Path(image).stem.casefold()}:
+            own.setdefault(key, []).append(image)
     found = []
     for name in names:
         plain = PureWindowsPath(name).name  # which takes both kinds of slashes
@@ -172,9 +172,9 @@ def _located(folder: Path, names: Sequence[str], file: Path) -> list[str]:
     return found
 
 
-def pictures(folder: Path) -> list[str]:
+def image_names(folder: Path) -> list[str]:
     """Images of a folder, or of its images/, as people count: img2 before img10."""
     inside = folder / "images" if (folder / "images").is_dir() else folder
-    files = [file for file in inside.iterdir() if file.suffix.lower() in PICTURES]
+    files = [file for file in inside.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     names = [str(file.relative_to(folder)) for file in files]
     return sorted(names, key=natural)

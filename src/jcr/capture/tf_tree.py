@@ -19,7 +19,7 @@ RIGID = 2e-3
 
 
 class TfTree:
-    """What /tf and /tf_static said, in plain arrays: an hour of a robot is a few million transforms."""
+    """What /tf and /tf_static given, in plain arrays: an hour of a robot is a few million transforms."""
 
     def __init__(self) -> None:
         self.parent: dict[str, str] = {}
@@ -28,7 +28,7 @@ class TfTree:
         self._numbers: dict[str, array[float]] = {}
 
     def add(self, transforms: list[Any], static: bool) -> None:
-        """The transforms of one message; a frame has one parent, the last that was said."""
+        """The transforms of one message; a frame has one parent, the last that was given."""
         for stamped in transforms:
             child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             if self.parent.get(child, parent) != parent:
@@ -49,9 +49,9 @@ class TfTree:
         frames = self.frames()
         for option, frame in (("--base-frame", base), ("--gripper-frame", gripper)):
             if frame not in frames:
-                said = "is not given" if frame is None else f"{frame} is not in the bag"
+                given = "is not given" if frame is None else f"{frame} is not in the bag"
                 raise InputError(
-                    f"{source}: {option} {said}; the frames of its tf are {', '.join(frames) or 'none'}"
+                    f"{source}: {option} {given}; the frames of its tf are {', '.join(frames) or 'none'}"
                 )
         assert base is not None and gripper is not None
         up, down = self._to_root(base), self._to_root(gripper)

@@ -14,17 +14,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL
-from jcr.capture.checks import checked_lens, read_rigid, require_frames
+from jcr.capture.checks import checked_intrinsics, read_rigid, require_frames
 from jcr.capture.model_cameras import ModelCamera, capture_of_cameras, one_each
 from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
-from jcr.capture.table import PICTURES
+from jcr.capture.table import IMAGE_SUFFIXES
 from jcr.errors import InputError
 from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
 
 FILE = "transforms.json"
+MODELS = (
+    "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "OPENCV_FISHEYE",
+)  # fmt: skip
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x")
+_KEYS = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x",
+)  # fmt: skip
 
 
 def read(path: Path, options: ReadOptions) -> Capture:
@@ -40,17 +45,19 @@ def _cameras(file: Path) -> list[ModelCamera]:
     content = read_json(file)
     groups: dict[object, list[int]] = {}
     for k, (name, frame) in enumerate(zip(names, content["frames"], strict=True)):
-        own = tuple((key, str(frame[key])) for key in _LENS_KEYS if key in frame)
+        own = tuple((key, str(frame[key])) for key in _KEYS if key in frame)
         groups.setdefault((own, str(Path(name).parent)) if own else None, []).append(k)
     if one_each([len(rows) for rows in groups.values()]):
         groups = {None: list(range(len(names)))}
     return [
         ModelCamera(
-            Path(names[rows[0]]).parent.name,
-            tuple(names[k] for k in rows),
-            poses[rows],
-            tuple(rows),
-            partial(_lens, content | {"frames": [content["frames"][k] for k in rows]}, file),
+            name=Path(names[rows[0]]).parent.name,
+            images=tuple(names[k] for k in rows),
+            recon_from_camera=poses[rows],
+            moment=tuple(rows),
+            intrinsics_of_size=partial(
+                _intrinsics, content | {"frames": [content["frames"][k] for k in rows]}, file
+            ),
         )
         for rows in sorted(groups.values(), key=lambda rows: (-len(rows), rows[0]))
     ]
@@ -76,7 +83,7 @@ def read_cameras(file: Path) -> tuple[list[str], Float[ndarray, "n 4 4"]]:
 def _located(file: Path, name: str, k: int) -> str:
     """The image's path, with the ending that some writers leave out."""
     name = str(Path(name))
-    for candidate in (name, *(f"{name}{suffix}" for suffix in PICTURES)):
+    for candidate in (name, *(f"{name}{suffix}" for suffix in IMAGE_SUFFIXES)):
         if os.path.isfile(file.parent / candidate):
             break
     else:
@@ -85,32 +92,24 @@ def _located(file: Path, name: str, k: int) -> str:
     return candidate
 
 
-def read_lens(file: Path, size: tuple[int, int]) -> Intrinsics:
+def read_intrinsics(file: Path, size: tuple[int, int]) -> Intrinsics:
     """The one set of intrinsics of all frames, of the given size; InputError for several or a strange one."""
-    return _lens(read_json(file), file, size)
+    return _intrinsics(read_json(file), file, size)
 
 
-def _lens(content: dict[str, Any], file: Path, size: tuple[int, int]) -> Intrinsics:
-    lenses = [
-        {key: source[key] for key in _LENS_KEYS if key in source}
+def _intrinsics(content: dict[str, Any], file: Path, size: tuple[int, int]) -> Intrinsics:
+    of_frames = [
+        {key: source[key] for key in _KEYS if key in source}
         for source in (content | frame for frame in content["frames"])
     ]
-    first = lenses[0]
-    if any(lens != first for lens in lenses):
+    first = of_frames[0]
+    if any(one != first for one in of_frames):
         raise InputError(f"{file}: its frames have different intrinsics; jcr needs images of one camera")
     model = content.get("camera_model", "OPENCV")
-    if model not in (
-        "OPENCV",
-        "PINHOLE",
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "PERSPECTIVE",
-        "OPENCV_FISHEYE",
-    ):
+    if model not in MODELS:
         raise InputError(f"{file}: camera_model {model}; undistort the images to a pinhole or OPENCV camera")
-    lens_model: LensModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
-    if first.get("k4") and lens_model == "pinhole":
+    distortion_model: LensModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
+    if first.get("k4") and distortion_model == "pinhole":
         raise InputError(f"{file}: a distortion with k4, which jcr does not know; undistort the images")
     width, height = size
     made_for = (first.get("w", width), first.get("h", height))
@@ -126,5 +125,5 @@ def _lens(content: dict[str, Any], file: Path, size: tuple[int, int]) -> Intrins
         numbers = [focal, first.get("fl_y", focal), *(float(value) - HALF_PIXEL for value in centre)]
     except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError):
         raise InputError(f"{file}: fl_x, fl_y, cx, cy and camera_angle_x must be numbers") from None
-    distortion = [first.get(key, 0.0) for key in COEFFICIENTS[lens_model]]
-    return checked_lens(numbers, distortion, size, str(file), lens_model)
+    distortion = [first.get(key, 0.0) for key in COEFFICIENTS[distortion_model]]
+    return checked_intrinsics(numbers, distortion, size, str(file), distortion_model)

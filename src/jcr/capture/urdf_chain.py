@@ -15,7 +15,7 @@ from jcr.handeye.robots import Arm
 if TYPE_CHECKING:
     import yourdfpy
 
-FULL_TURN = (-2 * np.pi, 2 * np.pi)
+ANY_ANGLE = (-2 * np.pi, 2 * np.pi)
 
 
 def read_chain(file: Path, dof: int, gripper: str | None = None) -> Arm:
@@ -103,8 +103,8 @@ def _moving(chain: list) -> int:
 def _limits(joint: "yourdfpy.Joint") -> tuple[float, float]:
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
-        return FULL_TURN
-    return (limit.lower, limit.upper) if limit.upper > limit.lower else FULL_TURN
+        return ANY_ANGLE
+    return (limit.lower, limit.upper) if limit.upper > limit.lower else ANY_ANGLE
 
 
 def _arm(chain: list, where: str) -> Arm:

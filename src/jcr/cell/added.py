@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from jcr.capture.camera_json import read_intrinsics_of_size
 from jcr.capture.cell_cameras import NAME, cameras_as_json, with_cameras
 from jcr.capture.images import read_image
-from jcr.capture.lens_json import read_lens_of_these
 from jcr.capture.plain_files import is_written, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -53,7 +53,7 @@ def camera_of(name: str, files: Sequence[Path], intrinsics: Path | None, taken: 
         content = read_json(intrinsics)
         if isinstance(content, dict) and isinstance(content.get("intrinsics"), dict):
             content = content["intrinsics"]
-        known = read_lens_of_these(content, sizes[0], f"{files[0]}, {intrinsics}")
+        known = read_intrinsics_of_size(content, sizes[0], f"{files[0]}, {intrinsics}")
     images = tuple(str(file.resolve()) for file in files)
     return CellCamera(name, "base", images, sizes[0], known, folder=Path("/"))
 

@@ -17,12 +17,12 @@ class Arguments:
 
     examples:
       jcr board board.pdf
-      jcr board board.svg charuco:9x6:0.040:0.030:DICT_5X5_100 --paper a3
+      jcr board a3.pdf charuco:9x6:0.040:0.030:DICT_5X5_100 --paper a3
       jcr board board.pdf chessboard:9x6:0.025
     """
 
     out: Annotated[Path, tyro.conf.Positional]
-    """File to write: .pdf or .svg."""
+    """PDF to write."""
     board: Annotated[str, tyro.conf.Positional] = "charuco:8x5:0.030:0.022:DICT_4X4_50"
     """charuco:SQUARES:SQUARE:MARKER:DICTIONARY or chessboard:INNER-CORNERS:SQUARE, lengths in metres."""
     paper: Literal["a4", "a3", "a2", "letter"] = "a4"
@@ -33,14 +33,12 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Write the sheet and print the option that it is used with."""
     from jcr.errors import InputError
-    from jcr.export.board_sheet import as_pdf, as_svg, board_sheet
+    from jcr.export.board_sheet import board_sheet
     from jcr.files import write_bytes
 
-    kind = arguments.out.suffix.lower()
-    if kind not in (".pdf", ".svg"):
-        raise InputError(f"jcr board {arguments.out}: writes .pdf and .svg; name a file that ends so")
-    sheet = board_sheet(arguments.board, arguments.paper)
-    write_bytes(arguments.out, as_pdf(sheet) if kind == ".pdf" else as_svg(sheet).encode())
+    if arguments.out.suffix.lower() != ".pdf":
+        raise InputError(f"jcr board {arguments.out}: writes a PDF; name a file that ends in .pdf")
+    write_bytes(arguments.out, board_sheet(arguments.board, arguments.paper).as_pdf())
     arguments.output.result(
         f"{arguments.out}: print at 100 % on {arguments.paper}, measure the rulers, then calibrate with "
         f"--board {arguments.board}\n",

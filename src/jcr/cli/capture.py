@@ -79,8 +79,8 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Collect until there are enough images, or the calibration is as accurate as required."""
-    from jcr.live.camera import opened
     from jcr.live.collect import collect
+    from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
     from jcr.run_folder import held
 

@@ -39,13 +39,13 @@ def posed_cameras(
             beside = tuple(int(np.flatnonzero(rows == camera.frame[k])[0]) for k in poses)
         out.append(
             PosedImages(
-                camera.folder or capture.folder,
-                tuple(camera.images[k] for k in poses),
-                np.stack([*poses.values()]),
-                found.intrinsics.record(),
-                NOTHING,
-                np.zeros((0, 3)),
-                beside,
+                folder=camera.folder or capture.folder,
+                images=tuple(camera.images[k] for k in poses),
+                base_from_camera=np.stack([*poses.values()]),
+                intrinsics=found.intrinsics.record(),
+                tracks=NOTHING,
+                points_in_base=np.zeros((0, 3)),
+                beside=beside,
             )
         )
     return out

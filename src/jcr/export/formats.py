@@ -43,7 +43,7 @@ def export_run(
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
     `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does, and
-    NotTrustedError if the calibration is rejected; with force=True it is exported, and the file says why it is rejected.
+    NotTrustedError if the calibration is rejected; with force=True it is exported, with the reason in the file.
     """
     named = None if path is None else Path(path)
     made = checked_options(options, ExportOptions)
@@ -121,7 +121,7 @@ class Run:
                 options.child_frame,
                 options.base_frame,
                 self.doubt,
-                None if self.calibration.intrinsics is None else self.lens,
+                None if self.calibration.intrinsics is None else self.intrinsics,
             )
         if options.to_root is None:
             return mount
@@ -172,11 +172,11 @@ class Run:
         base = self.options.base_frame
         return mounts + [
             ros.CameraMount(
-                base,
-                f"{arm.name}_{base}",
-                np.array(arm.base_from_other_base),
-                np.array(arm.uncertainty.covariance),
-                base,
+                parent=base,
+                child=f"{arm.name}_{base}",
+                parent_from_child=np.array(arm.base_from_other_base),
+                covariance=np.array(arm.uncertainty.covariance),
+                base=base,
             )
             for arm in cameras.arms
         ]
@@ -207,17 +207,17 @@ class Run:
         )
 
     @property
-    def lens(self) -> "Intrinsics":
+    def intrinsics(self) -> "Intrinsics":
         """As estimated, or as given where these are asked for."""
-        lens = self.calibration.intrinsics if self._kept is None else self._kept.intrinsics
+        found = self.calibration.intrinsics if self._kept is None else self._kept.intrinsics
         if self.options.camera is not None:
-            lens = self._camera(self.options.camera).intrinsics
-        if lens is None:
+            found = self._camera(self.options.camera).intrinsics
+        if found is None:
             raise InputError(
                 f"{self.folder.path}: knows no intrinsics, for camera poses were given and no images; export "
                 "something else"
             )
-        return lens.record()
+        return found.record()
 
     @cached_property
     def scene(self) -> "SceneMap":
@@ -285,7 +285,7 @@ def _easy_handeye2(run: Run, path: Path) -> None:
 
 
 def _camera_info(run: Run, path: Path) -> None:
-    write_text(path, ros.camera_info(run.mount, run.lens))
+    write_text(path, ros.camera_info(run.mount, run.intrinsics))
 
 
 def _joint_offsets(run: Run, path: Path) -> None:
@@ -306,7 +306,7 @@ def _ply(run: Run, path: Path) -> None:
 
 def _glb(run: Run, path: Path) -> None:
     scene = run.scene
-    from jcr.export.mesh import write_glb
+    from jcr.export.volume import write_glb
 
     write_glb(path, scene, run.provenance)
 
@@ -322,8 +322,7 @@ def _esdf(run: Run, path: Path) -> None:
     scene = run.scene
     from jcr.export.volume import write_esdf
 
-    unknown = run.options.unknown or "occupied"
-    write_esdf(path, scene, run.provenance, unknown, run.options.voxel_size)
+    write_esdf(path, scene, run.provenance, run.options.unknown or "occupied", run.options.voxel_size)
 
 
 def _spheres(run: Run, path: Path) -> None:

@@ -44,6 +44,6 @@ class ExportOptions:
     undistort: bool = False
     """Resample the images of nerfstudio and colmap to a pinhole camera."""
     force: bool = False
-    """Export a calibration that is rejected, too; the file then says why it is."""
+    """Export a calibration that is rejected, too; the file then has the reason."""
     link_images: bool = False
     """Link to the capture's images instead of copying them."""

@@ -1,4 +1,4 @@
-"""What every exported file says of itself: its frame, its units, and whether to trust it."""
+"""What every exported file states: its frame, its units, and why a calibration is rejected."""
 
 from dataclasses import dataclass
 

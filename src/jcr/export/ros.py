@@ -1,6 +1,6 @@
 """The camera's place on the gripper as ROS tools take it: tf2, URDF, xacro, easy_handeye2, MoveIt, camera_info.
 
-Every text names its frames and units, and says so where the calibration is rejected.
+Every text names its frames and units, and the reason where the calibration is rejected.
 """
 
 import re
@@ -29,7 +29,7 @@ ROOT_FROM_OPTICAL = transform(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matr
 _FRAME_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraMount:
     """A frame of the camera, fixed on the gripper, under its names in ROS."""
 
@@ -63,7 +63,15 @@ def camera_mount(
         require_frame_name(name)
     if parent == child:
         raise InputError(f"parent and child frame are both {parent!r}; name two different frames")
-    return CameraMount(parent, child, gripper_from_camera, covariance[:6, :6], base, doubt, intrinsics)
+    return CameraMount(
+        parent=parent,
+        child=child,
+        parent_from_child=gripper_from_camera,
+        covariance=covariance[:6, :6],
+        base=base,
+        doubt=doubt,
+        intrinsics=intrinsics,
+    )
 
 
 def on_root(
@@ -243,36 +251,36 @@ def pose_with_covariance(mount: CameraMount) -> str:
     return _yaml(mount, content, order)
 
 
-def camera_info(mount: CameraMount, lens: Intrinsics) -> str:
+def camera_info(mount: CameraMount, intrinsics: Intrinsics) -> str:
     """The intrinsics as camera_info_manager reads them; pixels, (0, 0) is the centre of the first."""
 
     def matrix(values: ndarray) -> dict[str, Any]:
         return {"rows": len(values), "cols": values.shape[1], "data": values.ravel().tolist()}
 
     content = {
-        "image_width": lens.width,
-        "image_height": lens.height,
+        "image_width": intrinsics.width,
+        "image_height": intrinsics.height,
         "camera_name": mount.child.replace("/", "_"),
-        "camera_matrix": matrix(lens.matrix),
-        "distortion_model": _DISTORTIONS[lens.model],
-        "distortion_coefficients": matrix(np.array([lens.distortion])),
+        "camera_matrix": matrix(intrinsics.matrix),
+        "distortion_model": _DISTORTIONS[intrinsics.model],
+        "distortion_coefficients": matrix(np.array([intrinsics.distortion])),
         "rectification_matrix": matrix(np.eye(3)),
-        "projection_matrix": matrix(np.column_stack([lens.matrix, np.zeros(3)])),
+        "projection_matrix": matrix(np.column_stack([intrinsics.matrix, np.zeros(3)])),
     }
-    return _yaml(mount, content, f"intrinsics in pixels; distortion {' '.join(COEFFICIENTS[lens.model])}")
+    return _yaml(
+        mount, content, f"intrinsics in pixels; distortion {' '.join(COEFFICIENTS[intrinsics.model])}"
+    )
 
 
 def notes(mount: CameraMount) -> list[str]:
-    """What every file says of itself."""
+    """The lines that every file begins with: frames, units, intrinsics and a reason for rejection."""
     lines = [f"{mount.child} in {mount.parent}: metres, radians, quaternions x y z w; jcr {__version__}"]
-    if (lens := mount.intrinsics) is not None:
-        bends = ", ".join(
-            f"{name} {value:.6g}"
-            for name, value in zip(COEFFICIENTS[lens.model], lens.distortion, strict=True)
-        )
+    if (given := mount.intrinsics) is not None:
+        coefficients = zip(COEFFICIENTS[given.model], given.distortion, strict=True)
+        distortion = ", ".join(f"{name} {value:.6g}" for name, value in coefficients)
         lines.append(
-            f"belongs to these intrinsics ({lens.width} x {lens.height} px): fx {lens.fx:.6g}, fy {lens.fy:.6g}, cx "
-            f"{lens.cx:.6g}, cy {lens.cy:.6g}, {lens.model} {bends}"
+            f"belongs to these intrinsics ({given.width} x {given.height} px): fx {given.fx:.6g}, fy {given.fy:.6g}, cx "
+            f"{given.cx:.6g}, cy {given.cy:.6g}, {given.model} {distortion}"
         )
     return lines if mount.doubt is None else [*lines, f"REJECTED: {mount.doubt}"]
 

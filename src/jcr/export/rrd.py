@@ -31,7 +31,7 @@ def write_rrd(
     """
     rr: Any = extra("rerun", "rerun", "a .rrd file")
     vertices, faces, colors = surface_mesh(scene)
-    lens = views.lens
+    intrinsics = views.intrinsics
     with written_whole(path) as temporary:
         recording = rr.RecordingStream("jcr")
         recording.save(temporary)
@@ -47,10 +47,10 @@ def write_rrd(
             recording.log(f"base/grippers/{image}", at, rr.TransformAxes3D(_GRIPPER_AXES_M), static=True)
             at = rr.Transform3D(translation=base_from_camera[:3, 3], mat3x3=base_from_camera[:3, :3])
             pinhole = rr.Pinhole(
-                image_from_camera=lens.matrix,
-                resolution=[lens.width, lens.height],
+                image_from_camera=intrinsics.matrix,
+                resolution=[intrinsics.width, intrinsics.height],
                 camera_xyz=rr.ViewCoordinates.RDF,
             )
-            picture = rr.EncodedImage(path=views.folder / image)
-            recording.log(f"base/cameras/{image}", at, pinhole, picture, static=True)
+            pixels = rr.EncodedImage(path=views.folder / image)
+            recording.log(f"base/cameras/{image}", at, pinhole, pixels, static=True)
         recording.disconnect()

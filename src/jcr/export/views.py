@@ -25,10 +25,10 @@ from jcr.represent.cloud_ply import write_cloud
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORIENTATION = 0x0112
-"""The EXIF tag that says how an image is to be rotated."""
+"""The EXIF tag of the rotation in which an image is shown."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosedImages:
     """The registered images of a capture, their cameras in the base frame and what they saw in common."""
 
@@ -37,7 +37,7 @@ class PosedImages:
     images: tuple[str, ...]
     """Relative to that folder."""
     base_from_camera: Float[ndarray, "m 4 4"]
-    lens: Intrinsics
+    intrinsics: Intrinsics
     tracks: Tracks
     """As the reconstruction has them; see `points_in_base` for the points."""
     points_in_base: Float[ndarray, "p 3"]
@@ -54,12 +54,12 @@ def posed_images(
     which the gripper poses of most arms do not.
     """
     return PosedImages(
-        capture.folder,
-        tuple(capture.images[row] for row in reconstruction.image_index),
-        base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale),
-        reconstruction.intrinsics,
-        reconstruction.tracks,
-        apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
+        folder=capture.folder,
+        images=tuple(capture.images[row] for row in reconstruction.image_index),
+        base_from_camera=base_from_recon @ scale_translation(reconstruction.recon_from_camera, scale),
+        intrinsics=reconstruction.intrinsics,
+        tracks=reconstruction.tracks,
+        points_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
     )
 
 
@@ -81,24 +81,24 @@ def write_nerfstudio(
     """
     with _new_folder(folder) as made:
         (made / "images").mkdir()
-        frames, lenses = [], []
+        frames, models = [], []
         for k, one in enumerate((views, *others)):
             below = "images" if k == 0 else f"images/{k}"
-            names, lens = _place_images(made / below, one, undistorted, link)
-            lenses.append(lens)
+            names, intrinsics = _place_images(made / below, one, undistorted, link)
+            models.append(intrinsics)
             frames += [
                 {
                     "file_path": f"{below}/{name}",
                     "transform_matrix": (base_from_camera @ _OPENGL_FROM_OPENCV).tolist(),
-                    **(_nerfstudio_lens(lens) if others else {}),
+                    **(_nerfstudio_intrinsics(intrinsics) if others else {}),
                 }
                 for name, base_from_camera in zip(names, one.base_from_camera, strict=True)
             ]
-        if len({_nerfstudio_model(lens) for lens in lenses}) > 1:
+        if len({_nerfstudio_model(intrinsics) for intrinsics in models}) > 1:
             raise InputError("nerfstudio has one kind of distortion for all cameras; export with --undistort")
         content = {
-            "camera_model": _nerfstudio_model(lenses[0]),
-            **_nerfstudio_lens(lenses[0]),
+            "camera_model": _nerfstudio_model(models[0]),
+            **_nerfstudio_intrinsics(models[0]),
             "ply_file_path": "points.ply",
             "frames": frames,
             "about": provenance.notes
@@ -108,24 +108,24 @@ def write_nerfstudio(
         write_cloud(made / "points.ply", cloud, provenance.notes)
 
 
-def _nerfstudio_model(lens: Intrinsics) -> str:
-    if lens.model == "rational":
+def _nerfstudio_model(intrinsics: Intrinsics) -> str:
+    if intrinsics.model == "rational":
         raise InputError("nerfstudio knows no rational distortion; export with --undistort")
-    plain = lens.model == "pinhole" and not any(lens.distortion)
-    return "PINHOLE" if plain else "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV"
+    plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
+    return "PINHOLE" if plain else "OPENCV_FISHEYE" if intrinsics.model == "fisheye" else "OPENCV"
 
 
-def _nerfstudio_lens(lens: Intrinsics) -> dict[str, float]:
-    plain = lens.model == "pinhole" and not any(lens.distortion)
+def _nerfstudio_intrinsics(intrinsics: Intrinsics) -> dict[str, float]:
+    plain = intrinsics.model == "pinhole" and not any(intrinsics.distortion)
     return {
-        "fl_x": lens.fx,
-        "fl_y": lens.fy,
+        "fl_x": intrinsics.fx,
+        "fl_y": intrinsics.fy,
         # The centre of the first pixel is (0, 0) here and (0.5, 0.5) there.
-        "cx": lens.cx + 0.5,
-        "cy": lens.cy + 0.5,
-        "w": lens.width,
-        "h": lens.height,
-        **({} if plain else dict(zip(COEFFICIENTS[lens.model], lens.distortion, strict=True))),
+        "cx": intrinsics.cx + 0.5,
+        "cy": intrinsics.cy + 0.5,
+        "w": intrinsics.width,
+        "h": intrinsics.height,
+        **({} if plain else dict(zip(COEFFICIENTS[intrinsics.model], intrinsics.distortion, strict=True))),
     }
 
 
@@ -143,12 +143,12 @@ def write_colmap(
     """
     with _new_folder(folder) as made:
         (made / "images").mkdir()
-        names, lens = _place_images(made / "images", views, undistorted, link)
+        names, intrinsics = _place_images(made / "images", views, undistorted, link)
         further = []
         for k, one in enumerate(others, start=1):
             theirs, of_other = _place_images(made / "images" / str(k), one, undistorted, link)
             further.append(_Further(one, of_other, [f"{k}/{name}" for name in theirs]))
-        model = _colmap_model(views, names, lens, further)
+        model = _colmap_model(views, names, intrinsics, further)
         model.extract_colors_for_all_images(str(made / "images"))
         sparse = made / "sparse" / "0"
         sparse.mkdir(parents=True)
@@ -165,33 +165,21 @@ class _Further:
     """A further camera as it is exported."""
 
     views: PosedImages
-    lens: Intrinsics
+    intrinsics: Intrinsics
     names: list[str]
     """In the folder of images."""
 
 
 def _colmap_model(
-    views: PosedImages, names: list[str], lens: Intrinsics, others: Sequence[_Further] = ()
+    views: PosedImages, names: list[str], intrinsics: Intrinsics, others: Sequence[_Further] = ()
 ) -> pycolmap.Reconstruction:
     """The cameras on the gripper are one rig, and a frame of it is what they saw at one pose."""
     model = pycolmap.Reconstruction()
-    rig = pycolmap.Rig(rig_id=1)
-    for number, one in enumerate((lens, *(other.lens for other in others)), start=1):
-        camera = camera_of(one, known=True)
-        camera.camera_id = number
-        beside = None if number == 1 else others[number - 2].views.beside
-        if number > 1 and beside is None:
-            model.add_camera_with_trivial_rig(camera)
-            continue
-        model.add_camera(camera)
-        if beside is None:
-            rig.add_ref_sensor(camera.sensor_id)
-        else:
-            theirs = others[number - 2].views.base_from_camera[0]
-            rig.add_sensor(camera.sensor_id, _rigid(inverse(theirs) @ views.base_from_camera[beside[0]]))
-    model.add_rig(rig)
-    x_px = views.tracks.x_px if lens == views.lens else _undistorted_px(views.tracks.x_px, views.lens, lens)
-    inside = ((x_px >= -0.5) & (x_px < [lens.width - 0.5, lens.height - 0.5])).all(1)
+    rig = _add_cameras(model, views, intrinsics, others)
+    x_px = views.tracks.x_px
+    if intrinsics != views.intrinsics:
+        x_px = project(intrinsics, unproject(views.intrinsics, x_px))
+    inside = ((x_px >= -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
     place = np.zeros(len(x_px), int)  # of each observation among those of its image
     images: dict[int, list[pycolmap.Image]] = {}
     for row, name in enumerate(names):
@@ -199,7 +187,45 @@ def _colmap_model(
         place[mine] = np.arange(mine.sum())
         image = pycolmap.Image(name=name, keypoints=x_px[mine] + 0.5, camera_id=1, image_id=row + 1)
         images[row] = [image]
-    count = len(names)
+    _add_other_images(model, images, others)
+    _add_frames(model, rig, images, views)
+    tracks = [pycolmap.Track() for _ in views.points_in_base]
+    for k in np.flatnonzero(inside):
+        tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
+    for xyz, track in zip(views.points_in_base, tracks, strict=True):
+        if track.length() >= 2:
+            model.add_point3D(xyz, track)
+    model.update_point_3d_errors()
+    return model
+
+
+def _add_cameras(
+    model: pycolmap.Reconstruction, views: PosedImages, intrinsics: Intrinsics, others: Sequence[_Further]
+) -> pycolmap.Rig:
+    """Add camera 1 with those beside it on the gripper, which make the rig, and each other camera on its own."""
+    rig = pycolmap.Rig(rig_id=1)
+    own = camera_of(intrinsics, known=True)
+    own.camera_id = 1
+    model.add_camera(own)
+    rig.add_ref_sensor(own.sensor_id)
+    for number, other in enumerate(others, start=2):
+        camera = camera_of(other.intrinsics, known=True)
+        camera.camera_id = number
+        if (beside := other.views.beside) is None:
+            model.add_camera_with_trivial_rig(camera)
+            continue
+        model.add_camera(camera)
+        camera_from_own = inverse(other.views.base_from_camera[0]) @ views.base_from_camera[beside[0]]
+        rig.add_sensor(camera.sensor_id, _rigid(camera_from_own))
+    model.add_rig(rig)
+    return rig
+
+
+def _add_other_images(
+    model: pycolmap.Reconstruction, images: dict[int, list[pycolmap.Image]], others: Sequence[_Further]
+) -> None:
+    """Add the images of cameras on their own to the model, those of the rig to `images` of the row at the same pose."""
+    count = len(images)
     for number, other in enumerate(others, start=2):
         for k, name in enumerate(other.names):
             count += 1
@@ -209,6 +235,15 @@ def _colmap_model(
                 model.add_image_with_trivial_frame(image, _rigid(camera_from_base))
             else:
                 images[other.views.beside[k]].append(image)
+
+
+def _add_frames(
+    model: pycolmap.Reconstruction,
+    rig: pycolmap.Rig,
+    images: dict[int, list[pycolmap.Image]],
+    views: PosedImages,
+) -> None:
+    """Add a frame of the rig for the images of each row."""
     first = max([0, *model.frames.keys()]) + 1
     for row, together in images.items():
         frame = pycolmap.Frame(frame_id=first + row, rig_id=rig.rig_id)
@@ -220,24 +255,10 @@ def _colmap_model(
         for image in together:
             model.add_image(image)
         model.register_frame(frame.frame_id)
-    tracks = [pycolmap.Track() for _ in views.points_in_base]
-    for k in np.flatnonzero(inside):
-        tracks[views.tracks.point[k]].add_element(int(views.tracks.image[k]) + 1, int(place[k]))
-    for xyz, track in zip(views.points_in_base, tracks, strict=True):
-        if track.length() >= 2:
-            model.add_point3D(xyz, track)
-    model.update_point_3d_errors()
-    return model
 
 
 def _rigid(a_from_b: Float[ndarray, "4 4"]) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(a_from_b[:3])
-
-
-def _undistorted_px(
-    x_px: Float[ndarray, "k 2"], lens: Intrinsics, pinhole: Intrinsics
-) -> Float[ndarray, "k 2"]:
-    return project(pinhole, unproject(lens, x_px))
 
 
 def _place_images(
@@ -250,23 +271,23 @@ def _place_images(
         names = [image.replace("/", "_") for image in views.images]
     if undistorted:
         names = [f"{Path(name).stem}.png" for name in names]
-        pinhole = pinhole_inside(views.lens, max(views.lens.width, views.lens.height))
+        pinhole = pinhole_inside(views.intrinsics, max(views.intrinsics.width, views.intrinsics.height))
         for image, name in zip(views.images, names, strict=True):
-            pixels = undistort_image(read_image(views.folder / image), views.lens, pinhole)
+            pixels = undistort_image(read_image(views.folder / image), views.intrinsics, pinhole)
             (folder / name).write_bytes(encode_png(pixels))
         return names, pinhole
     for k, (image, name) in enumerate(zip(views.images, names, strict=True)):
         source = (views.folder / image).resolve()
         with Image.open(source) as opened:
-            turned = opened.getexif().get(_ORIENTATION, 1) != 1
-        if turned:  # which not every reader heeds
+            is_rotated = opened.getexif().get(_ORIENTATION, 1) != 1
+        if is_rotated:  # which not every reader heeds
             names[k] = f"{Path(name).stem}.png"
             (folder / names[k]).write_bytes(encode_png(read_image(source)))
         elif link:
             (folder / name).symlink_to(source)
         else:
             shutil.copyfile(source, folder / name)
-    return names, views.lens
+    return names, views.intrinsics
 
 
 @contextmanager

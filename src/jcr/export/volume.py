@@ -1,12 +1,13 @@
-"""The map's space as planners load it: OctoMap, a voxel grid of distances, spheres.
+"""The map as planners load it: OctoMap, a voxel grid of distances, spheres, the mesh of its surface.
 
-All query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
+The first three query the map itself, so that they answer as `SceneMap.check_spheres` and `SceneMap.query` do.
 """
 
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float, Integer
 from numpy import ndarray
 
@@ -16,6 +17,7 @@ from jcr.export.provenance import Provenance
 from jcr.extras import extra
 from jcr.files import write_bytes, written_whole
 from jcr.represent.scene import FREE, OCCUPIED, SceneMap
+from jcr.represent.surface import surface_mesh
 
 MAX_VOXELS = 50_000_000
 _savez = np.savez_compressed if deflate.WORKS else np.savez
@@ -26,7 +28,7 @@ def write_octomap(path: Path, scene: SceneMap, provenance: Provenance, voxel: fl
     """Write a binary OctoMap (.bt) with voxels of side `voxel` m, by default the map's cell.
 
     A voxel is occupied when the sphere inscribed in it touches a seen surface, free when that sphere touches
-    neither a surface nor anything unseen; all others are left out, which is how OctoMap says unknown.
+    neither a surface nor anything unseen; all others are left out, which are unknown to OctoMap.
     Raises InputError without pyoctomap, and where the voxels would be too many.
     """
     octomap: Any = extra("pyoctomap", "planning", "an OctoMap")
@@ -62,19 +64,22 @@ def write_esdf(
     centers = _centers(scene.box[0], count, voxel)
     values = scene.query(centers.reshape(-1, 3), unknown).distance.reshape(count)
     dims = voxel * count
+    _write_npz(
+        path,
+        provenance,
+        values=values.astype(np.float32),
+        origin=centers[0, 0, 0],
+        voxel_size=voxel,
+        dims=dims,
+        pose=[*(scene.box[0] + dims / 2), 1.0, 0.0, 0.0, 0.0],
+        sign=_SIGN,
+        unknown=unknown,
+    )
+
+
+def _write_npz(path: Path, provenance: Provenance, **arrays: object) -> None:
     with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        _savez(
-            stream,
-            allow_pickle=False,
-            values=values.astype(np.float32),
-            origin=centers[0, 0, 0],
-            voxel_size=np.array(voxel),
-            dims=dims,
-            pose=np.array([*(scene.box[0] + dims / 2), 1.0, 0.0, 0.0, 0.0]),
-            sign=np.array(_SIGN),
-            unknown=np.array(unknown),
-            **{name: np.array(text) for name, text in provenance.notes.items()},
-        )
+        _savez(stream, allow_pickle=False, **{k: np.array(v) for k, v in (arrays | provenance.notes).items()})
 
 
 def write_spheres(
@@ -86,15 +91,7 @@ def write_spheres(
 ) -> None:
     """Write the spheres of `spheres_of_map` as .npz: `centers` (n,3) and `radii` (n,) m."""
     centers, radii = spheres_of_map(scene, unknown, excess)
-    with written_whole(path) as temporary, open(temporary, "wb") as stream:
-        _savez(
-            stream,
-            allow_pickle=False,
-            centers=centers,
-            radii=radii,
-            unknown=np.array(unknown),
-            **{name: np.array(text) for name, text in provenance.notes.items()},
-        )
+    _write_npz(path, provenance, centers=centers, radii=radii, unknown=unknown)
 
 
 def spheres_of_map(
@@ -126,6 +123,20 @@ def spheres_of_map(
             chosen.append(at)
     index = tuple(np.array(chosen, dtype=int).reshape(-1, 3).T)
     return points[index], radii[index].astype(np.float64)
+
+
+def write_glb(path: Path, scene: SceneMap, provenance: Provenance) -> None:
+    """Write the seen surface with vertex colours as binary glTF.
+
+    Its vertices are those of the robot's frame, z up, as planners load them; glTF's own viewers take y for up and
+    show it lying on its side. Raises InputError where the map has no surface.
+    """
+    vertices, faces, colors = surface_mesh(scene)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+    axes = {"axes": "the robot's, z up (not rotated to glTF's y up)"}
+    exported = trimesh.Scene({"map": mesh}, metadata=provenance.notes | axes).export(file_type="glb")
+    assert isinstance(exported, bytes)
+    write_bytes(path, exported)
 
 
 def _uncover(left: Bool[ndarray, "x y z"], at: Integer[ndarray, "3"], reach: float) -> None:

@@ -41,11 +41,11 @@ def pose_lines(
     if convention == "ur":
         row = numbers_from_poses(pose[None], "ur")[0]
         shown = ", ".join(f"{name} {1e3 * value:.1f}" for name, value in zip("xyz", row[:3], strict=True))
-        turn = ", ".join(
+        rotation = ", ".join(
             f"{name} {value:.4f}" for name, value in zip(("rx", "ry", "rz"), row[3:], strict=True)
         )
         numbers = ", ".join(f"{value:.5f}" for value in row)
-        lines = [f"pendant: {shown} mm, {turn} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
+        lines = [f"pendant: {shown} mm, {rotation} rad", f"URScript: movel(p[{numbers}], a=0.3, v=0.1)"]
     elif convention in ("franka", "matrix"):
         row = numbers_from_poses(pose[None], convention, words.units)[0]
         order = "O_T_EE, by columns" if convention == "franka" else "base_from_gripper, by rows"
@@ -61,20 +61,18 @@ def pose_lines(
 def named_numbers(pose: Float[ndarray, "4 4"], convention: ConventionName, units: UnitsName) -> str:
     """The pose's numbers, each with its name, and the units."""
     form = CONVENTIONS[convention]
-    length, angle = "mm" if form.millimetres else "m", "°" if form.degrees else "rad"
-    if units != "auto":
-        length, _, angle = units.replace("deg", "°").partition("-")
+    length, angle = form.units(units)
     row = numbers_from_poses(pose[None], convention, units)[0]
-    digits = [1 if length == "mm" else 4] * 3 + [5 if form.quaternion else 2 if angle == "°" else 4] * 4
+    digits = [1 if length == "mm" else 4] * 3 + [5 if not form.has_angles else 2 if angle == "deg" else 4] * 4
     text = [f"{name} {value:.{k}f}" for name, value, k in zip(form.columns, row, digits, strict=False)]
-    turn = " ".join(text[3:]) + ("" if form.quaternion else f" {angle}")
-    return f"{' '.join(text[:3])} {length}, {turn}"
+    unit = f" {angle.replace('deg', '°')}" if form.has_angles else ""
+    return f"{' '.join(text[:3])} {length}, {' '.join(text[3:])}{unit}"
 
 
 def joints_at(arm: Arm, path: Path, goal: Float[ndarray, "4 4"]) -> Float[ndarray, " dof"] | None:
     """Joint angles (rad) within the limits that reach `goal` from where the arm is; None where none do.
 
-    With recorded angles the tool is what they and their pose say, and the answer the branch that the arm is in.
+    With recorded angles the tool follows from them and their pose, and the answer is of the branch that the arm is in.
     """
     if path.joints is not None:
         now = path.joints[-1:]

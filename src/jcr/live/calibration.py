@@ -18,8 +18,8 @@ from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.requirement import advised
 from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
+from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
-from jcr.capture.lens_json import lens_as_json
 from jcr.errors import NotTrustedError
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
@@ -70,7 +70,7 @@ class LiveCalibration:
     ) -> None:
         """Raises InputError where the folder holds no capture that can be continued, or an option cannot be."""
         if not isinstance(folder, LiveFolder):
-            given = None if intrinsics is None else lens_as_json(intrinsics)
+            given = None if intrinsics is None else intrinsics_as_json(intrinsics)
             folder = LiveFolder(Path(folder), given, robot)
         self.live, self._reach = folder, reach
         self._options = checked_options(options, CalibrateOptions)

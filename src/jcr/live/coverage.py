@@ -27,19 +27,19 @@ ALTERNATIVES = 6
 """Proposals; the first that the arm reaches is taken."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
     """How far a capture is."""
 
-    pictures: int
+    images: int
     unseen: tuple[str, ...]
     """What the motions do not show yet, in words."""
     expected: tuple[Expectation, ...]
     """With the first 3, 4, … images, if all register; of a usual robot and usual images."""
-    next_pose: NextPose | None
-    next_joints: Float[ndarray, " dof"] | None
+    next_pose: NextPose | None = None
+    next_joints: Float[ndarray, " dof"] | None = None
     """rad; None where the arm is not known."""
-    like: str | None
+    like: str | None = None
     """The image nearest to the next pose."""
     words: ArmWords
 
@@ -58,7 +58,7 @@ def coverage(
     """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
     if len(places := live.places()) < 2:
-        return Coverage(len(places), (), (), None, None, None, words)
+        return Coverage(images=len(places), unseen=(), expected=(), words=words)
     capture = live.capture()
     poses, joints = capture.base_from_gripper, capture.joints
     camera = typical_camera(capture.intrinsics, capture.image_size)
@@ -71,13 +71,13 @@ def coverage(
     more = [expected(assumptions, poses[some], of_poses(robot.systematic, some)) for some in rows]
     next_pose = chosen.next_pose(1, chosen.expected(1))
     return Coverage(
-        len(poses),
-        observability(poses).unobservable,
-        (*known, *more),
-        next_pose,
-        next_joints,
-        capture.images[next_pose.like],
-        words,
+        images=len(poses),
+        unseen=observability(poses).unobservable,
+        expected=(*known, *more),
+        next_pose=next_pose,
+        next_joints=next_joints,
+        like=capture.images[next_pose.like],
+        words=words,
     )
 
 
@@ -105,19 +105,19 @@ def reachable(
 def in_words(found: Coverage) -> list[str]:
     """A line on what is covered, and lines with the next pose."""
     if found.next_pose is None:
-        first = "one image; " if found.pictures else "no image yet; "
+        first = "one image; " if found.images else "no image yet; "
         return [first + "rotate the wrist by 20° or more, and move, between images"]
     pose = found.next_pose
-    lines = [f"{found.pictures} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
+    lines = [f"{found.images} images" + "".join(f"; not observable yet: {name}" for name in found.unseen)]
     if (now := found.now) is not None and not found.unseen:
         mm, deg = (significant(value) for value in now.reached("seen"))
         far = significant(1e-3 * now.seen.distance_mm)
         lines[0] += (
             f"; a point seen at {far} m is expected within {mm} mm and {deg}° (95 % of errors, usual robot)"
         )
-    moved, turned = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
     then = f", then {significant(pose.within_95_mm)} mm" if now is not None else ""
-    lines.append(f"best next: {moved:.0f} mm and {turned:.0f}° from {found.like}{then}")
+    lines.append(f"best next: {moved:.0f} mm and {rotated:.0f}° from {found.like}{then}")
     return lines + [f"  {line}" for line in next_lines(found)]
 
 
@@ -135,7 +135,7 @@ def as_answer(found: Coverage) -> Answer:
     """The same for a program."""
     pose, now = found.next_pose, found.now
     return {
-        "pictures": found.pictures,
+        "pictures": found.images,
         "unobservable": list(found.unseen),
         "expected_std": None if now is None else now.std.tolist(),
         "expected_seen": None if now is None else vars(now.seen),

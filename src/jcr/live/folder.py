@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from numpy import ndarray
 
+from jcr.capture.camera_json import read_intrinsics, read_std
 from jcr.capture.capture_json import FILE, read_joints
 from jcr.capture.checks import read_rigid
 from jcr.capture.images import encode_png, read_image
-from jcr.capture.lens_json import read_lens, read_std
 from jcr.capture.plain_files import contained, read_json
 from jcr.errors import InputError
 from jcr.files import write_bytes, write_text
@@ -87,7 +87,7 @@ class LiveFolder:
                 f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
             )
         if self.lens is not None:
-            read_lens(self.lens, size, self.folder / FILE)
+            read_intrinsics(self.lens, size, self.folder / FILE)
         name = f"images/{self._next_number():03d}.png"
         write_bytes(self.folder / name, encode_png(image))
         depth = None
@@ -143,7 +143,7 @@ class LiveFolder:
 
     def _capture(self) -> Capture:
         assert self.size is not None
-        lens = read_lens(self.lens, self.size, self.folder / FILE)
+        lens = read_intrinsics(self.lens, self.size, self.folder / FILE)
         return Capture(
             folder=self.folder,
             images=tuple(self.names),

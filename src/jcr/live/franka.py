@@ -14,7 +14,7 @@ POLL_S = 0.008
 
 
 def states(host: str) -> Iterator[State]:
-    """What the robot says from now on; the pose is O_T_EE, of the end effector set in Desk.
+    """States of the robot from now on; the pose is O_T_EE, of the end effector set in Desk.
 
     Nothing is commanded, so the arm may be guided by hand. Raises InputError when the package is missing, or the
     robot cannot be reached or hangs up.

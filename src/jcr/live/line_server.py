@@ -1,7 +1,7 @@
 """Gripper poses over TCP, one JSON object a line, from any program that can open a socket (jcr docs capture).
 
-A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) says that the arm rests there now;
-the answer, a line too, says what came of it and which pose to go to next. `{"done": true}` ends the capture.
+A line `{"base_from_gripper": [[…]×4]}` (or six, seven or sixteen numbers) means that the arm rests there now;
+the answer, a line too, has the result and the pose to go to next. `{"done": true}` ends the capture.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ class Listen:
 def served_poses(server: socket.socket, listen: Listen) -> Iterator[Ask]:
     """A request per good line, from one client at a time; a bad line is answered, a bad client dropped.
 
-    Raises InputError when nobody says anything for `timeout_s`.
+    Raises InputError when no line comes for `timeout_s`.
     """
     while True:
         try:
@@ -91,58 +91,62 @@ def _gives_way(client: socket.socket, server: socket.socket, listen: Listen) -> 
 
 
 def _served(client: socket.socket, listen: Listen):
-    """Requests of one client; returns whether it said that it is done."""
-    received = bytearray()
-    welcome, refused = listen.token is None, 0
+    """Requests of one client; returns whether it ended the capture."""
+    received, refused = bytearray(), 0
+    if listen.token is not None and not _has_token(client, received, listen.token):
+        return False
     while True:
         try:
-            # A stranger who says nothing must not keep others waiting, nor anybody who drips a line byte by byte.
-            line = _line(client, received, listen.timeout_s if welcome else LINE_S)
-        except _NobodyError:
-            if not welcome:
-                return False
+            line = _line(client, received, listen.timeout_s)
+        except _SilentError:
             raise _silence(listen) from None
-        except OSError:
-            return False
         if not line:
-            return False
-        if len(line) > MAX_LINE:
-            _dismiss(client, f"a line of more than {MAX_LINE} bytes")
             return False
         if refused >= MOST_REFUSED:
             _dismiss(client, f"{MOST_REFUSED} lines in a row were refused")
             return False
-        message = parsed(line)
-        refused += 1
-        if not welcome:
-            given = message.get("token") if isinstance(message, dict) else None
-            if not hmac.compare_digest(_bytes(given), _bytes(listen.token)):
-                _dismiss(client, "the first line must be the right token")
-                return False
-            welcome, refused = True, 0
-            _answer(client, {"accepted": True})
-        elif isinstance(message, dict) and message.get("done") is True:
-            return True
-        elif isinstance(message, str):
-            _answer(client, _refusal(message))
+        try:
+            message = parsed(line)
+            if message.get("done") is True:
+                return True
+            pose = pose_of(message)
+        except InputError as error:
+            refused += 1
+            _answer(client, _refusal(str(error)))
         else:
-            try:
-                pose = pose_of(message)
-            except InputError as error:
-                _answer(client, _refusal(str(error)))
-                continue
             refused = 0
             yield Ask(pose, lambda answer: _answer(client, answer))
 
 
-class _NobodyError(Exception):
+def _has_token(client: socket.socket, received: bytearray, token: str) -> bool:
+    """Whether the first line of a client has the token; others are dismissed."""
+    try:
+        line = _line(client, received, LINE_S)
+    except _SilentError:
+        return False
+    if not line:
+        return False
+    try:
+        given = parsed(line).get("token")
+    except InputError:
+        given = None
+    # JSON may have half of a surrogate pair, which is no UTF-8.
+    known, sent = (str(one).encode("utf-8", "surrogatepass") for one in (token, given))
+    if not hmac.compare_digest(known, sent):
+        _dismiss(client, "the first line must be the right token")
+        return False
+    _answer(client, {"accepted": True})
+    return True
+
+
+class _SilentError(Exception):
     """No line began in time."""
 
 
 def _line(client: socket.socket, received: bytearray, patience_s: float) -> bytes:
-    """The next line, of at most one byte more than MAX_LINE; empty where the client is gone or drips.
+    """The next line; empty where the client is gone, or dismissed for a line that is too long or not whole in time.
 
-    `received` is what came behind the line before. Raises _NobodyError where none begins within `patience_s`.
+    `received` is what came behind the line before. Raises _SilentError where none begins within `patience_s`.
     """
     deadline = time.monotonic() + (LINE_S if received else patience_s)
     while b"\n" not in received and len(received) <= MAX_LINE:
@@ -152,26 +156,31 @@ def _line(client: socket.socket, received: bytearray, patience_s: float) -> byte
         except TimeoutError:
             if received:
                 return b""
-            raise _NobodyError from None
+            raise _SilentError from None
+        except OSError:
+            return b""
         if not more:
             break
         if not received:
             deadline = time.monotonic() + LINE_S
         received += more
-    end = received.find(b"\n")
-    length = min(end + 1 if end >= 0 else len(received), MAX_LINE + 1)
-    line = bytes(received[:length])
-    del received[:length]
-    return line
+    line, end, rest = bytes(received).partition(b"\n")
+    received[:] = rest
+    if len(line + end) > MAX_LINE:
+        _dismiss(client, f"a line of more than {MAX_LINE} bytes")
+        return b""
+    return line + end
 
 
-def parsed(line: bytes) -> dict[str, Any] | str:
-    """The object on a line, or what is wrong with it."""
+def parsed(line: bytes) -> dict[str, Any]:
+    """The object on a line; InputError where it has none."""
     try:
         message = json.loads(line)
     except (ValueError, RecursionError):
-        return 'not JSON; send {"base_from_gripper": [[…], […], […], […]]} on one line'
-    return message if isinstance(message, dict) else "not a JSON object"
+        raise InputError('not JSON; send {"base_from_gripper": [[…], […], […], […]]} on one line') from None
+    if not isinstance(message, dict):
+        raise InputError("not a JSON object")
+    return message
 
 
 def pose_of(message: dict[str, Any]) -> Float[ndarray, "4 4"]:
@@ -206,11 +215,6 @@ def _dismiss(client: socket.socket, reason: str) -> None:
         for _ in range(16):
             if not client.recv(MAX_LINE):
                 return
-
-
-def _bytes(token: object) -> bytes:
-    """A token to compare; JSON may hold half of a surrogate pair, which is no UTF-8."""
-    return str(token).encode("utf-8", "surrogatepass")
 
 
 def _refusal(reason: str) -> Answer:

@@ -134,7 +134,7 @@ def _kind(headline: str, found: Coverage, wanted: tuple[float, float]) -> str:
 
 
 def _tiles(found: Coverage, wanted: tuple[float, float]) -> str:
-    cells = [("images", str(found.pictures), "")]
+    cells = [("images", str(found.images), "")]
     if (now := found.now) is not None:
         mm, deg = now.reached("seen")
         far, std = significant(1e-3 * now.seen.distance_mm), now.std

@@ -1,7 +1,7 @@
 """An Intel RealSense: images, depth aligned with them, and the intrinsics that its maker stored; with pyrealsense2."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
@@ -12,8 +12,10 @@ import numpy as np
 
 from jcr.errors import InputError
 from jcr.extras import extra
-from jcr.live.camera import REALSENSE, TIMEOUT_S, Camera, CameraOptions, Frame, Newest, Recorded
+from jcr.live.camera import TIMEOUT_S, Camera, CameraOptions, Frame, Newest, Recorded
 
+REALSENSE = "realsense"
+"""Its name for `--camera`, with `:SERIAL` or `:FILE` behind it."""
 SIZE = (1280, 720)
 """A capture is better for more pixels; every D400 gives this."""
 DEPTH_LIMIT_MM = 65_535
@@ -29,20 +31,9 @@ def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
     """
     name = REALSENSE + (f":{serial}" if serial else "")
     rs = extra("pyrealsense2", "realsense", f"--camera {name}")
-    pipeline, config = rs.pipeline(), rs.config()
-    is_file = serial.endswith((".bag", ".db3"))
-    if is_file:
-        if not Path(serial).is_file():
-            raise InputError(f"--camera {name}: no such recording; name a .bag, or a serial number")
-        rs.config.enable_device_from_file(config, serial, repeat_playback=False)
-    else:
-        if serial:
-            config.enable_device(serial)
-        width, height = options.camera_size or SIZE
-        config.enable_stream(rs.stream.color, width, height, rs.format.rgb8)
-        config.enable_stream(rs.stream.depth)
+    pipeline, is_file = rs.pipeline(), serial.endswith((".bag", ".db3"))
     try:
-        profile = pipeline.start(config)
+        profile = pipeline.start(_config(rs, serial, is_file, options))
     except RuntimeError as error:
         raise InputError(
             f"--camera {name}: {' '.join(str(error).split())}; see what rs-enumerate-devices lists, and whether another "
@@ -53,39 +44,63 @@ def opened_realsense(serial: str, options: CameraOptions) -> Iterator[Camera]:
             profile.get_device().as_playback().set_real_time(False)
         else:
             _keep_to(rs, profile, options)
-        aligned, has_depth = rs.align(rs.stream.color), False
-        with suppress(RuntimeError):
-            has_depth = bool(profile.get_stream(rs.stream.depth))
-        unit_mm = 1e3 * profile.get_device().first_depth_sensor().get_depth_scale() if has_depth else 1.0
-
-        def read() -> Frame | None:
-            began = time.monotonic()
-            try:
-                frames = pipeline.wait_for_frames(int(1e3 * TIMEOUT_S if not is_file else 1e3))
-            except RuntimeError:
-                return None
-            stamp = frames.get_timestamp() / 1e3 if is_file else began
-            depth_mm = None
-            if has_depth:
-                frames = aligned.process(frames)
-                raw = np.asanyarray(frames.get_depth_frame().get_data())
-                depth_mm = np.rint(unit_mm * raw).clip(0, DEPTH_LIMIT_MM).astype(np.uint16)
-            color = frames.get_color_frame()
-            pixels = np.asanyarray(color.get_data()).copy()
-            if color.get_profile().format() == rs.format.bgr8:
-                pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
-            return Frame(pixels, stamp, depth_mm)
-
+        read = _reader(rs, pipeline, profile, is_file)
         stored = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
         source = Recorded(iter(read, None)) if is_file else Newest(read, name)
         try:
-            yield Camera(source, source.latest, lens_of_realsense(rs, stored))
+            yield Camera(source, source.latest, intrinsics_of_realsense(rs, stored))
         finally:
             if isinstance(source, Newest):
                 source.close()
     finally:
         with suppress(RuntimeError):
             pipeline.stop()
+
+
+def _config(rs: ModuleType, serial: str, is_file: bool, options: CameraOptions) -> Any:
+    """What to start: a recording, or colour and depth of the camera of a serial number, of any where it is empty."""
+    config = rs.config()
+    if is_file:
+        if not Path(serial).is_file():
+            raise InputError(
+                f"--camera {REALSENSE}:{serial}: no such recording; name a .bag, or a serial number"
+            )
+        rs.config.enable_device_from_file(config, serial, repeat_playback=False)
+        return config
+    if serial:
+        config.enable_device(serial)
+    width, height = options.camera_size or SIZE
+    config.enable_stream(rs.stream.color, width, height, rs.format.rgb8)
+    config.enable_stream(rs.stream.depth)
+    return config
+
+
+def _reader(rs: ModuleType, pipeline: Any, profile: Any, is_file: bool) -> Callable[[], Frame | None]:
+    """Reads the next frame, with depth where the camera measures it; None when there is no more."""
+    aligned, has_depth = rs.align(rs.stream.color), False
+    with suppress(RuntimeError):
+        has_depth = bool(profile.get_stream(rs.stream.depth))
+    unit_mm = 1e3 * profile.get_device().first_depth_sensor().get_depth_scale() if has_depth else 1.0
+
+    def read() -> Frame | None:
+        began = time.monotonic()
+        try:
+            frames = pipeline.wait_for_frames(int(1e3 * TIMEOUT_S if not is_file else 1e3))
+        except RuntimeError:
+            return None
+        stamp = frames.get_timestamp() / 1e3 if is_file else began
+        depth_mm = None
+        if has_depth:
+            frames = aligned.process(frames)
+            raw = np.asanyarray(frames.get_depth_frame().get_data())
+            depth_mm = np.rint(unit_mm * raw).clip(0, DEPTH_LIMIT_MM).astype(np.uint16)
+        color = frames.get_color_frame()
+        pixels = np.asanyarray(color.get_data()).copy()
+        if color.get_profile().format() == rs.format.bgr8:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        return Frame(pixels, stamp, depth_mm)
+
+    return read
 
 
 def _keep_to(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
@@ -107,15 +122,15 @@ def _keep_to(rs: ModuleType, profile: Any, options: CameraOptions) -> None:
         sensor.set_option(option, value)
 
 
-def lens_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | None:
+def intrinsics_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | None:
     """Intrinsics for capture.json; None where OpenCV's coefficients do not reproduce the maker's to FITTED_PX.
 
     librealsense has distortions of its own ("Projection in Intel RealSense SDK 2.0"), among them an inverse one. Its
     own deprojection gives the ray of each pixel, and the coefficients are linear in where rays go.
     """
-    lens = {"fx": stored.fx, "fy": stored.fy, "cx": stored.ppx, "cy": stored.ppy}
+    intrinsics = {"fx": stored.fx, "fy": stored.fy, "cx": stored.ppx, "cy": stored.ppy}
     if not any(stored.coeffs):
-        return lens | {"distortion": [0.0] * 5}
+        return intrinsics | {"distortion": [0.0] * 5}
     u, v = np.meshgrid(np.linspace(0, stored.width - 1, 25), np.linspace(0, stored.height - 1, 19))
     x_px = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = np.array([rs.rs2_deproject_pixel_to_point(stored, pixel.tolist(), 1.0) for pixel in x_px])
@@ -126,4 +141,4 @@ def lens_of_realsense(rs: ModuleType, stored: Any) -> dict[str, Any] | None:
     matrix, goal = np.vstack([by_x, by_y]), np.concatenate([seen[:, 0] - x, seen[:, 1] - y])
     coefficients = np.linalg.lstsq(matrix, goal, rcond=None)[0]
     off_px = max(stored.fx, stored.fy) * np.abs(matrix @ coefficients - goal).max()
-    return lens | {"distortion": coefficients.tolist()} if off_px < FITTED_PX else None
+    return intrinsics | {"distortion": coefficients.tolist()} if off_px < FITTED_PX else None

@@ -15,20 +15,20 @@ BY_COUNT: dict[int, ConventionName] = {6: "rotation-vector", 7: "quat-xyzw", 16:
 
 def typed_poses(
     lines: Iterator[str],
-    say: Callable[[str], None],
+    show: Callable[[str], None],
     convention: ConventionName = "auto",
     units: UnitsName = "auto",
 ) -> Iterator[Ask]:
     """A request per line typed; an empty line or the end of the input ends the capture."""
     while True:
-        say(f"pose at rest ({_wanted(convention, units)}; empty line ends):")
+        show(f"pose at rest ({_wanted(convention, units)}; empty line ends):")
         line = next(lines, "").strip().strip("[]p")
         if not line:
             return
         try:
             numbers = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
-            say("refused: not numbers; type the pose again")
+            show("refused: not numbers; type the pose again")
             continue
         try:
             named = BY_COUNT.get(len(numbers)) if convention == "auto" else convention
@@ -36,7 +36,7 @@ def typed_poses(
                 raise InputError(f"{len(numbers)} numbers; give {_wanted(convention, units)}")
             (pose,) = poses_from_numbers(np.array([numbers]), named, units, "typed")
         except InputError as error:
-            say(f"refused: {error}")
+            show(f"refused: {error}")
         else:
             yield Ask(pose)
 
@@ -46,6 +46,5 @@ def _wanted(convention: ConventionName, units: UnitsName) -> str:
         unit = "m, rad" if units == "auto" else units.replace("-", ", ")
         return f"x y z rx ry rz | x y z qx qy qz qw | 16 numbers by rows; {unit}"
     form = CONVENTIONS[convention]
-    unit = f"{'mm' if form.millimetres else 'm'}, {'deg' if form.degrees else 'rad'}"
     names = "16 numbers by columns" if convention == "franka" else " ".join(form.columns)
-    return f"{names}; {unit if units == 'auto' else units.replace('-', ', ')}"
+    return f"{names}; {', '.join(form.units(units))}"

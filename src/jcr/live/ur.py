@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from jcr.capture.capture_json import MOST_TURNS
+from jcr.capture.capture_json import MOST_ROTATION
 from jcr.errors import InputError
 from jcr.live.asks import pose_of_numbers
 from jcr.live.rest import State
@@ -28,7 +28,7 @@ JOINTS = 252
 
 
 def states(host: str, port: int) -> Iterator[State]:
-    """What the robot says from now on, 125 or 500 times a second.
+    """States of the robot from now on, 125 or 500 times a second.
 
     Raises InputError when the robot cannot be reached, falls silent or sends something else.
     """
@@ -61,5 +61,5 @@ def _state(head: bytes, read: Callable[[int], bytes], where: str) -> State:
     tool = struct.unpack_from("!6d", packet, offset)
     joints = np.array(struct.unpack_from("!6d", packet, JOINTS))
     # A last joint without limits may have gone round more often than a capture.json allows.
-    plausible = joints if (np.abs(joints) < MOST_TURNS).all() else None
+    plausible = joints if (np.abs(joints) < MOST_ROTATION).all() else None
     return State(struct.unpack_from("!d", packet, 4)[0], pose_of_numbers(list(tool), where), plausible)

@@ -17,7 +17,7 @@ POLL_S = 0.02
 
 
 def states(host: str) -> Iterator[State]:
-    """What the robot says from now on; the pose is that of the tool centre point set in UFACTORY Studio.
+    """States of the robot from now on; the pose is that of the tool centre point set in UFACTORY Studio.
 
     Nothing is commanded. Raises InputError when the package is missing, or the robot cannot be reached or hangs up.
     """

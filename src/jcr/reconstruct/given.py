@@ -45,7 +45,7 @@ def reconstruct(
         )
     rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
-    lens = capture.intrinsics or reader.read_lens(cameras, capture.image_size)
+    lens = capture.intrinsics or reader.read_intrinsics(cameras, capture.image_size)
     plan(len(known), capture.image_size, options.memory_gb)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:

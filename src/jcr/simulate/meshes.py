@@ -70,8 +70,8 @@ def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Me
 
     Within a profile the surface is shaded smooth; between profiles there is an edge.
     """
-    turn = np.linspace(0, 1, segments + 1)
-    ring = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], -1)
+    around = np.linspace(0, 1, segments + 1)
+    ring = np.stack([np.cos(2 * np.pi * around), np.sin(2 * np.pi * around)], -1)
     meshes = []
     for profile in profiles:
         radius, z = np.asarray(profile, float).T
@@ -79,7 +79,7 @@ def revolved(*profiles: Sequence[tuple[float, float]], segments: int = 48) -> Me
         vertices[..., :2] = radius[:, None, None] * ring
         vertices[..., 2] = z[:, None]
         along = np.r_[0.0, np.cumsum(np.hypot(np.diff(radius), np.diff(z)))]
-        uv = np.stack(np.broadcast_arrays(turn, (along / along[-1])[:, None]), -1)
+        uv = np.stack(np.broadcast_arrays(around, (along / along[-1])[:, None]), -1)
         meshes.append(_grid(vertices, uv))
     return _joined(meshes)
 
@@ -92,7 +92,7 @@ def tube(path: Float[ndarray, "n 3"], radius: float, segments: int = 12) -> Mesh
     plane_normal = np.cross(path[0] - path[len(path) // 2], path[-1] - path[len(path) // 2])
     side = np.broadcast_to(plane_normal / np.linalg.norm(plane_normal), path.shape)
     other = np.cross(tangent, side)
-    turn = np.linspace(0, 1, segments + 1)[None, :, None]
-    ring = np.cos(2 * np.pi * turn) * side[:, None] + np.sin(2 * np.pi * turn) * other[:, None]
+    around = np.linspace(0, 1, segments + 1)[None, :, None]
+    ring = np.cos(2 * np.pi * around) * side[:, None] + np.sin(2 * np.pi * around) * other[:, None]
     along = np.linspace(0, 1, len(path))[:, None]
-    return _grid(path[:, None] + radius * ring, np.stack(np.broadcast_arrays(turn[..., 0], along), -1))
+    return _grid(path[:, None] + radius * ring, np.stack(np.broadcast_arrays(around[..., 0], along), -1))

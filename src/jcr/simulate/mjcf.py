@@ -63,8 +63,8 @@ def to_mjcf(
 
 def _add_lamps(world: xml.Element, scene: Scene) -> None:
     """One lamp as a ring of weak ones: MuJoCo's shadows are hard, their sum is soft."""
-    for turn in 2 * np.pi * np.arange(_LAMPS) / _LAMPS:
-        at = scene.light_in_base + 0.12 * np.array([np.cos(turn), np.sin(turn), 0.0])
+    for angle in 2 * np.pi * np.arange(_LAMPS) / _LAMPS:
+        at = scene.light_in_base + 0.12 * np.array([np.cos(angle), np.sin(angle), 0.0])
         xml.SubElement(
             world,
             "light",

@@ -64,13 +64,13 @@ class TableObject:
         origin = self.base_from_object[:3, 3]
         outline = cv2.convexHull((x_in_base - origin)[:, :2].astype(np.float32))[:, 0]
         (x, y), (length, width), angle_deg = cv2.minAreaRect(outline)
-        turn = rotation_exp(np.radians([0.0, 0.0, angle_deg]))
+        rotation = rotation_exp(np.radians([0.0, 0.0, angle_deg]))
         return TrueObject(
             name=self.name,
             label=label,
             height=height,
             footprint_in_base=outline + origin[:2],
-            base_from_box=transform(turn, origin + [x, y, height / 2]),
+            base_from_box=transform(rotation, origin + [x, y, height / 2]),
             box_size=np.array([length, width, height]),
         )
 
@@ -89,9 +89,9 @@ def package(rng: np.random.Generator) -> TableObject:
     return _package("box", rng, rng.uniform((0.12, 0.09, 0.05), (0.17, 0.13, 0.08)))
 
 
-def held_package(rng: np.random.Generator) -> TableObject:
-    """A larger printed package, as a gripper would hold before a fixed camera."""
-    return _package("held", rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23)))
+def carried_package(rng: np.random.Generator) -> TableObject:
+    """A larger printed package, which a gripper carries before a fixed camera."""
+    return _package("carried", rng, rng.uniform((0.16, 0.11, 0.19), (0.2, 0.14, 0.23)))
 
 
 def book(rng: np.random.Generator) -> TableObject:
@@ -176,11 +176,11 @@ def mug(rng: np.random.Generator) -> TableObject:
     path = np.stack(
         [radius - 0.002 + 0.03 * np.cos(angle), 0 * angle, 0.52 * height + 0.3 * height * np.sin(angle)], -1
     )
-    picture = _wrap(textures.printed(rng, 320, 320, color))
+    print_around = _wrap(textures.printed(rng, 320, 320, color))
     return TableObject(
         "mug",
         (
-            Part(outside, color, picture),
+            Part(outside, color, print_around),
             Part(rest, color, shine=0.2),
             Part(tube(path, 0.0055), color, shine=0.2),
         ),

@@ -10,7 +10,7 @@ from jcr.simulate.poses import Pattern
 from jcr.simulate.scenes import SceneName, TableName
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
     """What to simulate."""
 

@@ -18,7 +18,7 @@ Cameras = Float[ndarray, "n 4 4"]
 
 # Azimuth and elevation (degrees, seen from the table; the robot stands at azimuth 180), distance (m) and roll
 # (degrees; 0: the top of the image points away from the robot). High left and right, three along x, sides:
-# any first few of them already turn about several axes and overlap.
+# any first few of them already rotate about several axes and overlap.
 _VIEWS = np.array(
     [
         (150, 62, 0.52, -15),
@@ -122,11 +122,11 @@ def _orbit(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.ra
 
 
 def _one_axis(count: int, target: ndarray, gripper_from_camera: ndarray, rng: np.random.Generator) -> Cameras:
-    turns = np.radians(np.linspace(-80, 80, count) + rng.uniform(-4, 4, count))
+    angles = np.radians(np.linspace(-80, 80, count) + rng.uniform(-4, 4, count))
     start = _look_at(target[None], *np.array([[180.0], [52.0], [0.55], [rng.uniform(-15, 15)]]))[0]
     about_target = transform(np.eye(3), target)
-    turned = transform(rotation_exp(turns[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
-    return about_target @ turned @ inverse(about_target) @ start
+    rotated = transform(rotation_exp(angles[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
+    return about_target @ rotated @ inverse(about_target) @ start
 
 
 def _translation(

@@ -49,7 +49,7 @@ def render(
     size = intrinsics.width, intrinsics.height
     fine = _SUPERSAMPLING * size[0], _SUPERSAMPLING * size[1]
     fovy = 2 * np.arctan(0.5 * intrinsics.height / intrinsics.fy)
-    with _renderers(*to_mjcf(scene, textured, fovy, fine), fine, size) as (model, data, picture, truth):
+    with _renderers(*to_mjcf(scene, textured, fovy, fine), fine, size) as (model, data, color, truth):
         label_of_geom = np.zeros(model.ngeom, np.uint8)
         for k in range(model.ngeom):
             if model.geom(k).name.startswith(LABEL_PREFIX):
@@ -57,9 +57,9 @@ def render(
         for matrix in base_from_camera:
             # MuJoCo's cameras look along -z with y up; ours along z with y down.
             data.cam_xpos[0], data.cam_xmat[0] = matrix[:3, 3], (matrix[:3, :3] * [1, -1, -1]).ravel()
-            picture.update_scene(data, CAMERA)
+            color.update_scene(data, CAMERA)
             # Blocks of pixels are averaged, so the centre of a pixel stays where it was.
-            image = cv2.resize(picture.render(), size, interpolation=cv2.INTER_AREA)
+            image = cv2.resize(color.render(), size, interpolation=cv2.INTER_AREA)
             if not with_truth:
                 yield View(image, None, None)
                 continue

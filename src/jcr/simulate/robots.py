@@ -6,7 +6,6 @@ transform differs from it by a constant that no pose shows.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -56,33 +55,6 @@ NEAREST, FARTHEST = 0.6, 1.5
 
 
 @dataclass(frozen=True)
-class ArmErrors:
-    """One-sigma errors of an arm's reported poses."""
-
-    white: tuple[float, float] = (0.0, 0.0)
-    """m, rad per axis, independent at each pose."""
-    sizes: ErrorSizes = ErrorSizes()
-    """Systematic errors, the same for all poses."""
-
-
-PresetName = Literal["white", "factory-calibrated", "typical", "poor", "low-cost"]
-
-
-def _bent(joint_offset_deg: float, link_mm: float) -> ArmErrors:
-    return ArmErrors((5e-5, np.radians(0.01)), ErrorSizes(np.radians(joint_offset_deg), 1e-3 * link_mm))
-
-
-PRESETS: dict[PresetName, ArmErrors] = {
-    "white": ArmErrors((5e-4, np.radians(0.1))),
-    "factory-calibrated": _bent(0.03, 0.1),
-    "typical": _bent(0.1, 0.3),
-    "poor": _bent(0.3, 1.0),
-    "low-cost": _bent(1.0, 1.0),
-}
-"""Random noise alone, or systematic errors beside a small repeatability (0.05 mm, 0.01°)."""
-
-
-@dataclass(frozen=True)
 class BentArm:
     """An arm with drawn errors."""
 
@@ -112,9 +84,9 @@ def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
 
 def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
     """A plausible gripper_from_camera (4,4) that looks where the gripper points."""
-    turn = np.cross([0.0, 0.0, 1.0], arm.forward)
-    angle = np.arctan2(np.linalg.norm(turn), arm.forward[2])
-    axis = turn / max(float(np.linalg.norm(turn)), 1e-12)
+    normal = np.cross([0.0, 0.0, 1.0], arm.forward)
+    angle = np.arctan2(np.linalg.norm(normal), arm.forward[2])
+    axis = normal / max(float(np.linalg.norm(normal)), 1e-12)
     return transform(rotation_exp(angle * axis), np.zeros(3)) @ random_hand_eye(rng)
 
 
@@ -271,7 +243,7 @@ def effective_about(
 
 def about_posture(arm: Arm, posture: Float[ndarray, " dof"], count: int, rng: np.random.Generator) -> Joints:
     """Joint angles (count,dof) about those of a posture; the wrist moves most."""
-    width = STRIDE * np.array([0.5, 0.5, 0.5, 1.5, 1.5, 2.0])
+    width = STRIDE * np.array([0.5] * (arm.dof - 3) + [1.5, 1.5, 2.0])
     return posture + width * rng.uniform(-1, 1, (count, arm.dof))
 
 

@@ -43,7 +43,7 @@ _GAP = 0.015
 """Between the bounding circles of neighbours, in metres."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
     """A table and what stands on it, in the robot's base frame."""
 
@@ -88,7 +88,13 @@ def make_scene(name: SceneName, seed: int, table: TableName | None = None) -> Sc
     body = Part(box(_TABLE_SIZE, ("+x", "-x", "+y", "-y", "-z")), (0.45, 0.42, 0.38))
     parts = tuple(replace(part, mesh=part.mesh.moved((0.0, 0.0, -_TABLE_SIZE[2]))) for part in (top, body))
     light = center + [lamp.uniform(-0.7, 0.3), lamp.uniform(-0.6, 0.6), lamp.uniform(1.4, 1.8)]
-    return Scene(name, parts, center, _placed(layout, things, center), light)
+    return Scene(
+        name=name,
+        table=parts,
+        table_center_in_base=center,
+        objects=_arranged(layout, things, center),
+        light_in_base=light,
+    )
 
 
 def moved(scene: Scene, center_in_base: Float[ndarray, "3"]) -> Scene:
@@ -117,7 +123,7 @@ def _table_top(rng: np.random.Generator, table: TableName, plain: bool) -> Part:
     return Part(box(_TABLE_SIZE, ("+z",)), (float(r), float(g), float(b)), texture, shine=0.0)
 
 
-def _placed(
+def _arranged(
     rng: np.random.Generator, things: Sequence[TableObject], center_in_base: Float[ndarray, "3"]
 ) -> tuple[TableObject, ...]:
     """The objects, each rotated at random, where the bounding circles of none overlap."""
@@ -126,8 +132,8 @@ def _placed(
     order = rng.permutation(len(things))
     for count, k in enumerate(order):
         # The first free spot on the way from the middle outwards, in ever new directions.
-        turn = rng.uniform(0, 2 * np.pi, 500)
-        tries = np.linspace(0, 0.5, 500)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        toward = rng.uniform(0, 2 * np.pi, 500)
+        tries = np.linspace(0, 0.5, 500)[:, None] * np.column_stack([np.cos(toward), np.sin(toward)])
         others = order[:count]
         clear = np.linalg.norm(tries[:, None] - spots[others], axis=-1) - radii[others] - radii[k]
         spots[k] = tries[(clear > _GAP).all(1).argmax()]
@@ -135,7 +141,7 @@ def _placed(
     spots -= (low + high) / 2
     placed = []
     for k, thing in enumerate(things):
-        turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
+        rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
         middle_in_base = center_in_base + np.append(spots[k], 0.0)
-        placed.append(replace(thing, base_from_object=transform(turn, middle_in_base)))
+        placed.append(replace(thing, base_from_object=transform(rotation, middle_in_base)))
     return tuple(placed)

@@ -1,6 +1,8 @@
 """What a camera and a robot make of the truth: intrinsics, the errors of cheaper cameras, poses as they are reported."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -9,6 +11,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.capture.images import encode_png
+from jcr.files import write_bytes
 from jcr.geometry import retract
 from jcr.records import Intrinsics
 from jcr.simulate.options import SimulateOptions
@@ -37,6 +40,13 @@ def with_lens_error(camera: Intrinsics, percent: float, rng: np.random.Generator
     )
 
 
+def stated_intrinsics(
+    camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
+) -> Intrinsics | None:
+    """The intrinsics that capture.json gives: with the errors that the options ask for, or None where it gives none."""
+    return None if options.unknown_intrinsics else with_lens_error(camera, options.lens_error, rng)
+
+
 def with_robot_noise(
     base_from_gripper: Float[ndarray, "n 4 4"],
     translation_mm: float,
@@ -62,6 +72,19 @@ def degraded(
     if options.noise:
         light += rng.normal(0, options.noise, image.shape)
     return np.clip(light + 0.5, 0, 255).astype(np.uint8)
+
+
+def image_suffix(options: SimulateOptions) -> str:
+    """The ending of the images' names, without dot."""
+    return "png" if options.jpeg_quality == "lossless" else "jpg"
+
+
+def write_image(
+    path: Path, pixels: UInt8[ndarray, "h w 3"], options: SimulateOptions, stream: Sequence[int]
+) -> None:
+    """Write what the camera of the options takes of `pixels`; its noise is the stream's of the options' seed."""
+    rng = np.random.default_rng([options.seed, *stream])
+    write_bytes(path, encoded(degraded(pixels, options, rng), options.jpeg_quality))
 
 
 def encoded(image: UInt8[ndarray, "h w 3"], jpeg_quality: int | Literal["lossless"]) -> bytes:

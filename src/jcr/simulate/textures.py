@@ -54,11 +54,11 @@ def printed(rng: np.random.Generator, height: int, width: int, color: Color) -> 
     for _ in range(16):
         center = int(rng.uniform(0, width)), int(rng.uniform(band, height))
         axes = tuple(int(v) for v in rng.uniform(0.04, 0.2, 2) * min(height, width))
-        ink, turn_deg = inks[rng.integers(len(inks))], float(rng.uniform(0, 180))
+        ink, angle_deg = inks[rng.integers(len(inks))], float(rng.uniform(0, 180))
         if rng.random() < 0.5:
-            cv2.ellipse(image, center, axes, turn_deg, 0, 360, ink, -1, cv2.LINE_AA)
+            cv2.ellipse(image, center, axes, angle_deg, 0, 360, ink, -1, cv2.LINE_AA)
         else:
-            corners = cv2.boxPoints((center, (2.0 * axes[0], 2.0 * axes[1]), turn_deg))
+            corners = cv2.boxPoints((center, (2.0 * axes[0], 2.0 * axes[1]), angle_deg))
             cv2.fillConvexPoly(image, corners.round().astype(np.int32), ink, cv2.LINE_AA)
     font = _FONTS[rng.integers(len(_FONTS))]
     _write(image, str(rng.choice(_WORDS)), (0.08, 0.12, 0.84, 0.7 * band / height), lettering, font)

@@ -28,7 +28,7 @@ SliceOf = Literal["distance", "occupancy", "unknown"]
 
 @dataclass(frozen=True)
 class MapPoints:
-    """Points near seen surfaces with what the map says there, none nobody has seen."""
+    """Points near seen surfaces with the values of the map there; none in unseen space."""
 
     points_in_base: Float[ndarray, "n 3"]
     occupancy: Float[ndarray, " n"]

@@ -23,7 +23,7 @@ GREY = 128
 """Of images that are not to be had."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewedRun:
     """Cameras, grippers, points and map of a run, in the base frame."""
 
@@ -36,9 +36,9 @@ class ViewedRun:
     """Of all images where the robot's poses are known, else of the registered ones as the calibration puts them."""
     gripper_image: Int[ndarray, " n"]
     """Row of `calibration.images` that each gripper pose belongs to."""
-    lens: Intrinsics
-    """Undistorted, of `pictures`."""
-    pictures: UInt8[ndarray, "m h w 3"]
+    intrinsics: Intrinsics
+    """Undistorted, of `pixels`."""
+    pixels: UInt8[ndarray, "m h w 3"]
     tracks_in_base: Float[ndarray, "p 3"]
     cloud: PointCloud
     scene: SceneMap | None
@@ -64,7 +64,7 @@ def read_run(out: Path) -> ViewedRun:
         base_from_gripper = base_from_camera @ inverse(np.array(calibration.gripper_from_camera))
         gripper_image = reconstruction.image_index
         notes.append(f"grippers stand where the calibration puts them, not where the robot did: {error}")
-    lens, pictures = _pictures(reconstruction, capture)
+    intrinsics, pixels = _undistorted_images(reconstruction, capture)
     scene = None
     if folder.has_map():
         scene = folder.scene()
@@ -77,8 +77,8 @@ def read_run(out: Path) -> ViewedRun:
         base_from_camera=base_from_camera,
         base_from_gripper=base_from_gripper,
         gripper_image=gripper_image,
-        lens=lens,
-        pictures=pictures,
+        intrinsics=intrinsics,
+        pixels=pixels,
         tracks_in_base=apply_similarity(base_from_recon, scale, reconstruction.tracks.points_in_recon),
         cloud=_pointmap_cloud(reconstruction, base_from_camera, base_from_recon, scale)
         if scene is None
@@ -88,7 +88,7 @@ def read_run(out: Path) -> ViewedRun:
     )
 
 
-def _pictures(
+def _undistorted_images(
     reconstruction: Reconstruction, capture: Capture | None
 ) -> tuple[Intrinsics, UInt8[ndarray, "m h w 3"]]:
     """The registered images without distortion, and their camera; grey where neither run nor capture has them."""

@@ -1,4 +1,4 @@
-"""The web server of the viewer: viser, held to this machine and one port, its sharing through others' machines off."""
+"""The web server of the viewer: viser on this machine and one port alone, its sharing through others' machines off."""
 
 import io
 import socket

@@ -57,7 +57,7 @@ class Viewer:
         self.server, self.run, self.scene, self._lock = server, run, run.scene, threading.Lock()
         self.joint_values = joint_values
         server.scene.set_up_direction("+z")
-        self._said = server.gui.add_markdown(self._verdict())
+        server.gui.add_markdown(self._verdict())
         report("view", 0.1)
         self._add_capture()
         self.robot = None
@@ -96,7 +96,7 @@ class Viewer:
         return "\n\n".join([*lines, *self.run.notes])
 
     def _add_capture(self) -> None:
-        server, run, lens = self.server, self.run, self.run.lens
+        server, run, intrinsics = self.server, self.run, self.run.intrinsics
         server.scene.add_frame("/base", axes_length=0.1, axes_radius=0.003)
         server.scene.add_label("/base/name", "base")
         self._grid = server.scene.add_grid(
@@ -108,8 +108,11 @@ class Viewer:
             fade_from="origin",
         )
         self.frusta, self.grippers = [], []
-        fov, aspect = 2 * float(np.arctan2(lens.height / 2, lens.fy)), lens.width / lens.height
-        step = max(1, lens.width // 160)
+        fov, aspect = (
+            2 * float(np.arctan2(intrinsics.height / 2, intrinsics.fy)),
+            intrinsics.width / intrinsics.height,
+        )
+        step = max(1, intrinsics.width // 160)
         for k, pose in enumerate(run.base_from_camera):
             frustum = server.scene.add_camera_frustum(
                 f"/cameras/{k}",
@@ -118,7 +121,7 @@ class Viewer:
                 scale=REACH,
                 thickness=2.0,
                 thickness_units="screen",
-                image=run.pictures[k, ::step, ::step],
+                image=run.pixels[k, ::step, ::step],
                 wxyz=_wxyz(pose),
                 position=pose[:3, 3],
             )
@@ -187,7 +190,7 @@ class Viewer:
             np.zeros((2, 2, 4), np.uint8),
             float(high[0] - low[0]),
             float(high[1] - low[1]),
-            # viser's pictures have y downwards, as the base seen from above has it upwards.
+            # viser's images have y downwards, as the base seen from above has it upwards.
             wxyz=(0.0, 1.0, 0.0, 0.0),
             visible=False,
         )
@@ -245,18 +248,21 @@ class Viewer:
                     self.robot.update_cfg(self.joint_values[pose[0]])
 
     def _show_photo(self, camera: int | None) -> None:
-        """The chosen camera's photograph before it, so that from there it lies over what the map says."""
+        """The chosen camera's photograph before it, so that from there it lies over the map."""
         share = self.photo.value / 100
         self._photo.visible = camera is not None and share > 0
         if camera is None or share == 0:
             return
-        lens, pose = self.run.lens, self.run.base_from_camera[camera]
+        intrinsics, pose = self.run.intrinsics, self.run.base_from_camera[camera]
         for frustum in self.frusta:  # theirs would lie before it
             frustum.visible = False
-        opaque = np.full((*self.run.pictures.shape[1:3], 1), round(255 * share), np.uint8)
-        self._photo.image = np.concatenate([self.run.pictures[camera], opaque], axis=-1)
-        size, focal = np.array([lens.width, lens.height]), np.array([lens.fx, lens.fy])
-        middle = ((size - 1) / 2 - [lens.cx, lens.cy]) / focal
+        opaque = np.full((*self.run.pixels.shape[1:3], 1), round(255 * share), np.uint8)
+        self._photo.image = np.concatenate([self.run.pixels[camera], opaque], axis=-1)
+        size, focal = (
+            np.array([intrinsics.width, intrinsics.height]),
+            np.array([intrinsics.fx, intrinsics.fy]),
+        )
+        middle = ((size - 1) / 2 - [intrinsics.cx, intrinsics.cy]) / focal
         self._photo.render_width, self._photo.render_height = (BEFORE * size / focal).tolist()
         self._photo.wxyz = _wxyz(pose)
         self._photo.position = apply(pose, BEFORE * np.array([*middle, 1.0]))
@@ -271,7 +277,7 @@ class Viewer:
         pose = self.run.base_from_camera[camera]
         with client.atomic():
             client.camera.wxyz, client.camera.position = _wxyz(pose), pose[:3, 3]
-            client.camera.fov = 2 * float(np.arctan2(self.run.lens.height / 2, self.run.lens.fy))
+            client.camera.fov = 2 * float(np.arctan2(self.run.intrinsics.height / 2, self.run.intrinsics.fy))
 
     def show_points(self) -> None:
         """Draw the points that are asked for: the cloud, or those of the map over the threshold."""

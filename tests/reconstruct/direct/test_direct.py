@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.camera import rays
 from jcr.capture.images import read_image
@@ -26,7 +27,6 @@ from jcr.reconstruct.direct.photometric import (
 from jcr.reconstruct.direct.search import starts_from_nothing
 from jcr.records import Intrinsics
 from jcr.simulate.capture import SimulateOptions, simulate
-from jcr.simulate.truth import read_truth
 
 pytestmark = pytest.mark.slow
 

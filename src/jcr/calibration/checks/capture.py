@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from jcr.calibration.case import Case
 from jcr.calibration.checks.checked import Checked
-from jcr.capture.checks import how_turned
+from jcr.capture.checks import how_rotated
 from jcr.handeye.observability import observability
 from jcr.records import Finding, Kind
 
@@ -39,7 +39,7 @@ def check_arm(case: Case) -> Checked:
 
 def check_images(case: Case) -> Checked:
     """That the images were rotated to be read."""
-    rotated = how_turned(case.capture)
+    rotated = how_rotated(case.capture)
     return Checked(() if rotated is None else (rotated,))
 
 
