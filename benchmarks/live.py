@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from benchmarks.simulated.arm_errors import PRESETS
 from jcr.calibration.options import CalibrateOptions
 from jcr.geometry import apply, inverse, retract, rotation_angle, transform
 from jcr.handeye.arms import RobotName, arm_named
@@ -20,7 +21,6 @@ from jcr.records import Intrinsics
 from jcr.simulate.poses import looking_at
 from jcr.simulate.render import render
 from jcr.simulate.robots import (
-    PRESETS,
     BentArm,
     bend,
     effective_about,

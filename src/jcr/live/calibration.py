@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
 from jcr.calibration.case import Case, some_of_many
@@ -29,7 +29,7 @@ from jcr.live.arm_words import ArmWords
 from jcr.live.arm_words import Path as ArmPath
 from jcr.live.calibration_left_out import left_out
 from jcr.live.calibration_progress import LeftOut, Progress, Reached
-from jcr.live.coverage import ALTERNATIVES, reachable
+from jcr.live.coverage import reachable
 from jcr.live.folder import LiveFolder
 from jcr.live.look import STILL, grid
 from jcr.options import checked_options
@@ -48,6 +48,11 @@ OBSERVATIONS = 300, 8000
 FEW = 5
 """Images from which on there is a calibration, or a finding that says what is missing."""
 MOST_POINTS = 3000
+PROPOSALS = 12
+"""Poses of which the first is proposed that the arm reaches and whose image is likely to register."""
+ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
+"""Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
+of its camera from where an image did not register."""
 
 
 class LiveCalibration:
@@ -322,17 +327,31 @@ class LiveCalibration:
         poses, names = case.base_from_gripper[used], [case.names[row] for row in used]
         pose: NextPose = hand_eye.next_poses[0]
         joints = None
-        is_bounded = self._reach is not None or self._arm is not None
-        if is_bounded and not hand_eye.converged:
+        if not hand_eye.is_sound:
             return self._before_calibration(case.capture)
-        if is_bounded:
-            ahead = Ahead.of(assumptions, poses, robot.of(used), ALTERNATIVES, self._reach)
+        is_bounded = self._reach is not None or self._arm is not None
+        registers = self._registers(case, pose.base_from_gripper[None])[0]
+        if is_bounded or not registers:
+            ahead = Ahead.of(assumptions, poses, robot.of(used), PROPOSALS, self._reach)
+            likely = self._registers(case, ahead.added)
+            ahead = replace(ahead, added=ahead.added[likely if likely.any() else slice(None)])
             angles = case.capture.joints
             of_used = None if angles is None else angles[case.reconstruction.image_index[used]]
             row, joints = reachable(ahead.added, ArmPath(poses, of_used), ArmWords(arm=self._arm))
             ahead = replace(ahead, added=ahead.added[row : row + 1])
             pose = ahead.next_pose(1, ahead.expected(1))
         return {"next_pose": pose, "next_joints": joints, "next_like": names[pose.like]}
+
+    def _registers(self, case: Case, added: Float[ndarray, "c 4 4"]) -> Bool[ndarray, " c"]:
+        """Which gripper poses are likely to give an image that registers: one that looks along nearly the same line as
+        another from nearly the same distance, and not from where an image did not register."""
+        x, capture = case.hand_eye.gripper_from_camera, case.capture
+        there = np.isin(np.arange(len(capture)), case.reconstruction.image_index)
+        camera, known = added @ x, capture.base_from_gripper[there] @ x
+        angle = np.arccos(np.clip(camera[:, :3, 2] @ known[:, :3, 2].T, -1, 1)).min(1)
+        failed = capture.base_from_gripper[~there] @ x
+        away = np.linalg.norm(camera[:, None, :3, 3] - failed[:, :3, 3], axis=2).min(1, initial=np.inf)
+        return (angle < ALIKE) & (away > ELSEWHERE_M)
 
 
 def _first(capture: Capture, count: int) -> Capture:
@@ -350,8 +369,8 @@ def _too_few(images: int) -> list[Finding]:
 
 
 def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
-    """Images whose gripper poses an accepted calibration leaves out, and where their cameras show the gripper."""
-    if not hand_eye.converged:
+    """Images whose gripper poses a sound calibration leaves out, and where their cameras show the gripper."""
+    if not hand_eye.is_sound:
         return []
     images = hand_eye.images
     return [

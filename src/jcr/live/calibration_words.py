@@ -5,6 +5,7 @@ import numpy as np
 from jcr.live.arm_words import ArmWords, pose_lines
 from jcr.live.asks import Answer
 from jcr.live.calibration_progress import Progress, Reached
+from jcr.records import Kind
 from jcr.records.findings import without_consequences
 from jcr.records.words import sentence
 from jcr.rounding import significant
@@ -27,7 +28,9 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
             f"{significant(proof.rotation_deg)}° (rms), {verdict}"
         )
     lines += [
-        f"  {sentence(one)}" for one in without_consequences(state.findings) if one.severity != "informs"
+        f"  {sentence(one)}"
+        for one in without_consequences(state.findings)
+        if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
     ]
     if (pose := state.next_pose) is not None:
         moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
@@ -47,7 +50,7 @@ def _accuracy(state: Progress, require: tuple[float, float] | None) -> str:
     if state.now is None or state.hand_eye is None:
         return "no calibration yet"
     asked = "" if require is None else f"; {require[0]:g} mm and {require[1]:g}° are required"
-    verdict = "" if state.hand_eye.converged else ", rejected"
+    verdict = "" if state.hand_eye.is_sound else ", rejected"
     return f"± {_pair(state.now)} (95 % of errors of a seen point){verdict}{asked}"
 
 
