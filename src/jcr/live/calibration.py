@@ -344,7 +344,7 @@ class LiveCalibration:
 
     def _registers(self, case: Case, added: Float[ndarray, "c 4 4"]) -> Bool[ndarray, " c"]:
         """Which gripper poses are likely to give an image that registers: one that looks along nearly the same line as
-        another from nearly the same distance, and not from where an image did not register."""
+        an image that registered, and not from where one did not."""
         x, capture = case.hand_eye.gripper_from_camera, case.capture
         there = np.isin(np.arange(len(capture)), case.reconstruction.image_index)
         camera, known = added @ x, capture.base_from_gripper[there] @ x

@@ -27,7 +27,7 @@ from jcr.live.calibration_progress import LeftOut
 from jcr.records import Capture, Reconstruction, Tracks
 
 GROUPS = 3
-LEAST = 6
+LEAST = 5
 """Images that a calibration without a group must keep."""
 OBSERVATIONS = 150
 """An image, of a calibration without a group."""
