@@ -49,7 +49,7 @@ FEW = 5
 """Images from which on there is a calibration, or a finding that says what is missing."""
 MOST_POINTS = 3000
 PROPOSALS = 12
-"""Poses of which the first is proposed that the arm reaches and whose image is likely to register."""
+"""Poses that are compared; the first that the arm reaches and whose image is likely to register is proposed."""
 ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
 """Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
 of its camera from where an image did not register."""
