@@ -24,9 +24,9 @@ from jcr.geometry import (
 )
 from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
-from jcr.reconstruct.global_alignment.align import AlignOptions, align
+from jcr.reconstruct.global_alignment.align import align, align_with_robot
+from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
-from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 
 SMALL, MIDDLE, LARGE = (64, 48), (128, 96), (512, 384)
 

@@ -13,8 +13,9 @@ from scipy.stats import chi2
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.intrinsics_prior import prior_of
-from jcr.adjust.robots import Adjusted, Placed, adjust
+from jcr.adjust.robots import Adjusted, Placed
 from jcr.adjust.scene import Freedom, Scene
+from jcr.adjust.together import adjust
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture

@@ -18,17 +18,10 @@ from jcr.handeye.inverse_kinematics import reach_toward
 from jcr.live.calibration import LiveCalibration
 from jcr.live.calibration_progress import Progress
 from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import BentArm, bend
 from jcr.simulate.poses import looking_at
 from jcr.simulate.render import render
-from jcr.simulate.robots import (
-    BentArm,
-    bend,
-    effective_about,
-    hand_eye_on,
-    table_center,
-    view_size,
-    views,
-)
+from jcr.simulate.robots import effective_about, hand_eye_on, table_center, view_size, views
 from jcr.simulate.scenes import Scene, make_scene, moved
 from jcr.simulate.taken import pinhole
 

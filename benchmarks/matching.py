@@ -93,7 +93,7 @@ def reference_of(folder: Path) -> Reference:
 def by_board(folder: Path, board: str) -> Reference | None:
     """The marker back end's from a board in the images; None where it rejects it."""
     capture = read_capture(folder)
-    hand_eye = calibrate(capture, marker.reconstruct(capture, board))
+    hand_eye = calibrate(capture, marker.reconstruct_marker(capture, board))
     return (
         Reference(hand_eye.gripper_from_camera, hand_eye.covariance[:6, :6]) if hand_eye.converged else None
     )

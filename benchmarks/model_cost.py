@@ -9,7 +9,7 @@ import sys
 
 from jcr.extras import is_installed
 from jcr.reconstruct.backends import BACKENDS
-from jcr.reconstruct.views_at_once.cost import Cost
+from jcr.reconstruct.views_at_once.views_at_once import Cost
 
 HEAD = (
     "network",

@@ -22,9 +22,9 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import step_between
 from jcr.reconstruct import backends
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions
+from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.views_at_once import da3
-from jcr.reconstruct.views_at_once.cost import Cost
-from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
+from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 from jcr.records import Capture, HandEye, Reconstruction
 from jcr.represent.cloud import point_cloud
 from jcr.segment.labels import read_labels
@@ -156,14 +156,15 @@ def _methods(
 
     def predicted(errors: ViewErrors, refined: bool) -> Callable[[Capture], Reconstruction]:
         options = ViewsOptions(
-            "da3",
-            da3.load,
-            Path("simulated"),
-            BACKENDS["da3"].licence,
-            Cost(0.0, 0.0, 0.0, 0.0),
+            backend="da3",
+            load=da3.load,
+            weights=Weights(Path("simulated"), "simulated", BACKENDS["da3"].licence),
+            cost=Cost(0.0, 0.0, 0.0, 0.0),
             refined=refined,
         )
-        return lambda capture: reconstruct(capture, options, predict=predictions(place, errors, seed))
+        return lambda capture: reconstruct_views_at_once(
+            capture, options, predict=predictions(place, errors, seed)
+        )
 
     def by_name(name: str) -> Callable[[Capture], Reconstruction]:
         return lambda capture: backends.reconstruct(capture, ReconstructOptions(name))

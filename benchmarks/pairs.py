@@ -87,10 +87,10 @@ def measure(way: Callable[[], PairPredictions]) -> Measured:
 
 def encode_once(network: Dust3r, images: PreparedImages) -> PairPredictions:
     """As `jcr predict` does, without its cache."""
-    loaded = LoadedNetwork(network, "random", "", is_metric=False)
+    loaded = LoadedNetwork(network, is_metric=False)
     count = len(images.colors)
     names, poses = tuple(map(str, range(count))), np.tile(np.eye(4), (count, 1, 1))
-    return predict_pairs(loaded, images, names, poses, PairOptions("complete", cache_gb=0))[0]
+    return predict_pairs(loaded, images, names, poses, PairOptions(pair_graph="complete", cache_gb=0))[0]
 
 
 @torch.inference_mode()

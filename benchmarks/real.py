@@ -29,7 +29,7 @@ from jcr.geometry import (
 )
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
-from jcr.reconstruct.marker import reconstruct
+from jcr.reconstruct.marker import reconstruct_marker
 from jcr.records import Capture, HandEye, HeldOut, Intrinsics, coefficients_of
 
 
@@ -199,7 +199,7 @@ def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) ->
         return []
     blind = replace(capture, intrinsics=None)
     try:
-        found = reconstruct(blind, board)
+        found = reconstruct_marker(blind, board)
         hand_eye = calibrate_stage(blind, found)
     except NotTrustedError:
         return []

@@ -1,4 +1,5 @@
-"""Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas.
+"""Writes the pages of the reference that are read from the source: cli.md, api.md, formats.md and their schemas, and
+the table of backends.md.
 
 `docs/conf.py` calls it before the site is built; `python docs/generated.py` does the same. The pages are committed, for
 those who read them in the repository or by `jcr docs`; a test holds them to the source.
@@ -20,29 +21,19 @@ import jcr
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS
-from jcr.cli.help import Argument, groups
+from jcr.cli.arguments import Argument, groups
+from jcr.cli.models import SCALES
 from jcr.depth.depth_npz import About as DepthAbout
+from jcr.pages import pages
+from jcr.reconstruct.backends import BACKENDS
 from jcr.reconstruct.reconstruction_npz import About
 from jcr.run_folder import State
 
 REFERENCE = Path(__file__).parent / "reference"
 SCHEMAS = REFERENCE / "schemas"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "01_quick_start.py"
-RESULTS_OF_CALLS = (
-    "jcr.results:RunResult",
-    "jcr.results:SavedRun",
-    "jcr.calibration.difference:Difference",
-    "jcr.verify:Verification",
-    "jcr.touch_test:Touched",
-    "jcr.records:Requirement",
-    "jcr.records:Capture",
-    "jcr.records:HandEye",
-    "jcr.records:Reconstruction",
-    "jcr.records:Pointmaps",
-    "jcr.represent.scene:SceneMap",
-    "jcr.represent.sample:Sample",
-)
-"""What the functions of the package return, and a user reads."""
+RESULTS_OF_CALLS = ("jcr.records:Pointmaps",)
+"""What is in a record of the package, is no name of its own, and a user reads."""
 FORMATS = {
     "calibration.json": (
         CalibrationFile,
@@ -52,7 +43,7 @@ FORMATS = {
     "run.json": (State, "The state of a run folder: capture, options, fingerprint of the reconstruction."),
     "reconstruction.npz": (
         About,
-        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#reconstruction).",
+        "The array `about` in it, as JSON; other arrays have the names of [Reconstruction](api.md#jcrreconstruction).",
     ),
     "depth.npz": (
         DepthAbout,
@@ -128,7 +119,7 @@ def api_page() -> str:
     ]
     for name in jcr.__all__:
         parts += _entry(f"jcr.{name}", getattr(jcr, name))
-    parts += ["## What functions return", ""]
+    parts += ["## Parts of these", ""]
     for place in RESULTS_OF_CALLS:
         module, _, name = place.partition(":")
         parts += _entry(name, getattr(import_module(module), name), "###")
@@ -318,7 +309,50 @@ def _type(value: dict[str, Any]) -> str:
     return str(value.get("type", "any"))
 
 
-PAGES = {"cli.md": cli_page, "api.md": api_page, "formats.md": formats_page}
+def backends_page() -> str:
+    """The page of back ends with its table as the source has it."""
+    head = [
+        "back end",
+        "options of its own",
+        "auto",
+        "scale",
+        "parameters",
+        "download",
+        "licence",
+        "measured",
+    ]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for row in BACKENDS.values():
+        flags = [f"`--{name.replace('_', '-')}`" for name in row.options]
+        cells = [
+            f"`{row.name}`",
+            ", ".join(flags),
+            "yes" if row.auto else "no",
+            SCALES[row.metric],
+            f"{row.parameters} M" if row.parameters else "",
+            f"{row.download_gb:g} GB" if row.download_gb else "",
+            row.licence,
+            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    written = (REFERENCE / "backends.md").read_text("utf-8")
+    return re.sub(
+        r"(?m)^\| back end \| options of its own(?:.*\n\|)*.*$", lambda _: "\n".join(lines), written
+    )
+
+
+def _link(named: re.Match[str]) -> str:
+    """From the page of back ends to the one that a command prints."""
+    file = pages()[named[1]]
+    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
+
+
+PAGES = {
+    "api.md": api_page,
+    "backends.md": backends_page,
+    "cli.md": cli_page,
+    "formats.md": formats_page,
+}
 """What writes each page."""
 
 if __name__ == "__main__":

@@ -193,6 +193,7 @@ def networks(folder: Path) -> dict[str, Target]:
     import torch
 
     from jcr.reconstruct.dust3r.weights import load_weights
+    from jcr.reconstruct.hub import Weights
 
     folder.mkdir()
     shape = (2, 4, 4)
@@ -204,7 +205,9 @@ def networks(folder: Path) -> dict[str, Target]:
         "pairs.npz": Target(
             folder / "pairs.npz", lambda file: pairs_from_arrays(read_arrays(file), file.name)
         ),
-        "weights.pth": Target(folder / "weights.pth", lambda file: load_weights(str(file), "cpu")),
+        "weights.pth": Target(
+            folder / "weights.pth", lambda file: load_weights(Weights(file, file.name, "unknown"))
+        ),
     }
 
 
@@ -245,7 +248,9 @@ def sound_run(out: Path) -> Path:
         frames.append({"image": name, "base_from_gripper": pose.tolist()})
     (out / "capture" / "capture.json").write_text(json.dumps({"frames": frames}))
     pairs = PosePairs(out, names, problem.base_from_gripper, problem.recon_from_camera, False)
-    attempt = Attempt("colmap", RUN_IMAGES, 1.0, 0.5, None)
+    attempt = Attempt(
+        backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
+    )
     content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
     lens = {
         "fx": 90.0,

@@ -1,10 +1,13 @@
 """The names of the package, and that pycolmap may be imported before or after it."""
 
+import inspect
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import cv2
 import numpy as np
@@ -17,6 +20,7 @@ from jcr import deflate
 from jcr.capture.images import encode_png
 from jcr.capture.options import ReadOptions
 from jcr.options import checked_options
+from jcr.reconstruct.backends import BACKENDS
 from jcr.results import RunOptions
 
 
@@ -30,6 +34,54 @@ def test_the_api_is_listed_and_every_name_of_it_is_there():
     assert len(set(jcr.__all__)) == len(jcr.__all__)
     with pytest.raises(AttributeError, match="no attribute 'calibrated'"):
         _ = jcr.calibrated  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _types_of(hint: object) -> set[type]:
+    return {hint} if isinstance(hint, type) else set().union(*map(_types_of, get_args(hint)))
+
+
+def test_every_type_of_a_public_function_has_a_public_name():
+    pytest.importorskip("torch")
+    public = {getattr(jcr, name) for name in jcr.__all__}
+    sources = {"Measured": jcr.Measured, "SceneMap": jcr.SceneMap}
+    for function in filter(inspect.isfunction, public):
+        hints = get_type_hints(function, {**function.__globals__, **sources})
+        ours = {
+            kind for hint in hints.values() for kind in _types_of(hint) if kind.__module__.startswith("jcr")
+        }
+        assert ours <= public, function
+    for record in (jcr.RunOptions, jcr.RunResult):
+        hints = get_type_hints(record, {**vars(sys.modules[record.__module__]), **sources})
+        ours = {
+            kind for hint in hints.values() for kind in _types_of(hint) if kind.__module__.startswith("jcr")
+        }
+        assert ours <= public, record
+
+
+def test_help_of_run_names_the_back_ends():
+    assert all(repr(name) in str(inspect.signature(jcr.run)) for name in ("auto", *BACKENDS))
+
+
+def test_names_of_the_first_release_still_work_and_warn(tmp_path: Path):
+    assert jcr.NotTrustedError is jcr.RejectedError
+    with (
+        pytest.warns(DeprecationWarning, match="images"),
+        pytest.raises(jcr.InputError, match="holds no run"),
+    ):
+        jcr.add_camera(tmp_path, "overhead", pictures="overhead.png")
+    with pytest.raises(jcr.InputError, match="overhead: no images"):
+        jcr.add_camera(tmp_path, "overhead")
+    with (
+        pytest.warns(DeprecationWarning, match="ExportOptions"),
+        pytest.raises(jcr.InputError, match="parnt"),
+    ):
+        jcr.export_run(tmp_path, "ros2", parnt_frame="tool0")
+
+
+def test_notebooks_show_records_as_tables(tabletop: Path):
+    capture = jcr.read_capture(tabletop)
+    shown = replace(capture, robot="<ur5>")._repr_html_()
+    assert f"{len(capture)} of 640 x 480 px" in shown and "&lt;ur5&gt;" in shown and "<ur5>" not in shown
 
 
 @pytest.mark.slow

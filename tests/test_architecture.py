@@ -2,7 +2,6 @@
 
 import ast
 import sys
-from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -89,18 +88,6 @@ def imports(file: Path) -> list[str]:
     ]
 
 
-def imports_when_loaded(body: list[ast.stmt]) -> Iterator[str]:
-    """Without what functions import when they are called, and what only type checkers read."""
-    for node in body:
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            yield from named(node)
-        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            yield from imports_when_loaded(node.orelse)
-        elif not isinstance(node, ast.FunctionDef):
-            for part in ("body", "orelse", "handlers", "finalbody"):
-                yield from imports_when_loaded(getattr(node, part, []))
-
-
 def room(file: Path) -> str:
     return file.relative_to(SOURCE).parts[0].removesuffix(".py")
 
@@ -157,12 +144,27 @@ def test_hand_eye_calibration_takes_arrays_and_gives_arrays():
     assert not against
 
 
-def test_no_file_needs_itself_to_be_loaded():
-    graph = {}
-    for module, file in FILES.items():
-        others = set(imports_when_loaded(ast.parse(file.read_text()).body))
-        graph[module] = (others & set(FILES)) - {module}
+PUBLIC = "jcr"
+"""The package itself names what the modules below it offer, and they ask it for the version: no circle of ideas."""
+KNOWN_CIRCLES = [
+    {"jcr.records.assessed", "jcr.records.calibration", "jcr.records.words"},
+    {"jcr.calibration.calibration_json", "jcr.calibration.uncertainty_json", "jcr.calibration.words"},
+    {"jcr.live.camera", "jcr.live.realsense"},
+]
+"""Modules whose imports of one another are not yet undone; the list only shrinks."""
+
+
+def test_no_module_knows_a_module_that_knows_it():
+    """Imports within functions count, and those that only type checkers read: both are knowledge of the other."""
+    graph = {
+        module: (set(imports(file)) & set(FILES)) - {module, PUBLIC}
+        for module, file in FILES.items()
+        if module != PUBLIC
+    }
     assert sum(map(len, graph.values())) > len(FILES), "the imports are read"
+    for circle in KNOWN_CIRCLES:
+        for module in circle & set(graph):
+            graph[module] -= circle
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:

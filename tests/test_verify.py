@@ -21,7 +21,7 @@ from jcr.cli import dispatch
 from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.handeye.arms import arm_named
 from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.fit import fit_poses
+from jcr.handeye.fit import PoseProblem, fit_poses
 from jcr.handeye.systematic import arm_errors, posed, smooth_errors
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.reconstruction_npz import write_reconstruction
@@ -117,7 +117,15 @@ def drifts(
         SCALE,
         inverse(transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))),
     )
-    fit = fit_poses(reported[:OLD], places[:OLD], start, np.ones(OLD, bool))
+    fit = fit_poses(
+        PoseProblem(
+            base_from_gripper=reported[:OLD],
+            recon_from_camera=places[:OLD],
+            used=np.ones(OLD, bool),
+            systematic=smooth_errors(reported[:OLD]),
+        ),
+        start,
+    )
     spread = np.broadcast_to(np.diag(camera_std**2), (len(rows), 6, 6))
     systematic = smooth_errors(np.concatenate([reported[:OLD], reported[rows]]))
     return drift(
@@ -137,9 +145,13 @@ def test_joint_angles_show_a_drift_that_poses_of_a_bent_arm_hide():
         bumped[OLD:, :3, 3] += 1e-3 / made.scale * camera[OLD:, :3, 0]
         for systematic in covariances:
             of_used = systematic[: 6 * OLD, : 6 * OLD]
-            fit = fit_poses(
-                gripper[of_old], camera[of_old], start, np.ones(OLD, bool), systematic=of_used, averaged=False
+            problem = PoseProblem(
+                base_from_gripper=gripper[of_old],
+                recon_from_camera=camera[of_old],
+                used=np.ones(OLD, bool),
+                systematic=of_used,
             )
+            fit = fit_poses(problem, start, averaged=False)
             for cameras in (camera, bumped):
                 new = gripper[OLD:], cameras[OLD:], np.broadcast_to(1e-10 * np.eye(6), (3, 6, 6))
                 shown.append(drift(fit, (gripper[of_old], camera[of_old]), new, systematic, 1e-3).p_value)

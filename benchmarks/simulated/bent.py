@@ -10,7 +10,8 @@ from benchmarks.simulated.arm_errors import PRESETS, ArmErrors, PresetName
 from benchmarks.simulated.problem import HandEyeProblem, disturbed
 from jcr.geometry import rotation_exp, scale_translation, transform
 from jcr.handeye.robots import Arm
-from jcr.simulate.robots import BentArm, bend, effective_about, hand_eye_on, views
+from jcr.simulate.bent_arm import BentArm, bend
+from jcr.simulate.robots import effective_about, hand_eye_on, views
 
 
 @dataclass(frozen=True)

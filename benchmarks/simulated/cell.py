@@ -2,7 +2,7 @@
 
 Four kinds: `fixed`, a camera beside the table that a wrist camera maps; `wrists`, two cameras on one wrist; `arms`, two
 arms with a wrist camera each before one table; `carried`, a fixed camera that watches a box in the gripper. Poses are
-those of arms that bend as robots.py has it, and the truth is the effective transform.
+those of arms that bend as simulate/bent_arm.py has it, and the truth is the effective transform.
 """
 
 from dataclasses import dataclass, field
@@ -30,13 +30,12 @@ from jcr.handeye.arms import arm_named
 from jcr.handeye.known_scale import Fit, fit_known_scale
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import BentArm, bend
 from jcr.simulate.poses import looking_at, random_hand_eye
 from jcr.simulate.robots import (
     EFFECTIVE_NOISE,
     EFFECTIVE_POSES,
-    BentArm,
     about_posture,
-    bend,
     effective_exchanged,
     hand_eye_on,
     table_center,

@@ -12,9 +12,10 @@ from benchmarks.simulated.arm_errors import PRESETS
 from jcr.geometry import transform
 from jcr.handeye.arms import RobotName, arm_named
 from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import bend
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render
-from jcr.simulate.robots import bend, effective_about, hand_eye_on, patterned, table_center
+from jcr.simulate.robots import effective_about, hand_eye_on, patterned, table_center
 from jcr.simulate.scenes import Scene, make_scene, moved
 
 SIZE, WIDE = (640, 480), (960, 720)

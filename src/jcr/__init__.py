@@ -6,35 +6,90 @@ scene = jcr.load_map("out/table")
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from jcr import deflate  # noqa: F401
 from jcr.errors import InputError, NotTrustedError, RejectedError
 
 if TYPE_CHECKING:
-    from jcr.calibration.difference import compare
+    from jcr.calibration.calibration_json import CalibrationFile
+    from jcr.calibration.difference import Difference, compare
     from jcr.calibration.options import CalibrateOptions
     from jcr.capture.options import ReadOptions
     from jcr.capture.read import read_capture
+    from jcr.cell.cameras_json import CamerasFile
+    from jcr.check import Examination
     from jcr.check import check as check_capture
+    from jcr.depth.options import DepthOptions
     from jcr.export.formats import export_run
+    from jcr.export.options import ExportOptions
+    from jcr.handeye.fit import Cues
+    from jcr.handeye.robots import Arm
     from jcr.handeye.solve import solve_hand_eye
     from jcr.live.calibration import LiveCalibration
     from jcr.live.calibration_progress import Progress
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.reconstruct.backends import ReconstructOptions
+    from jcr.records import (
+        Capture,
+        CellCamera,
+        Finding,
+        HandEye,
+        Intrinsics,
+        Observability,
+        PointCloud,
+        PosePairs,
+        Reconstruction,
+        Requirement,
+    )
     from jcr.represent.map_file import load_map
-    from jcr.results import RunOptions, load_run
-    from jcr.touch_test import touch
+    from jcr.represent.options import CloudOptions, MapOptions
+    from jcr.represent.sample import Sample
+    from jcr.represent.scene import SceneMap
+    from jcr.results import RunOptions, RunResult, SavedRun, load_run
+    from jcr.segment.measure import Measured
+    from jcr.segment.options import SegmentOptions
+    from jcr.touch_test import Touched, touch
+    from jcr.verify import Verification, VerifyOptions
     from jcr.verify import verify as verify_run
 
     __version__: str
 
 _MODULE_OF = {
     "ReadOptions": "jcr.capture.options",
-    "RunOptions": "jcr.results",
     "CalibrateOptions": "jcr.calibration.options",
     "ReconstructOptions": "jcr.reconstruct.backends",
+    "CloudOptions": "jcr.represent.options",
+    "MapOptions": "jcr.represent.options",
+    "SegmentOptions": "jcr.segment.options",
+    "DepthOptions": "jcr.depth.options",
+    "ExportOptions": "jcr.export.options",
+    "VerifyOptions": "jcr.verify",
+    "RunOptions": "jcr.results",
+    "Capture": "jcr.records",
+    "CellCamera": "jcr.records",
+    "Intrinsics": "jcr.records",
+    "PosePairs": "jcr.records",
+    "Reconstruction": "jcr.records",
+    "PointCloud": "jcr.records",
+    "HandEye": "jcr.records",
+    "Observability": "jcr.records",
+    "Requirement": "jcr.records",
+    "Finding": "jcr.records",
+    "Arm": "jcr.handeye.robots",
+    "Cues": "jcr.handeye.fit",
+    "RunResult": "jcr.results",
+    "SavedRun": "jcr.results",
+    "Difference": "jcr.calibration.difference",
+    "Examination": "jcr.check",
+    "Touched": "jcr.touch_test",
+    "Verification": "jcr.verify",
+    "SceneMap": "jcr.represent.scene",
+    "Measured": "jcr.segment.measure",
+    "Sample": "jcr.represent.sample",
+    "CalibrationFile": "jcr.calibration.calibration_json",
+    "CamerasFile": "jcr.cell.cameras_json",
     "compare": "jcr.calibration.difference",
     "load_run": "jcr.results",
     "touch": "jcr.touch_test",
@@ -52,17 +107,45 @@ _MODULE_OF = {
     "measure": "jcr.pipeline",
     "load_map": "jcr.represent.map_file",
 }
+"""Of each name that is imported when it is asked for, and its name there where that differs."""
 
 __all__ = [
+    "Arm",
     "CalibrateOptions",
+    "CalibrationFile",
+    "CamerasFile",
+    "Capture",
+    "CellCamera",
+    "CloudOptions",
+    "Cues",
+    "DepthOptions",
+    "Difference",
+    "Examination",
+    "ExportOptions",
+    "Finding",
+    "HandEye",
     "InputError",
+    "Intrinsics",
     "LiveCalibration",
+    "MapOptions",
+    "Measured",
     "NotTrustedError",
+    "Observability",
+    "PointCloud",
+    "PosePairs",
     "Progress",
     "ReadOptions",
     "ReconstructOptions",
+    "Reconstruction",
     "RejectedError",
+    "Requirement",
     "RunOptions",
+    "RunResult",
+    "SavedRun",
+    "SegmentOptions",
+    "Touched",
+    "Verification",
+    "VerifyOptions",
     "add_camera",
     "build_map",
     "calibrate",
@@ -78,6 +161,8 @@ __all__ = [
     "touch",
     "verify_run",
 ]
+if find_spec("torch"):
+    __all__ += ["Sample", "SceneMap"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,19 +1,25 @@
 """Arrays, and parts of files, as the JSON that jcr writes holds them."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from jcr.geometry import require_rigid
 
 
 class Part(BaseModel):
-    """A part of a file: what it names and nothing else, numbers that are finite."""
+    """A part of a file: what it names and nothing else, numbers that are finite; made of its fields, or of a record."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True, from_attributes=True
+    )
+
+
+def _listed(array: Any) -> Any:
+    return array.tolist() if isinstance(array, ndarray) else array
 
 
 def _rigid(rows: list[list[float]]) -> list[list[float]]:
@@ -55,14 +61,18 @@ def _least_eigenvalue(matrix: Float[ndarray, "n n"], std: Float[ndarray, " n"]) 
 
 Spread = Annotated[float, Field(ge=0)]
 """A standard deviation, or a size."""
-Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3)]
+Listed = BeforeValidator(_listed)
+"""Takes an array for the lists that stand for it in JSON."""
+Spreads = Annotated[list[Spread], Listed]
+Spread3 = Annotated[list[Spread], Field(min_length=3, max_length=3), Listed]
 Numbers4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 Numbers6 = Annotated[list[float], Field(min_length=6, max_length=6)]
-Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7)]
-Matrix = Annotated[list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
+Numbers7 = Annotated[list[float], Field(min_length=7, max_length=7), Listed]
+Square = Annotated[list[list[float]], Listed]
+Matrix = Annotated[list[Numbers4], Field(min_length=4, max_length=4), AfterValidator(_rigid), Listed]
 """Of a rigid transform."""
-Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole)]
-Covariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole)]
+Covariance6 = Annotated[list[Numbers6], Field(min_length=6, max_length=6), AfterValidator(_whole), Listed]
+Covariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_whole), Listed]
 """Of everything that was estimated: positive definite."""
-PartCovariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part)]
+PartCovariance7 = Annotated[list[Numbers7], Field(min_length=7, max_length=7), AfterValidator(_part), Listed]
 """What one cause adds to it, which may be nothing."""

@@ -294,7 +294,14 @@ def _tried(
         reconstruction = reconstruct(capture, options, progress)
     except (InputError, NotTrustedError) as error:
         seconds = round(time.perf_counter() - start, 3)
-        account = Attempt(options.backend, None, seconds, 0.0, str(error), features)
+        account = Attempt(
+            backend=options.backend,
+            images_registered=None,
+            reconstruct_s=seconds,
+            calibrate_s=0.0,
+            why_not=str(error),
+            features=features,
+        )
         return Tried(account=account, failure=error.with_traceback(None))
     tried = _reconstructed(reconstruction, time.perf_counter() - start, features, options.backend)
     give_back()  # what the back end worked with
@@ -308,7 +315,12 @@ def _reconstructed(
 ) -> Tried:
     count = len(reconstruction.image_index)
     account = Attempt(
-        backend or reconstruction.backend, count, round(seconds, 3), 0.0, why_not=None, features=features
+        backend=backend or reconstruction.backend,
+        images_registered=count,
+        reconstruct_s=round(seconds, 3),
+        calibrate_s=0.0,
+        why_not=None,
+        features=features,
     )
     return Tried(account=account, made=reconstruction)
 

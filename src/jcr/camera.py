@@ -201,22 +201,22 @@ def _fisheye_rays(camera: Intrinsics, target: Float[ndarray, "*batch 2"]) -> Flo
 
 
 @lru_cache(maxsize=64)  # every stage asks for the same camera
-def fold_distance_px(lens: Intrinsics) -> float | None:
+def fold_distance_px(camera: Intrinsics) -> float | None:
     """How far from the principal point the distortion folds over inside the frame; None when it never does.
 
     Rays are followed outwards until they leave the frame. Where the Jacobian's determinant reaches zero
     before, two rays share one pixel and the pixels beyond have no ray at all.
     """
-    edges = np.array([[-0.5, -0.5], [lens.width - 0.5, lens.height - 0.5]])
-    (left, top), (right, bottom) = unproject(without_distortion(lens), edges)[:, :2]
+    edges = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+    (left, top), (right, bottom) = unproject(without_distortion(camera), edges)[:, :2]
     to_corners = np.arctan2([top, top, bottom, bottom], [left, right, left, right])
     angle = np.append(np.arange(0, 2 * np.pi, np.radians(2)), to_corners)
     radius = np.linspace(0, _WIDEST_TANGENT, 4001)[:, None]
     ray = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones((4001, len(angle)))], axis=-1)
-    by_x, cross, by_y = _slopes(lens, ray[..., 0], ray[..., 1])
+    by_x, cross, by_y = _slopes(camera, ray[..., 0], ray[..., 1])
     folded = by_x * by_y <= cross * cross
-    x_px = project(lens, ray)
-    outside = ((x_px < -0.5) | (x_px > [lens.width - 0.5, lens.height - 0.5])).any(-1)
+    x_px = project(camera, ray)
+    outside = ((x_px < -0.5) | (x_px > [camera.width - 0.5, camera.height - 0.5])).any(-1)
     # A ray that is still in the frame at the widest angle counts as folded there.
     first_folded, first_outside = (
         np.where(event.any(0), event.argmax(0), len(radius) - 1) for event in (folded, outside)
@@ -225,33 +225,33 @@ def fold_distance_px(lens: Intrinsics) -> float | None:
     if not bad.any():
         return None
     at_fold = x_px[first_folded[bad], bad.nonzero()[0]]
-    return float(np.linalg.norm(at_fold - [lens.cx, lens.cy], axis=-1).min())
+    return float(np.linalg.norm(at_fold - [camera.cx, camera.cy], axis=-1).min())
 
 
-def usable_lens(lens: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
+def usable_lens(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
     """Given intrinsics, without a distortion that has no inverse, and a warning that says so.
 
     With such a distortion images do not register.
     """
     # Of a fisheye's border, beyond the widest angle, there are pixels without rays; the rest is as good as any.
-    if lens is None or lens.model == "fisheye" or (fold := fold_distance_px(lens)) is None:
-        return lens, ()
+    if camera is None or camera.model == "fisheye" or (fold := fold_distance_px(camera)) is None:
+        return camera, ()
     warning = (
         f"the stored distortion folds over at {fold:.0f} px from the centre: not used; "
         "calibrate the intrinsics again with points out to the corners, or give zero distortion"
     )
-    return without_distortion(lens), (warning,)
+    return without_distortion(camera), (warning,)
 
 
-def resized(lens: Intrinsics, width: int, height: int) -> Intrinsics:
+def resized(camera: Intrinsics, width: int, height: int) -> Intrinsics:
     """The same camera with its image resized to `width` x `height` pixels."""
-    sx, sy = width / lens.width, height / lens.height
+    sx, sy = width / camera.width, height / camera.height
     return replace(
-        lens,
-        fx=lens.fx * sx,
-        fy=lens.fy * sy,
-        cx=(lens.cx + 0.5) * sx - 0.5,
-        cy=(lens.cy + 0.5) * sy - 0.5,
+        camera,
+        fx=camera.fx * sx,
+        fy=camera.fy * sy,
+        cx=(camera.cx + 0.5) * sx - 0.5,
+        cy=(camera.cy + 0.5) * sy - 0.5,
         width=width,
         height=height,
     )
@@ -267,24 +267,24 @@ def zoomed(camera: Intrinsics, factor: float) -> Intrinsics:
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
-def pinhole_inside(lens: Intrinsics, long_side_px: int) -> Intrinsics:
+def pinhole_inside(camera: Intrinsics, long_side_px: int) -> Intrinsics:
     """The largest undistorted pinhole grid whose every pixel lies in the frame, its long side as asked.
 
     Of a distortion that folds over, what lies within the fold: a rectangle of the frame's shape.
     """
-    corners = np.array([[-0.5, -0.5], [lens.width - 0.5, lens.height - 0.5]])
-    if (fold_px := fold_distance_px(lens)) is not None:
-        centre, half = np.array([lens.cx, lens.cy]), np.array([lens.width, lens.height]) / 2
+    corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+    if (fold_px := fold_distance_px(camera)) is not None:
+        centre, half = np.array([camera.cx, camera.cy]), np.array([camera.width, camera.height]) / 2
         reach = WITHIN_FOLD * fold_px * half / np.linalg.norm(half)
         corners = np.clip(np.stack([centre - reach, centre + reach]), *corners)
     (u0, v0), (u1, v1) = corners
     u, v = np.linspace(u0, u1, 100), np.linspace(v0, v1, 100)
-    left, right = (unproject(lens, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
-    top, bottom = (unproject(lens, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
+    left, right = (unproject(camera, np.stack([0 * v + x, v], -1))[:, 0] for x in (u0, u1))
+    top, bottom = (unproject(camera, np.stack([u, 0 * u + y], -1))[:, 1] for y in (v0, v1))
     x0, x1 = max(float(left.max()), -_WIDEST_PINHOLE), min(float(right.min()), _WIDEST_PINHOLE)
     y0, y1 = max(float(top.max()), -_WIDEST_PINHOLE), min(float(bottom.min()), _WIDEST_PINHOLE)
-    scale = long_side_px / max((x1 - x0) * lens.fx, (y1 - y0) * lens.fy)
-    width, height = round((x1 - x0) * lens.fx * scale), round((y1 - y0) * lens.fy * scale)
+    scale = long_side_px / max((x1 - x0) * camera.fx, (y1 - y0) * camera.fy)
+    width, height = round((x1 - x0) * camera.fx * scale), round((y1 - y0) * camera.fy * scale)
     fx, fy = width / (x1 - x0), height / (y1 - y0)
     return Intrinsics(fx, fy, -x0 * fx - 0.5, -y0 * fy - 0.5, width, height)
 
@@ -296,21 +296,21 @@ def rays(pinhole: Intrinsics) -> Float[ndarray, "h w 3"]:
 
 
 def undistort_image(
-    image: UInt8[ndarray, "h w 3"], lens: Intrinsics, pinhole: Intrinsics
+    image: UInt8[ndarray, "h w 3"], camera: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[ndarray, "h2 w2 3"]:
     """The image resampled to an undistorted grid; averaged over areas where the grid is coarser."""
-    return undistortion(lens, pinhole)(image)
+    return undistortion(camera, pinhole)(image)
 
 
 def undistortion(
-    lens: Intrinsics, pinhole: Intrinsics
+    camera: Intrinsics, pinhole: Intrinsics
 ) -> Callable[[UInt8[ndarray, "h w 3"]], UInt8[ndarray, "h2 w2 3"]]:
     """`undistort_image` for many images of one camera: where the pixels come from is computed once."""
-    factor = max(1, round(lens.fx / pinhole.fx))
+    factor = max(1, round(camera.fx / pinhole.fx))
     fine = resized(pinhole, factor * pinhole.width, factor * pinhole.height)
     u, v = (
         np.ascontiguousarray(place)
-        for place in np.moveaxis(project(lens, rays(fine)), -1, 0).astype(np.float32)
+        for place in np.moveaxis(project(camera, rays(fine)), -1, 0).astype(np.float32)
     )
 
     def undistorted(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h2 w2 3"]:

@@ -108,33 +108,30 @@ def check(
 ) -> Examination:
     """Examine a capture, or what lies at its path.
 
-    With `look` its images are registered sparsely to hold the poses against them.
-
-    A few of them at a small size tell in seconds; where these speak against the capture, or where it is to be
-    `thorough`, all are registered as a calibration does. Where the cameras' poses were given instead, the gripper's are
-    held against those.
+    With `look` its images are registered sparsely and compared with the poses. A few of them at a small size tell in
+    seconds; where these speak against the capture, or where it is to be `thorough`, all are registered as a calibration
+    does. Where the cameras' poses were given instead, the gripper's are compared with those.
 
     `suggest` is how many gripper poses to propose, `robot_noise` (m, rad) one sigma per axis. InputError where gripper
     poses and joint angles contradict each other.
     """
     if isinstance(capture, str | Path):
         capture = read_source(capture)
-    alone, held = _by_itself(capture), _Held()
+    alone, shown = _examine_alone(capture), _Compared()
     if isinstance(capture, PosePairs):
-        held = _pairs_held(capture, robot_noise)
+        shown = _compare_pairs(capture, robot_noise)
     elif look and not any(one.severity == "rejects" for one in alone.views):
-        held = _looked_at(capture, alone.robot, robot_noise, seed, progress, thorough)
-    angles = None if held.ratio is None or held.blames_camera else angle_finding(*held.ratio)
-    counted = alone.clear if held.registered is None else held.registered
+        shown = _compare_with_images(capture, alone.robot, robot_noise, seed, progress, thorough)
+    angles = None if shown.ratio is None or shown.blames_camera else angle_finding(*shown.ratio)
+    counted = alone.clear if shown.registered is None else shown.registered
     rows = counted if len(counted) >= FEWEST else np.arange(len(capture))
-    gripper, assumptions = capture.base_from_gripper[rows], held.assumptions
+    gripper, assumptions = capture.base_from_gripper[rows], shown.assumptions
     if assumptions is None:
         assumptions = assumed(gripper, _camera(capture), robot_noise)
-    seen = held.observability
-    if seen is None:
-        seen = observability(gripper, None if held.assumptions is None else assumptions.gripper_from_camera)
-    unseen = seen.findings if held.hand_eye is None else ()
-    faults = [*held.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)]
+    x = None if shown.assumptions is None else assumptions.gripper_from_camera
+    seen = shown.observability or observability(gripper, x)
+    unseen = seen.findings if shown.hand_eye is None else ()
+    faults = [*shown.faults, *(f"{unobservable(one)}; {remedy(one)}" for one in unseen)]
     views = as_causes(alone.views) if faults else alone.views
     causes = [sentence(one) for one in views if one.severity == "rejects"]
     ahead = Ahead.of(assumptions, gripper, alone.robot.of(rows), suggest, reach, seed)
@@ -147,12 +144,12 @@ def check(
         expected=ahead.expected(0) if len(counted) >= FEWEST else None,
         counted=counted,
         suggestions=tuple(replace(one, like=int(rows[one.like])) for one in suggestions),
-        hand_eye=held.hand_eye,
-        angle_ratio=held.ratio,
+        hand_eye=shown.hand_eye,
+        angle_ratio=shown.ratio,
         faults=tuple(dict.fromkeys((*causes, *faults))),
         remarks=(
             *alone.remarks,
-            *held.remarks,
+            *shown.remarks,
             *([] if angles is None else [sentence(angles)]),
             *(sentence(one) for one in views if one.severity == "warns"),
         ),
@@ -171,11 +168,11 @@ class _Alone:
     """Rows of the images that are sharp and well exposed."""
     sharpness: Float[ndarray, " n"]
     views: tuple[Finding, ...]
-    """What the images say against the capture, whatever their poses are."""
+    """What the images alone show against the capture."""
     remarks: tuple[str, ...]
 
 
-def _by_itself(capture: Capture | PosePairs) -> _Alone:
+def _examine_alone(capture: Capture | PosePairs) -> _Alone:
     gripper = capture.base_from_gripper
     move_m, turn_rad = largest_motion(gripper)
     alone = _Alone(
@@ -198,7 +195,7 @@ def _by_itself(capture: Capture | PosePairs) -> _Alone:
 
 def _with_images(alone: _Alone, capture: Capture) -> _Alone:
     robot, views = robot_errors(capture, CalibrateOptions()), view_findings(capture)
-    brightness, sharpness = _looks(capture)
+    brightness, sharpness = _brightness_and_sharpness_of_each(capture)
     blurred = {name for one in views if one.kind is Kind.BLURRED for name in one.images}
     clear = [
         exposure_fault(grey) is None and name not in blurred
@@ -223,8 +220,8 @@ def _camera(capture: Capture | PosePairs) -> ForeseenCamera | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Held:
-    """Gripper poses held against cameras."""
+class _Compared:
+    """What a comparison of gripper poses with cameras shows."""
 
     hand_eye: HandEye | None = None
     """None where no cameras were found."""
@@ -243,30 +240,30 @@ class _Held:
 
     @property
     def observability(self) -> Observability | None:
-        """Of the poses that were held; None where they are not all."""
+        """Of the poses that were compared; None where some were not."""
         if self.hand_eye is None or self.registered is None:
             return None
         return self.hand_eye.observability
 
 
-def _looked_at(
+def _compare_with_images(
     capture: Capture,
     robot: RobotErrors,
     robot_noise: tuple[float, float] | None,
     seed: int,
     progress: Progress | None,
     thorough: bool,
-) -> _Held:
-    """The gripper poses held against few small images, and where that is not enough, against all."""
+) -> _Compared:
+    """The gripper poses compared with few small images and, where that is not enough, with all of them."""
     if not thorough and len(capture) > QUICK:
         rows = spread_rows(len(capture))
         few = _of_rows(capture, rows)
-        held = _registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
+        shown = _compare_registered(few, robot.of(rows), robot_noise, seed, progress, QUICK_SIZE_PX)
         # Angles that differ have a cause, which all images at full size may show.
-        agree = held.ratio is None or angle_finding(*held.ratio) is None
-        if agree and not held.faults and held.registered is not None and len(held.registered) == QUICK:
-            return replace(held, registered=None)
-    return _registered(capture, robot, robot_noise, seed, progress)
+        agree = shown.ratio is None or angle_finding(*shown.ratio) is None
+        if agree and not shown.faults and shown.registered is not None and len(shown.registered) == QUICK:
+            return replace(shown, registered=None)
+    return _compare_registered(capture, robot, robot_noise, seed, progress)
 
 
 def spread_rows(count: int) -> Int[ndarray, " k"]:
@@ -282,15 +279,15 @@ def _of_rows(capture: Capture, rows: Int[ndarray, " k"]) -> Capture:
     )
 
 
-def _registered(
+def _compare_registered(
     capture: Capture,
     robot: RobotErrors,
     robot_noise: tuple[float, float] | None,
     seed: int,
     progress: Progress | None,
     size_px: int | None = None,
-) -> _Held:
-    """The gripper poses held against cameras that features find, and what else that shows."""
+) -> _Compared:
+    """The gripper poses compared with cameras that are reconstructed from features, and what else that shows."""
     options = ColmapOptions(seed=seed)
     if size_px is not None:
         options = replace(options, working_size_px=size_px)
@@ -300,32 +297,32 @@ def _registered(
         board = None
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])
-        return _Held(faults=(str(error),), remarks=() if board is None else (sentence(board),))
+        return _Compared(faults=(str(error),), remarks=() if board is None else (sentence(board),))
     rows = found.image_index
     mm_deg = None if robot_noise is None else (1e3 * robot_noise[0], float(np.degrees(robot_noise[1])))
     options_then = CalibrateOptions(robot_noise=mm_deg)
     if size_px is None:
         case = checked(capture, found, options_then, robot.of(rows))
-        held = _by_calibration(capture, case)
+        shown = _compare_by_calibration(capture, case)
     else:
         case = fitted(capture, found, options_then, robot.of(rows))
         case = adjusted(case) if case.hand_eye.converged else case
-        held = _held_against(capture.base_from_gripper[rows], found, case.hand_eye)
+        shown = _compare_poses(capture.base_from_gripper[rows], found, case.hand_eye)
     return replace(
-        held,
-        remarks=(*held.remarks, *found.notes),
+        shown,
+        remarks=(*shown.remarks, *found.notes),
         registered=rows[case.hand_eye.inliers],
         assumptions=assumed_of(case) if case.hand_eye.converged else None,
     )
 
 
-def _by_calibration(capture: Capture, case: Case) -> _Held:
+def _compare_by_calibration(capture: Capture, case: Case) -> _Compared:
     """What a calibration finds, and of poses that it left out why."""
     hand_eye = case.hand_eye
     if hand_eye.converged:
         hand_eye = hand_eye.with_findings(*left_out_poses(capture, case.reconstruction, hand_eye))
     ratio, said = hand_eye.robot.angle_ratio, without_consequences(hand_eye.findings)
-    return _Held(
+    return _Compared(
         hand_eye=hand_eye,
         ratio=None if ratio is None or not hand_eye.converged else (ratio.ratio, ratio.std),
         faults=tuple(sentence(one) for one in said if one.severity == "rejects"),
@@ -333,23 +330,23 @@ def _by_calibration(capture: Capture, case: Case) -> _Held:
     )
 
 
-def _pairs_held(pairs: PosePairs, noise: tuple[float, float] | None) -> _Held:
-    """Gripper poses held against camera poses that somebody else found."""
+def _compare_pairs(pairs: PosePairs, noise: tuple[float, float] | None) -> _Compared:
+    """Gripper poses compared with camera poses that were given."""
     gripper, camera = pairs.base_from_gripper, pairs.recon_from_camera
     hand_eye = solve_hand_eye(gripper, camera, robot_noise=noise)
     assumptions = None
     if hand_eye.converged:
         scale_std = SCALE_STD if pairs.is_metric and is_one(hand_eye) else None
         assumptions = assumed_of_poses(hand_eye, gripper[hand_eye.inliers], scale_std)
-    held = _held_against(gripper, pairs, hand_eye)
-    return replace(held, registered=np.flatnonzero(hand_eye.inliers), assumptions=assumptions)
+    shown = _compare_poses(gripper, pairs, hand_eye)
+    return replace(shown, registered=np.flatnonzero(hand_eye.inliers), assumptions=assumptions)
 
 
-def _held_against(
+def _compare_poses(
     used: Float[ndarray, "m 4 4"],
     found: Reconstruction | PosePairs,
     hand_eye: HandEye,
-) -> _Held:
+) -> _Compared:
     camera, ratio = found.recon_from_camera, None
     reading = better_reading(used, camera)
     faults = [] if reading is None else [sentence(convention_finding(reading))]
@@ -357,10 +354,10 @@ def _held_against(
     remarks = [warning for warning in hand_eye.warnings if hand_eye.converged]
     if hand_eye.converged and hand_eye.inliers.sum() >= 3:
         ratio = angle_ratio(used[hand_eye.inliers], camera[hand_eye.inliers])
-    return _Held(hand_eye=hand_eye, ratio=ratio, faults=tuple(faults), remarks=tuple(remarks))
+    return _Compared(hand_eye=hand_eye, ratio=ratio, faults=tuple(faults), remarks=tuple(remarks))
 
 
-def _looks(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
+def _brightness_and_sharpness_of_each(capture: Capture) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
     """Mean grey level and relative sharpness of every image."""
     looks = [brightness_and_sharpness(read_image(capture.folder / name)) for name in capture.images]
     brightness, sharpness = np.array(looks).T

@@ -10,7 +10,7 @@ import sys
 from contextlib import suppress
 
 WORKS = "pycolmap" not in sys.modules
-"""Whether compressing is safe: nobody has imported pycolmap before jcr."""
+"""Whether compressing is safe: pycolmap was not imported before jcr."""
 
 with suppress(OSError):  # other systems have no library of this name, nor the trouble
     ctypes.CDLL("libz.so.1")

@@ -22,7 +22,7 @@ class InputError(ValueError):
         super().__init__(printable(message))
 
 
-class NotTrustedError(RuntimeError):
+class RejectedError(RuntimeError):
     """The input is sound but the result is rejected: the reason, what would help, and what else is worth saying (exit
     status 3). `despite_texture`: the images show features enough, so that their lack is not the reason."""
 
@@ -33,12 +33,12 @@ class NotTrustedError(RuntimeError):
         self.what, self.remedies, self.also = what, remedies, tuple(also)
         self.despite_texture = despite_texture
 
-    def with_more(self, *also: str) -> "NotTrustedError":
+    def with_more(self, *also: str) -> "RejectedError":
         """The same with more to say."""
-        return NotTrustedError(
+        return RejectedError(
             self.what, *self.remedies, also=(*self.also, *also), despite_texture=self.despite_texture
         )
 
 
-RejectedError = NotTrustedError
-"""The name that says what it is; the other one stays for programs that catch it."""
+NotTrustedError = RejectedError
+"""Another name of RejectedError, for programs that catch it."""

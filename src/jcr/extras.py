@@ -11,7 +11,7 @@ DISTRIBUTION = "jcr-handeye"
 
 
 def extra(module: str, name: str, what: str, otherwise: str = "") -> ModuleType:
-    """The module that `what` needs, or an InputError that says which extra brings it, or what to do `otherwise`."""
+    """The module that `what` needs, or an InputError that names the extra with it, or what to do `otherwise`."""
     try:
         return import_module(module)
     except ImportError as error:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.errors import InputError
 
+Transform = Float[ndarray, "4 4"]
 Transforms = Float[ndarray, "*batch 4 4"]
 Rotations = Float[ndarray, "*batch 3 3"]
 Vectors = Float[ndarray, "*batch 3"]
@@ -98,8 +99,8 @@ def step_between(
     a_from_b: Float[ndarray, "*#batch 4 4"], target: Float[ndarray, "*#batch 4 4"]
 ) -> Float[ndarray, "... 6"]:
     """Steps (...,6) that take `a_from_b` to `target`: the inverse of `retract`, rotations up to a rotation by 180°."""
-    turn = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(turn)], axis=-1)
+    rotation = target[..., :3, :3] @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.concatenate([target[..., :3, 3] - a_from_b[..., :3, 3], rotation_log(rotation)], axis=-1)
 
 
 def step_axes(rotation: Rotations) -> Float[ndarray, "*batch 6 6"]:
@@ -124,16 +125,20 @@ def twist_from_step(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
     return out
 
 
-def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
-    """Matrices that take twists (v, ω) in b axes to a axes."""
-    out = np.zeros((len(a_from_b), 6, 6))
-    rotation = a_from_b[:, :3, :3]
-    out[:, :3, :3] = out[:, 3:, 3:] = rotation
-    out[:, :3, 3:] = skew(a_from_b[:, :3, 3]) @ rotation
+def by_inverse(a_from_b: Transforms) -> Float[ndarray, "*batch 6 6"]:
+    """Matrices (...,6,6) that take steps of transforms to those of their inverses."""
+    rotation_t = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    out = -step_axes(rotation_t)
+    out[..., :3, 3:] = -rotation_t @ skew(a_from_b[..., :3, 3])
     return out
 
 
-def apply(a_from_b: Float[ndarray, "4 4"], x_in_b: Vectors) -> Vectors:
+def adjoint(a_from_b: Float[ndarray, "n 4 4"]) -> Float[ndarray, "n 6 6"]:
+    """Matrices that take twists (v, ω) in b axes to a axes."""
+    return twist_from_step(a_from_b) @ step_axes(a_from_b[:, :3, :3])
+
+
+def apply(a_from_b: Transform, x_in_b: Vectors) -> Vectors:
     """x_in_a for points (...,3) under one rigid transform (4,4)."""
     return x_in_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
@@ -145,7 +150,7 @@ def scale_translation(
     return transform(a_from_b[..., :3, :3], np.asarray(scale)[..., None] * a_from_b[..., :3, 3])
 
 
-def apply_similarity(a_from_b: Float[ndarray, "4 4"], scale: float, x_in_b: Vectors) -> Vectors:
+def apply_similarity(a_from_b: Transform, scale: float, x_in_b: Vectors) -> Vectors:
     """x_in_a = R · (scale · x_in_b) + t for points (...,3)."""
     return apply(a_from_b, scale * x_in_b)
 
@@ -175,14 +180,14 @@ def fit_similarity(
     rotation = nearest_rotation(cross)
     moment = np.einsum("...ij,...ij->...", rotation, cross)
     scale = np.maximum(moment, TINY) / np.maximum((w * (b * b).sum(-1)).sum(-1), TINY)
-    turned = (rotation @ np.swapaxes(mean_b, -1, -2))[..., 0]
-    return transform(rotation, mean_a[..., 0, :] - scale[..., None] * turned), scale
+    middle = (rotation @ np.swapaxes(mean_b, -1, -2))[..., 0]
+    return transform(rotation, mean_a[..., 0, :] - scale[..., None] * middle), scale
 
 
 def across_lines(direction: Vectors) -> Rotations:
     """Projectors (...,3,3) onto the plane at right angles to unit directions (...,3): I − d dᵀ.
 
-    They are what lines tell of the point nearest to them: Σ (I − d dᵀ) x = Σ (I − d dᵀ) o, with o on each line.
+    They are what lines show of the point nearest to them: Σ (I − d dᵀ) x = Σ (I − d dᵀ) o, with o on each line.
     """
     return np.eye(3) - direction[..., :, None] * direction[..., None, :]
 
@@ -223,7 +228,7 @@ def roll_pitch_yaw(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
         return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
-def require_rigid(matrix: Float[ndarray, "4 4"], where: str) -> Float[ndarray, "4 4"]:
+def require_rigid(matrix: Transform, where: str) -> Transform:
     """The matrix with its rotation made exact; InputError saying how far from rigid it is, and why.
 
     `where` begins the message: the file and frame, or the argument, that the matrix came from.

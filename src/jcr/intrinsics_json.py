@@ -1,12 +1,12 @@
 """Intrinsics as the JSON that jcr writes holds them."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field, model_validator
 
-from jcr.arrays_json import Part, Spread
+from jcr.arrays_json import Part, Spreads
 from jcr.geometry import HUGE
 from jcr.records import COEFFICIENTS, Intrinsics, LensModel, coefficients_of
 
@@ -37,22 +37,14 @@ class IntrinsicsJson(Part):
 
     def record(self) -> Intrinsics:
         """Without what a file says beside it."""
-        return Intrinsics(
-            self.fx,
-            self.fy,
-            self.cx,
-            self.cy,
-            self.width,
-            self.height,
-            coefficients_of(self.distortion),
-            self.model,
-        )
+        given: dict[str, Any] = {name: getattr(self, name) for name in IntrinsicsJson.model_fields}
+        return Intrinsics(**given | {"distortion": coefficients_of(self.distortion)})
 
 
 class IntrinsicsAndStd(IntrinsicsJson):
     """With what is known of their errors."""
 
-    std: list[Spread] | None = None
+    std: Spreads | None = None
     """Standard deviations of fx, fy, cx, cy and the distortion; null where the intrinsics were not refined."""
 
     @model_validator(mode="after")
@@ -71,4 +63,4 @@ class IntrinsicsAndStd(IntrinsicsJson):
         """Those of a record, None where there are none."""
         if intrinsics is None:
             return None
-        return cls.model_validate(vars(intrinsics) | {"std": None if std is None else std.tolist()})
+        return cls.model_validate(vars(intrinsics) | {"std": std})

@@ -30,7 +30,7 @@ FOUND = 5_000_000
 def require_address_space() -> None:
     """Raise InputError where a limit (ulimit -v) leaves less address space than the libraries take that we call.
 
-    With less OpenBLAS ends the process, and libraries cannot be loaded; neither says why.
+    With less OpenBLAS ends the process, and libraries cannot be loaded, both without a reason.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
@@ -41,7 +41,7 @@ def require_address_space() -> None:
 
 
 def resident() -> int:
-    """Bytes of the resident set now; where the system does not tell, at its peak."""
+    """Bytes of the resident set now; where the system does not report that, at its peak."""
     try:
         pages = int(Path("/proc/self/statm").read_text("utf-8").split()[1])
     except OSError:
@@ -63,8 +63,8 @@ def relieve(budget: float) -> None:
 
 
 def announce(needed: int, budget: float, beside: str = "") -> None:
-    """Say what work will take (bytes), before it starts; the same is not said twice, of many captures in a row."""
-    _say(
+    """Print what work will take (bytes), before it starts; the same is not printed twice, of many captures in a row."""
+    _write_once(
         f"memory: about {needed / GB:.2g} GB, the program included{beside}; the budget is {budget / GB:.2g} GB\n"
     )
 
@@ -82,7 +82,7 @@ def require(needed: int, budget: float, what: str) -> None:
 def plan(
     images: int, size: tuple[int, int], memory_gb: float, *, features: int = 0, result: int = 0, work: int = 0
 ) -> None:
-    """Say what memory a stage over this many images of a size, and those after it, will take before it starts.
+    """Print what memory a stage over this many images of a size, and those after it, will take before it starts.
 
     All in bytes: `features` are what finding those of one image takes at least, `result` what stays of each image,
     `work` what an image takes while it is worked on. Raises InputError where the budget cannot be kept with one image
@@ -90,19 +90,19 @@ def plan(
     """
     width, height = size
     program = resident() + ALLOWANCE
-    pictures = 3 * width * height * images
+    pixels = 3 * width * height * images
     results = images * (result + FOUND)
     budget = memory_gb * GB
-    least = program + pictures + max(features, results + max(work, MAP))
+    least = program + pixels + max(features, results + max(work, MAP))
     require(least, budget, f"a run of {images} images of {width}x{height}, with the program itself,")
     at_once = min(os.cpu_count() or 1, images)
     # Freed blocks are given back only when half a budget is in use: with an ample one the stages' needs add up.
-    ample = program + pictures + max(features * at_once, results + at_once * work + MAP)
+    ample = program + pixels + max(features * at_once, results + at_once * work + MAP)
     announce(min(ample, int(budget)), budget)
 
 
 @cache
-def _say(line: str) -> None:
+def _write_once(line: str) -> None:
     sys.stderr.write(line)
 
 

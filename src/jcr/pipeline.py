@@ -4,6 +4,7 @@ capture -> reconstruct -> calibrate -> densify -> map -> report
 """
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,10 +21,11 @@ from jcr.cell.added import camera_of, keep_camera, read_added_cameras
 from jcr.errors import InputError, NotTrustedError
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
+from jcr.reconstruct.backends import BackendName
 from jcr.records import Capture, PosePairs
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.results import PosesResult, RunOptions, RunResult, SavedRun, load_run
-from jcr.run_folder import CAPTURE, REPORT, RunFolder, held
+from jcr.run_folder import CAPTURE, REPORT, RunFolder, locked
 from jcr.segment.options import SegmentOptions
 
 if TYPE_CHECKING:
@@ -35,30 +37,22 @@ def run(
     out: str | Path,
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
-    backend: str | None = None,
+    backend: BackendName | None = None,
     progress: Progress | None = None,
     calibrated: Callable[[RunResult], None] | None = None,
 ) -> RunResult:
     """Calibrate a capture, or what lies at its path, and write calibration, cloud, map and report to the folder `out`.
 
-    Finished stages are reused from `out` if capture and options are unchanged. Without torch there is no map, and a note
-    says how to add it. `calibrated` is called as soon as the calibration stands, before depth and map. Raises InputError
-    if the input cannot be used, and NotTrustedError if no camera poses are found (calibration.json then says why).
+    `backend` (auto, or a name of `jcr models`) takes the place of that of `options`. Finished stages are reused from
+    `out` if capture and options are unchanged. Without torch there is no map, and a note says how to add it.
+    `calibrated` is called with the calibration before depth and map are made. Raises InputError if the input cannot be
+    used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
     options = checked_options(options, RunOptions)
     check_options(options.calibrate)
     capture = _capture_of(capture, Path(out))
-    options = options.for_capture(capture, backend)
-    missing = None
-    if capture.mount == "base":  # what it sees moves with the gripper: there is no map in the base frame
-        options = replace(options, map=None)
-    if options.map is not None:
-        from jcr.mapping import require_dense, why_no_map
-
-        require_dense(options.depth)
-        if (missing := why_no_map()) is not None:
-            options = replace(options, map=None)
-    with held(Path(out)) as folder:
+    options, missing = _possible(options.for_capture(capture, backend), capture)
+    with locked(Path(out)) as folder:
         capture = folder.keep_capture(capture)
         added = None if options.map is None else read_added(folder.path, capture)
         result = stages.calibrated(capture, folder, options, progress or silent)
@@ -73,17 +67,26 @@ def run(
 
 def finished(capture: Capture, out: str | Path, options: RunOptions) -> SavedRun | None:
     """The run in the folder `out`, if it was made from this capture with these options and nothing has changed."""
-    from jcr.mapping import why_no_map
-
     if not (Path(out) / REPORT).is_file():
         return None
-    options = options.for_capture(capture)
-    if capture.mount == "base" or why_no_map() is not None:
-        options = replace(options, map=None)
-    with held(Path(out)) as folder:
+    options, _ = _possible(options.for_capture(capture), capture)
+    with locked(Path(out)) as folder:
         if not folder.is_complete(folder.keep_capture(capture), options):
             return None
     return load_run(out)
+
+
+def _possible(options: RunOptions, capture: Capture) -> tuple[RunOptions, str | None]:
+    """The options without the map where none can be made, and what is missing for it if that can be installed."""
+    if (
+        options.map is None or capture.mount == "base"
+    ):  # what that sees moves with the gripper, not with the base
+        return replace(options, map=None), None
+    from jcr.mapping import require_dense, why_no_map
+
+    require_dense(options.depth)
+    missing = why_no_map()
+    return (options if missing is None else replace(options, map=None)), missing
 
 
 def calibrate(
@@ -91,7 +94,7 @@ def calibrate(
     out: str | Path,
     options: RunOptions | Mapping[str, Any] | None = None,
     *,
-    backend: str | None = None,
+    backend: BackendName | None = None,
     progress: Progress | None = None,
 ) -> RunResult:
     """Calibrate a capture and write calibration and report to the folder `out`; raises as `run` does.
@@ -108,15 +111,20 @@ def calibrate_poses(
     """calibration.json and report in the folder `out` from camera poses that were given, without images."""
     from jcr.report.html import poses_report_html
 
-    with held(Path(out)) as folder:
+    with locked(Path(out)) as folder:
         start = time.perf_counter()
         hand_eye = calibrate_poses_stage(pairs, options)
         timings = {"calibrate": round(time.perf_counter() - start, 3)}
         content = calibration_file(pairs, pairs, hand_eye, timings, __version__)
         folder.forget_reconstruction()
         folder.keep_calibration(content)
-        is_metric = hand_eye.converged and is_one(hand_eye)
-        result = PosesResult(folder.path, pairs, content, hand_eye, is_metric)
+        result = PosesResult(
+            out=folder.path,
+            pairs=pairs,
+            calibration=content,
+            hand_eye=hand_eye,
+            scale_is_one=hand_eye.converged and is_one(hand_eye),
+        )
         folder.keep_report(poses_report_html(result, {"calibrate": asdict(options or CalibrateOptions())}))
         return result
 
@@ -146,7 +154,7 @@ def build_map(
     )
     require_map(options.depth)
     capture = before.capture()
-    with held(Path(out)) as folder:
+    with locked(Path(out)) as folder:
         added = with_images(
             read_added(folder.path, capture), [(Path(image), Path(pose)) for image, pose in add]
         )
@@ -157,29 +165,36 @@ def build_map(
 def add_camera(
     out: str | Path,
     name: str,
-    pictures: Sequence[str | Path] | str | Path,
+    images: Sequence[str | Path] | str | Path = (),
     intrinsics: str | Path | None = None,
     *,
     progress: Progress | None = None,
+    pictures: Sequence[str | Path] | str | Path | None = None,
 ) -> RunResult:
     """Locate a fixed camera from its images of the scene of the run folder `out`.
 
-    `intrinsics` is a JSON file in the form of capture.json; None: they are estimated. The camera becomes part of the
-    run, of cameras.json and of the report. Raises InputError if the images are not from one camera or do not fit the
-    intrinsics, and NotTrustedError, writing nothing, if they do not determine the camera's pose or the run is rejected.
+    `images` are one file or more (`pictures`, their name in 0.1.0, is removed in 0.2.0). `intrinsics` is a JSON file in
+    the form of capture.json; None: they are estimated. The camera becomes part of the run, of cameras.json and of the
+    report. Raises InputError if the images are not from one camera or do not fit the intrinsics, and RejectedError,
+    writing nothing, if they do not determine the camera's pose or the run is rejected.
     """
-    pictures = [pictures] if isinstance(pictures, str | Path) else pictures
+    if pictures is not None:
+        warnings.warn("add_camera: `pictures` is called `images` now", DeprecationWarning, stacklevel=2)
+        images = pictures
+    files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
+    if not files:
+        raise InputError(f"{name}: no images; give one or more that the camera took")
     before, report = RunFolder(Path(out)), progress or silent
     options, capture = RunOptions.of(before.options(), map=None), before.capture()
     if (doubt := before.calibration().doubt) is not None:
         raise NotTrustedError(
             f"{out}: its calibration is rejected, so no camera can be located with it: {doubt}"
         )
-    with held(Path(out)) as folder:
+    with locked(Path(out)) as folder:
         added = read_added_cameras(folder.path, capture)
         taken = [capture.camera_name, *(camera.name for camera in (*capture.others, *added))]
         file = None if intrinsics is None else Path(intrinsics)
-        camera = camera_of(name, [Path(picture) for picture in pictures], file, taken)
+        camera = camera_of(name, files, file, taken)
         result = stages.calibrated(capture, folder, options, report)
         located = stages.cameras(result, (*added, camera), folder, options, report)
         assert located is not None
@@ -212,7 +227,7 @@ def _capture_of(capture: Capture | str | Path, out: Path) -> Capture:
         return capture
     if not isinstance(capture, str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
-    with held(out):
+    with locked(out):
         return read_capture(capture, into=out / CAPTURE)
 
 

@@ -12,7 +12,7 @@ Progress = Callable[[str, float], None]
 
 
 def silent(stage: str, fraction: float) -> None:
-    """Progress that nobody watches."""
+    """Progress that is not shown."""
 
 
 def steps(progress: Progress, stage: str, items: Sequence[Item]) -> Iterator[Item]:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,6 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.cell.cameras_json import CamerasFile
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError
-from jcr.geometry import rotation_log
 from jcr.reconstruct.backends import ReconstructOptions, with_cameras_of
 from jcr.records import (
     Capture,
@@ -28,6 +26,7 @@ from jcr.records import (
     Verdict,
     verdict_of,
 )
+from jcr.records.notebook import hand_eye_table
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith, RunFolder
 from jcr.segment.options import SegmentOptions
@@ -91,7 +90,7 @@ class RunOptions:
         return replace(self, reconstruct=with_cameras_of(capture, reconstruct))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunResult:
     """What a run found, and where it is kept; each stage adds its part."""
 
@@ -134,9 +133,14 @@ class RunResult:
         return self.reconstruction.image_index
 
     @property
-    def lens(self) -> Intrinsics:
-        """As the calibration left it."""
+    def intrinsics(self) -> Intrinsics:
+        """As the calibration left them."""
         return self.hand_eye.intrinsics or self.reconstruction.intrinsics
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The former name of `intrinsics`."""
+        return self.intrinsics
 
     @property
     def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -153,12 +157,12 @@ class RunResult:
     ) -> Float[ndarray, "*points 3 3"]:
         """Covariance (m², camera axes) of where on the gripper points are that are seen at pixels at distances.
 
-        `x_px` (...,2) are pixels of the distorted image, `distance_m` is along the ray. It is that of `lens`,
+        `x_px` (...,2) are pixels of the distorted image, `distance_m` is along the ray. It is that of `intrinsics`,
         `gripper_from_camera` and the scale together; the robot's pose errors are not in it.
         """
         from jcr.calibration.seen import seen_uncertainty
 
-        return seen_uncertainty(self.hand_eye.estimate, self.lens, np.asarray(x_px, float), distance_m)
+        return seen_uncertainty(self.hand_eye.estimate, self.intrinsics, np.asarray(x_px, float), distance_m)
 
     def seen_in_base(
         self,
@@ -177,29 +181,13 @@ class RunResult:
                 f"{self.out}: its camera is fixed and no gripper pose places its points; use seen_uncertainty"
             )
         x_px = np.asarray(x_px, float)
-        return seen_in_base(self.hand_eye, self.lens, x_px, distance_m, np.asarray(base_from_gripper, float))
+        return seen_in_base(
+            self.hand_eye, self.intrinsics, x_px, distance_m, np.asarray(base_from_gripper, float)
+        )
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
         return hand_eye_table(self.hand_eye, str(self.out / "report.html"))
-
-
-def hand_eye_table(hand_eye: HandEye, report: str) -> str:
-    """The transform with its standard deviations as HTML."""
-    std = np.sqrt(np.diag(hand_eye.covariance))
-    mm = 1e3 * hand_eye.gripper_from_camera[:3, 3]
-    turn = np.degrees(rotation_log(hand_eye.gripper_from_camera[:3, :3]))
-    rows = "".join(
-        f"<tr><th>{axis}</th><td>{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm</td>"
-        f"<td>{turn[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°</td></tr>"
-        for k, axis in enumerate("xyz")
-    )
-    verdict = ": ".join(filter(None, (hand_eye.verdict, escape("; ".join(hand_eye.warnings)))))
-    return (
-        f"<p><b>gripper_from_camera</b>, {verdict}; {int(hand_eye.inliers.sum())} of {len(hand_eye.inliers)} poses "
-        f"used</p><table><tr><th></th><th>translation</th><th>rotation vector</th></tr>{rows}</table>"
-        f"<p>1σ, gripper axes. {escape(report)}</p>"
-    )
 
 
 @dataclass(frozen=True)
@@ -253,9 +241,9 @@ def load_run(out: str | Path) -> SavedRun:
     return SavedRun(folder.path, folder.calibration(), folder.cameras())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosesResult:
-    """What camera poses that were given say, without images."""
+    """The calibration from camera poses that were given, without images."""
 
     out: Path
     pairs: PosePairs

@@ -1,6 +1,6 @@
 """A run folder: what its files are, which stage made each and from what, who may write there, and reading them back.
 
-Whatever a command is given as OUT is input like any other: somebody may have edited or cut it. What is read here has
+Whatever a command is given as OUT is input like any other: it may have been edited or cut. What is read here has
 been validated; what has not raises InputError in one line.
 """
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from jcr.represent.scene import SceneMap
 
 LOCK = ".lock"
-"""Held by the run that writes there."""
+"""Locked by the run that writes there."""
 MOVING = "moving"
 """Images of a fixed camera without what stands still; a carried thing is reconstructed from them."""
 CAPTURE = "capture"
@@ -274,7 +274,7 @@ class RunFolder:
         self.keep_state(self.state().model_copy(update={"complete": self._completion(capture, options)}))
 
     def is_complete(self, capture: Capture, options: Any) -> bool:
-        """Whether a run of the same is finished, and nobody has changed or removed its files since."""
+        """Whether a run of the same is finished, and its files were neither changed nor removed since."""
         files = [RECONSTRUCTION, CALIBRATION, REPORT] + ([] if options.map is None else [CLOUD, MAP])
         if not all((self.path / name).is_file() for name in files):
             return False
@@ -304,8 +304,8 @@ class RunFolder:
 
 
 @contextmanager
-def held(path: Path) -> Iterator[RunFolder]:
-    """The folder, made and held, so that a second run on it writes nothing between the first one's files.
+def locked(path: Path) -> Iterator[RunFolder]:
+    """The folder, made and locked, so that a second run on it writes nothing between the first one's files.
 
     What a killed run had begun to write is removed, and so is a new folder into which nothing came.
     """
@@ -339,7 +339,7 @@ def _with_depth_apart(content: bytes) -> bytes:
         del old["dense"]  # which was set by the command
         state["options"]["depth"] = {"priors": old.pop("priors")}
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return content  # as it is written now, or damaged: where, the model says
+        return content  # as it is written now, or damaged, and refused by the model
     return json.dumps(state).encode()
 
 
@@ -357,7 +357,7 @@ def state_of(capture: Capture, options: MadeWith) -> State:
 
 
 def fingerprints_with_depth(capture: Capture, options: MadeWith) -> list[str]:
-    """Those of the same reconstruction in files that held its depth: with the same depth, or none."""
+    """Those of the same reconstruction in files that hold its depth too: with the same depth, or none."""
     made = _deciding(options.reconstruct)
     return [
         fingerprint(capture, made | {"dense": dense, "priors": priors}, WITH_DEPTH)
@@ -376,14 +376,14 @@ def fingerprint(capture: Capture, options: dict[str, Any], format: str = FORMAT)
     for name in capture.images:
         digest.update(name.encode() + b"\0" + hashlib.sha256((capture.folder / name).read_bytes()).digest())
     digest.update(capture.base_from_gripper.tobytes())
-    lens = None if capture.intrinsics is None else asdict(capture.intrinsics)
+    intrinsics = None if capture.intrinsics is None else asdict(capture.intrinsics)
     for name in ("weights", "predictions", "cameras"):
         if options[name] is None:
             continue
-        # Gigabytes at times: size and date tell one file of that name from another.
+        # Gigabytes at times: size and date distinguish files of one name.
         path = Path(options[name])
         files = sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         states = [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         options = options | {name: states or options[name]}
-    digest.update(json.dumps([lens, options, __version__, format], sort_keys=True).encode())
+    digest.update(json.dumps([intrinsics, options, __version__, format], sort_keys=True).encode())
     return digest.hexdigest()

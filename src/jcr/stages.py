@@ -50,7 +50,13 @@ def calibrated(capture: Capture, folder: RunFolder, options: RunOptions, progres
         board = proposed_for(capture, options.reconstruct.board)
         content = content if board is None else content.with_findings(board)
     folder.keep_calibration(content)
-    return RunResult(folder.path, capture, content, hand_eye, tried.reconstruction)
+    return RunResult(
+        out=folder.path,
+        capture=capture,
+        calibration=content,
+        hand_eye=hand_eye,
+        reconstruction=tried.reconstruction,
+    )
 
 
 def _carried_scene(capture: Capture, folder: RunFolder) -> Capture:

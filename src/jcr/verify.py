@@ -21,7 +21,7 @@ from jcr.distributions import chi2
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
-from jcr.handeye.fit import PoseFit, fit_poses
+from jcr.handeye.fit import PoseFit, PoseProblem, fit_poses
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -46,7 +46,7 @@ class VerifyOptions:
     """MM DEG: drifts smaller than both raise no alarm, however significant."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Verification:
     """The verdict on a calibration, and what it rests on."""
 
@@ -163,7 +163,7 @@ def _read(new: Capture | str | Path) -> Capture:
 
 
 def _calibrated_on(folder: RunFolder, calibration: CalibrationFile, new: Capture) -> Capture:
-    """The capture of a run; InputError where new images cannot be held against it."""
+    """The capture of a run; InputError where new images cannot be compared with it."""
     if not calibration.converged:
         raise InputError(
             f"{folder.path}: its calibration is rejected and cannot be tested; calibrate again (jcr run)"
@@ -212,7 +212,7 @@ def _in_old_scene(
 def verify_camera(
     out: Path,
     name: str,
-    pictures: Sequence[Path],
+    files: Sequence[Path],
     options: VerifyOptions = VerifyOptions(),
     progress: Progress | None = None,
 ) -> Verification:
@@ -239,20 +239,20 @@ def verify_camera(
         raise InputError(f"--camera {name}: {out} has placed no fixed camera of that name; there are {there}")
     own = others[name]
     _require_new(
-        {str(picture): read_image(picture) for picture in pictures},
+        {str(file): read_image(file) for file in files},
         _images(own.folder or capture.folder, own.images),
     )
-    # One lens took both: what is wrong with it moves both places alike.
-    lens = placed[name]
-    exact = np.zeros(4 + len(lens.distortion))
-    then = replace(others[name], intrinsics=lens, intrinsics_std=exact)
-    now = camera_of(f"{name[:60]}_now", pictures, None, ())
+    # One camera took both: what is wrong with its intrinsics moves both places alike.
+    known = placed[name]
+    exact = np.zeros(4 + len(known.distortion))
+    then = replace(others[name], intrinsics=known, intrinsics_std=exact)
+    now = camera_of(f"{name[:60]}_now", files, None, ())
     if now.image_size != then.image_size:
         raise InputError(
-            f"{pictures[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
+            f"{files[0]}: {now.image_size[0]}x{now.image_size[1]} pixels, but {name} has "
             f"{then.image_size[0]}x{then.image_size[1]}; take it with the same camera and resolution"
         )
-    now = replace(now, intrinsics=lens, intrinsics_std=exact)
+    now = replace(now, intrinsics=known, intrinsics_std=exact)
     hand_eye = calibrate(capture, reconstruction, made_with.calibrate)
     found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
     for camera in found.cameras:
@@ -264,7 +264,7 @@ def verify_camera(
     covariance = j @ found.answer.covariance @ j.T
     offset = step_between(before(found.answer.placed), after(found.answer.placed))
     notes = tuple(text for camera in found.cameras for text in camera.warnings)
-    images = tuple(str(picture) for picture in pictures)
+    images = tuple(str(file) for file in files)
     return replace(_of_two(offset, covariance, options, images, notes, "in the mapped scene"), fixed=name)
 
 
@@ -316,19 +316,15 @@ def fitted(
         capture.base_from_gripper[reconstruction.image_index][row_used],
         reconstruction.recon_from_camera[row_used],
     )
-    fit = fit_poses(
-        *poses,
-        (
-            np.array(calibration.gripper_from_camera),
-            calibration.scale or 1.0,
-            np.array(calibration.base_from_recon),
-        ),
-        np.ones(int(row_used.sum()), bool),
-        options.robot_noise_m_rad,
+    problem = PoseProblem(
+        base_from_gripper=poses[0],
+        recon_from_camera=poses[1],
+        used=np.ones(len(poses[0]), bool),
         systematic=systematic,
-        averaged=False,
+        noise=options.robot_noise_m_rad,
     )
-    return fit, poses
+    x, z = np.array(calibration.gripper_from_camera), np.array(calibration.base_from_recon)
+    return fit_poses(problem, (x, calibration.scale or 1.0, z), averaged=False), poses
 
 
 def _used(calibration: CalibrationFile, reconstruction: Reconstruction) -> Bool[ndarray, " m"]:
@@ -342,16 +338,16 @@ def _judged(
         notes += ("the images disagree with one another; something else than the camera moved too, or the robot "
                   "is less exact than when it was calibrated",)  # fmt: skip
     return Verification(
-        _is_moved(found.offset, found.p_value, options),
-        found.cause,
-        found.offset,
-        np.sqrt(np.diag(found.covariance)),
-        found.p_value,
-        found.misfit_p_value,
-        found.detectable,
-        images,
-        notes,
-        how,
+        moved=_is_moved(found.offset, found.p_value, options),
+        cause=found.cause,
+        offset=found.offset,
+        std=np.sqrt(np.diag(found.covariance)),
+        p_value=found.p_value,
+        misfit_p_value=found.misfit_p_value,
+        detectable=found.detectable,
+        images=images,
+        notes=notes,
+        how=how,
     )
 
 
@@ -397,14 +393,14 @@ def _of_two(
     """The verdict on two places of the camera that are so far apart."""
     p_value = float(chi2.sf(offset @ np.linalg.solve(covariance, offset), 6))
     return Verification(
-        _is_moved(offset, p_value, options),
-        "camera",
-        offset,
-        np.sqrt(np.diag(covariance)),
-        p_value,
-        None,
-        detectable(covariance, options.alpha),
-        images,
-        notes,
-        how,
+        moved=_is_moved(offset, p_value, options),
+        cause="camera",
+        offset=offset,
+        std=np.sqrt(np.diag(covariance)),
+        p_value=p_value,
+        misfit_p_value=None,
+        detectable=detectable(covariance, options.alpha),
+        images=images,
+        notes=notes,
+        how=how,
     )

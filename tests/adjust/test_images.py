@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.simulated.cell import CellProblem, cell_problem
-from jcr.adjust.images import ImageProblem, derivatives, view_of
 from jcr.adjust.intrinsics_prior import MEASURED, prior_of
-from jcr.adjust.robots import adjust
+from jcr.adjust.projection import ImageProblem, derivatives, view_of
 from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior, Scene, at_start, stepped
+from jcr.adjust.together import adjust
 
 COUNT = 6
 

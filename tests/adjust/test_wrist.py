@@ -7,11 +7,11 @@ from scipy.stats import chi2
 import jcr
 from benchmarks.simulated.observations import LENS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
-from jcr.adjust import robots
+from jcr.adjust import together
 from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import ESTIMATED, MEASURED, prior_of
 from jcr.adjust.robots import Adjusted
-from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
@@ -117,8 +117,8 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
 
 def counted(monkeypatch) -> list[int]:
     """One more entry for each time that images are linearised."""
-    calls, linearised = [], robots.linearised
-    monkeypatch.setattr(robots, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
+    calls, linearised = [], together.linearised
+    monkeypatch.setattr(together, "linearised", lambda *given: (calls.append(1), linearised(*given))[1])
     return calls
 
 
@@ -129,9 +129,9 @@ def test_an_adjustment_goes_on_until_it_stays(monkeypatch):
     # Errors of matches have long tails, and their size and the weights then depend on each other for long.
     tracks.x_px[:] += rng.standard_t(2, size=tracks.x_px.shape)
     found = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
-    monkeypatch.setattr(robots, "STEP_SETTLED", 1e-5)
-    monkeypatch.setattr(robots, "SIZES_SETTLED", 1e-5)
-    monkeypatch.setattr(robots, "ROUNDS", 200)
+    monkeypatch.setattr(together, "STEP_SETTLED", 1e-5)
+    monkeypatch.setattr(together, "SIZES_SETTLED", 1e-5)
+    monkeypatch.setattr(together, "ROUNDS", 200)
     settled = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
     off = step_between(found.placed.x[0], settled.placed.x[0])
     assert (np.abs(off) < 0.05 * np.sqrt(np.diag(settled.covariance)[:6])).all()
@@ -146,7 +146,7 @@ def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypat
     calls = counted(monkeypatch)
     from_poses = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED))
     of_poses = len(calls)
-    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), near=near)
+    again = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED), options=WristOptions(near=near))
     assert len(calls) - of_poses < of_poses
     apart = step_between(from_poses.placed.x[0], again.placed.x[0])
     assert (np.abs(apart) < 0.05 * np.sqrt(np.diag(from_poses.covariance)[:6])).all()

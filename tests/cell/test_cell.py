@@ -12,10 +12,12 @@ import pytest
 
 import jcr
 from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
-from jcr.adjust.images import ImageProblem, evidence, noise_of, view_of
+from jcr.adjust.images import evidence, noise_of
 from jcr.adjust.intrinsics_prior import HELD, prior_of
-from jcr.adjust.robots import Adjusted, adjust
+from jcr.adjust.projection import ImageProblem, view_of
+from jcr.adjust.robots import Adjusted
 from jcr.adjust.scene import Freedom, Scene, at_start, similarities
+from jcr.adjust.together import adjust
 from jcr.calibration.checks.camera import camera_faults
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
@@ -28,7 +30,8 @@ from jcr.cell.added import camera_of, read_added_cameras
 from jcr.cell.cameras_json import cameras_file, read_cameras, write_cameras
 from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.cell.images import CellImages
-from jcr.cell.stage import far_from_gripper, place_cameras
+from jcr.cell.place_checks import far_from_gripper
+from jcr.cell.stage import place_cameras
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
@@ -354,7 +357,10 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
         name="second",
         mount="gripper",
         arm=None,
-        images=tuple(ImageFound(i, False, 3, None, "few") for i in second.images),
+        images=tuple(
+            ImageFound(image=i, used=False, points=3, reprojection_px=None, reason="few")
+            for i in second.images
+        ),
         findings=(few,),
     )
     assert alone.sees_another_scene(second, nothing)

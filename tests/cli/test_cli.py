@@ -15,7 +15,8 @@ import pytest
 
 import jcr
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.help import COMMON, MANY, groups
+from jcr.cli.arguments import groups
+from jcr.cli.help import COMMON, MANY
 from jcr.represent.cloud_ply import read_cloud
 from jcr.represent.options import MapOptions
 

@@ -18,7 +18,8 @@ import pytest
 from benchmarks.simulated.problem import hand_eye_problem
 from capture_writers import write_easy_handeye2
 from jcr.cli import COMMANDS, dispatch
-from jcr.cli.completion import SHELLS, arguments_of, script
+from jcr.cli.arguments import groups
+from jcr.cli.completion import SHELLS, script
 from jcr.cli.output import Output
 from jcr.cli.query import labelled
 from jcr.export.formats import FORMATS
@@ -113,8 +114,8 @@ def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.Capt
     assert dispatch([name, "--help-all"]) == 0
     told = capsys.readouterr().out
     listed = set(re.findall(r"^  (--[a-z][a-z0-9-]*)", told, re.MULTILINE))
-    offered = {argument.flag for argument in arguments_of(_arguments(name))}
-    assert listed == offered - {None}
+    offered = {argument.flag for group in groups(_arguments(name), "jcr") for argument in group.arguments}
+    assert listed == offered - {""}
     # Arguments are told by their own names, and None is no word of a command line.
     assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]
 
@@ -137,7 +138,7 @@ TYPED = {
 @pytest.mark.slow
 def test_bash_completes(tmp_path: Path):
     (tmp_path / "images").mkdir()
-    (tmp_path / "jcr.bash").write_text(script("bash"))
+    (tmp_path / "jcr.bash").write_text(script("bash", COMMANDS))
     for line, offered in TYPED.items():
         words = " ".join(f"'{word}'" for word in line.split(" "))
         asked = (
@@ -155,7 +156,7 @@ def test_fish_completes(tmp_path: Path):
     if shutil.which("fish") is None:
         pytest.skip("fish is not installed")
     (tmp_path / "images").mkdir()
-    (tmp_path / "jcr.fish").write_text(script("fish"))
+    (tmp_path / "jcr.fish").write_text(script("fish", COMMANDS))
     for line, offered in TYPED.items():
         told = subprocess.run(
             ["fish", "-c", f"source jcr.fish; complete -C '{line}'"],
@@ -168,7 +169,7 @@ def test_fish_completes(tmp_path: Path):
 def test_zsh_completes(tmp_path: Path):
     if shutil.which("zsh") is None:
         pytest.skip("zsh is not installed")
-    (tmp_path / "jcr.zsh").write_text(script("zsh"))
+    (tmp_path / "jcr.zsh").write_text(script("zsh", COMMANDS))
     # Tab works in a terminal alone.
     asking, terminal = pty.openpty()
     zsh = subprocess.Popen(

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +19,7 @@ from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
 from jcr.depth.views import choose_neighbours, sweep_planes
 from jcr.geometry import apply, inverse, rotation_exp, transform
-from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
-
-if TYPE_CHECKING:
-    from jcr.depth.dense import DenseDepth
+from jcr.records import BOTH, MATCHED, NO_DEPTH, PRIOR, Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
 
 pytestmark = pytest.mark.slow
 
@@ -109,11 +106,11 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def dense(scene: Scene) -> "DenseDepth":
+def dense(scene: Scene) -> Pointmaps:
     return _dense(scene, scene.recon_from_camera, scene.tracks)
 
 
-def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: Any) -> "DenseDepth":
+def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: Any) -> Pointmaps:
     from jcr.depth.dense import dense_pointmaps
 
     neighbours = choose_neighbours(tracks, recon_from_camera, 6)
@@ -124,19 +121,19 @@ def _dense(scene: Scene, recon_from_camera: ndarray, tracks: Tracks, **options: 
     )
 
 
-def _z(scene: Scene, dense: "DenseDepth", recon_from_camera: ndarray | None = None) -> ndarray:
+def _z(scene: Scene, dense: Pointmaps, recon_from_camera: ndarray | None = None) -> ndarray:
     cameras = scene.recon_from_camera if recon_from_camera is None else recon_from_camera
     pairs = zip(inverse(cameras), dense.points_in_recon, strict=True)
     return np.stack([apply(camera_from_recon, x)[..., 2] for camera_from_recon, x in pairs])
 
 
-def test_a_tight_budget_changes_no_bit(scene: Scene, dense: "DenseDepth") -> None:
+def test_a_tight_budget_changes_no_bit(scene: Scene, dense: Pointmaps) -> None:
     tight = _dense(scene, scene.recon_from_camera, scene.tracks, memory_gb=0.1)  # one thread
     for name in ("points_in_recon", "confidence", "reason", "depth_std"):
         np.testing.assert_array_equal(getattr(tight, name), getattr(dense, name))
 
 
-def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: "DenseDepth") -> None:
+def test_depth_is_found_and_reasons_and_sigmas_are_honest(scene: Scene, dense: Pointmaps) -> None:
     depth = _z(scene, dense)
     assert np.isfinite(depth).all() and (depth > 0).all()
     np.testing.assert_array_equal(dense.confidence > 0, dense.reason != NO_DEPTH)
@@ -212,7 +209,7 @@ def test_loops_give_the_same_bits_freshly_compiled_and_from_the_cache(tmp_path: 
 
 def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     """A wall at 1 m before four cameras side by side; the last one found 2 m, by chance or because it is so."""
-    from jcr.depth.consistency import agreement
+    from jcr.depth.consistency import agreement, evidence
     from jcr.depth.matched import grid, relative
 
     poses = transform(np.eye(3), np.array([[x, 0.0, 0.0] for x in (0.0, 0.02, -0.02, 0.01)]))
@@ -221,16 +218,17 @@ def test_only_a_confirmed_depth_sees_through_a_point() -> None:
     known = np.ones(inverse_depth.shape, bool)
     chance = known & (np.arange(4) != 3)[:, None, None]
     view = relative(0, np.arange(1, 4), poses, PINHOLE)
-    for trusted, seeing in ((chance, 0), (known, 1)):
-        rest = (view.others, view.a, view.b, view.centre, grid(PINHOLE), 0.01)
-        mean, count, through, information = agreement(0, inverse_depth, known, trusted, *rest)
+    for confirmed, seeing in ((chance, 0), (known, 1)):
+        compared = evidence(inverse_depth, known, confirmed)
+        rest = (view.others, view.a, view.b, view.centre, grid(PINHOLE), PINHOLE.width, 0.01)
+        mean, count, through, information = agreement(0, compared, *rest)
         middle = np.s_[10:-10, 10:-10]
         assert (count[middle] == 2).all() and (through[middle] == seeing).all()
         np.testing.assert_allclose(mean[middle], 1.0, rtol=1e-6)
         np.testing.assert_allclose(information[middle], 2 * (0.02 * PINHOLE.fx) ** 2, rtol=1e-4)
 
 
-def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene, dense: "DenseDepth") -> None:
+def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene, dense: Pointmaps) -> None:
     without = _dense(scene, scene.recon_from_camera, scene.tracks, priors=False)
     assert not np.isin(without.reason, (PRIOR, BOTH)).any()
     inner = _inner(scene.patch, 6)
@@ -243,7 +241,7 @@ def test_one_colour_is_filled_within_its_plane_and_nowhere_matched(scene: Scene,
 
 
 def test_one_colour_that_goes_on_beyond_the_last_texture_stays_unknown(
-    scene: Scene, dense: "DenseDepth"
+    scene: Scene, dense: Pointmaps
 ) -> None:
     """It may be the floor beside the table as well."""
     inner = _inner(scene.blank, 12)
@@ -259,7 +257,7 @@ def _inner(mask: Bool[ndarray, "m h w"], margin: int) -> Bool[ndarray, "m h w"]:
     return inner
 
 
-def test_a_pixel_that_no_neighbour_sees_has_no_confidence(scene: Scene, dense: "DenseDepth") -> None:
+def test_a_pixel_that_no_neighbour_sees_has_no_confidence(scene: Scene, dense: Pointmaps) -> None:
     neighbours = choose_neighbours(scene.tracks, scene.recon_from_camera, 6)
     hidden_somewhere = 0
     for i, others in enumerate(neighbours):
@@ -274,7 +272,7 @@ def test_a_pixel_that_no_neighbour_sees_has_no_confidence(scene: Scene, dense: "
     assert hidden_somewhere > 100
 
 
-def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: "DenseDepth") -> None:
+def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: Pointmaps) -> None:
     scale, motion = 7.3, transform(rotation_exp(np.array([0.3, -1.1, 0.7])), np.array([2.0, -3.0, 1.0]))
     moved = motion @ scene.recon_from_camera
     moved[:, :3, 3] *= scale
@@ -293,7 +291,7 @@ def test_the_gauge_changes_nothing_but_the_unit(scene: Scene, dense: "DenseDepth
 
 
 def test_the_stage_estimates_depth_whatever_the_order_of_the_frames(
-    scene: Scene, dense: "DenseDepth", tmp_path: Path
+    scene: Scene, dense: Pointmaps, tmp_path: Path
 ) -> None:
     """Of images whose names sort otherwise than the capture's frames; and what has pointmaps is left as it is."""
     order = np.array([3, 0, 6, 1, 5, 2, 4])  # row k of the capture is row order[k] by name

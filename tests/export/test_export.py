@@ -224,10 +224,10 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
     stated = jcr.read_capture(ROOT / "examples" / "tabletop").intrinsics
     assert stated is not None and kept["intrinsics"]["fx"] == stated.fx
     for which, (transform_of_pair, lens) in pairs.items():
-        file = export_run(done, "camera_info", tmp_path / f"{which}.yaml", intrinsics=which)
+        file = export_run(done, "camera_info", tmp_path / f"{which}.yaml", {"intrinsics": which})
         written = yaml.safe_load(file.read_text())["camera_matrix"]["data"]
         assert written[0] == pytest.approx(lens["fx"]) and written[2] == pytest.approx(lens["cx"])
-        file = export_run(done, "covariance", tmp_path / f"{which}.covariance.yaml", intrinsics=which)
+        file = export_run(done, "covariance", tmp_path / f"{which}.covariance.yaml", {"intrinsics": which})
         text = file.read_text()
         position = yaml.safe_load(text)["pose"]["pose"]["position"]
         assert [position[axis] for axis in "xyz"] == pytest.approx([row[3] for row in transform_of_pair[:3]])
@@ -235,7 +235,7 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
     with pytest.raises(InputError, match="--intrinsics given"):
-        export_run(done, "camera_info", tmp_path / "none.yaml", intrinsics="given")
+        export_run(done, "camera_info", tmp_path / "none.yaml", {"intrinsics": "given"})
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": kept}))
 
 

@@ -9,16 +9,11 @@ from scipy.stats import chi2
 import jcr
 from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.geometry import retract, rotation_exp, step_between, transform
-from jcr.handeye.components import (
-    Equations,
-    _cholesky,
-    expected_posterior,
-    most_likely,
-    over_sizes,
-    posterior,
-    solve,
-)
+from jcr.handeye.cholesky import cholesky
+from jcr.handeye.components import most_likely, over_sizes
 from jcr.handeye.equation import residuals
+from jcr.handeye.mixed_model import Equations, solve
+from jcr.handeye.posterior import expected_posterior, posterior
 from jcr.handeye.robust import robust_fit
 from jcr.handeye.systematic import Region, arm_errors, smooth_errors
 from jcr.records import RobotNoise
@@ -39,7 +34,13 @@ def equations(rng: np.random.Generator, count: int, systematic_rad: float) -> Eq
     )
     drawn = drawn + np.tile(np.repeat(WHITE, 3), count) * rng.normal(size=6 * count)
     jacobian = np.column_stack([np.tile(np.eye(6), (count, 1)), rng.normal(size=6 * count)])
-    return Equations(drawn, jacobian, np.zeros((7, 7)), np.zeros(7), None, alike)
+    return Equations(
+        residual=drawn,
+        jacobian=jacobian,
+        prior_information=np.zeros((7, 7)),
+        prior_gradient=np.zeros(7),
+        systematic=alike,
+    )
 
 
 def test_smooth_errors_are_a_covariance_that_the_choice_of_the_base_does_not_change():
@@ -136,7 +137,7 @@ def test_a_matrix_without_full_rank_still_has_a_factor():
     rng = np.random.default_rng(3)
     wide = rng.normal(size=(8, 5)) * np.array([1e6, 1.0, 1e-6, 1.0, 1.0, 1e3, 1e-3, 1.0])[:, None]
     for matrix in (wide @ wide.T, wide @ wide.T - 1e-9 * np.diag(np.diag(wide @ wide.T)), np.zeros((3, 3))):
-        factor, size = _cholesky(matrix), np.sqrt(np.diag(matrix)) + 1e-12
+        factor, size = cholesky(matrix), np.sqrt(np.diag(matrix)) + 1e-12
         assert (factor == np.tril(factor)).all()
         assert (np.abs((factor @ factor.T - matrix) / np.outer(size, size)) < 1e-8).all()
 
@@ -199,7 +200,7 @@ def test_the_posterior_that_is_expected_is_the_one_that_draws_have(count: int, s
         white = np.tile(np.repeat(WHITE, 3), count) * rng.normal(size=6 * count)
         drawn = replace(one, residual=part + white)
         reported.append(np.diag(posterior(drawn, *most_likely(drawn), None).covariance))
-    noise = RobotNoise(*WHITE, True, None, systematic_rad)
+    noise = RobotNoise(translation=WHITE[0], rotation=WHITE[1], estimated=True, systematic=systematic_rad)
     silent = replace(one, residual=np.zeros(6 * count))
     ratio = np.diag(expected_posterior(silent, noise, None).covariance) / np.median(reported, axis=0)
     assert (np.abs(np.log(ratio)) < np.log(1.6)).all(), ratio

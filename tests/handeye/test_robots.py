@@ -13,18 +13,15 @@ from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.inverse_kinematics import inverse_kinematics, required_posture
 from jcr.handeye.mounting import LengthError, mounted_arm
 from jcr.handeye.robots import (
-    ErrorSizes,
-    bent_kinematics,
     error_jacobian,
-    error_names,
     error_std,
     forward_kinematics,
     from_dh,
     joint_frames,
     with_tool,
 )
+from jcr.simulate.bent_arm import BentArm, error_names
 
-ALL = ("joint", "link", "sag", "gear")
 H = np.pi / 2
 Z = (0, 0, 1)
 
@@ -226,14 +223,14 @@ def test_error_jacobian_is_the_derivative_of_the_bent_arm(name):
     arm = with_tool(arm_named(name), tool)
     joints = postures(arm, 10)
     reported = forward_kinematics(arm, joints)
-    jacobian = error_jacobian(arm, joints, ALL)
-    names, std = error_names(arm, ALL), error_std(arm, ErrorSizes(1.0, 1.0, 1.0, 1.0), ALL)
-    assert jacobian.shape == (10, 6, len(names)) and len(names) == len(std) == 8 * arm.dof
+    jacobian, names = error_jacobian(arm, joints), error_names(arm)
+    assert jacobian.shape == (10, 6, len(error_std(arm, 1.0, 1.0))) == (10, 6, 5 * arm.dof)
+    assert len(names) == 8 * arm.dof
     step = 1e-6
-    for k in range(len(names)):
+    for k in range(jacobian.shape[2]):
         error = np.zeros(len(names))
         error[k] = step
-        ends = [bent_kinematics(arm, joints, sign * error, ALL) for sign in (1, -1)]
+        ends = [BentArm(arm, sign * error).true(joints) for sign in (1, -1)]
         there, back = (step_between(reported, end) for end in ends)
         numeric = (there - back) / (2 * step)
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=2e-9, err_msg=names[k])

@@ -9,9 +9,9 @@ import jcr
 from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.geometry import inverse, retract, rotation_between_deg, rotation_exp, scale_translation, transform
 from jcr.handeye.closed_form import closed_form
-from jcr.handeye.components import Equations, solve
 from jcr.handeye.equation import PRIOR_STD, residuals, residuals_by_camera
-from jcr.handeye.fit import Cues, fit_poses, left_out
+from jcr.handeye.fit import Cues, PoseProblem, fit_poses
+from jcr.handeye.mixed_model import Equations, left_out, solve
 from jcr.handeye.systematic import smooth_errors
 
 NOISE = (5e-4, np.radians(0.1))
@@ -215,7 +215,14 @@ def test_covariance_matches_a_jackknife_over_images():
     noise = (full.robot_noise.translation, full.robot_noise.rotation)
     left_out = []
     for k in range(30):
-        fit = fit_poses(gripper, camera, start, ~np.eye(30, dtype=bool)[k], noise)
+        others = PoseProblem(
+            base_from_gripper=gripper,
+            recon_from_camera=camera,
+            used=~np.eye(30, dtype=bool)[k],
+            systematic=smooth_errors(gripper),
+            noise=noise,
+        )
+        fit = fit_poses(others, start)
         left_out.append(error(problem, fit.gripper_from_camera, fit.scale))
     jackknife = 29 / 30 * ((np.array(left_out) - np.mean(left_out, 0)) ** 2).sum(0)
     ratio = np.sqrt(jackknife / np.diag(full.covariance))
@@ -234,11 +241,15 @@ def test_held_out_error_is_that_of_a_fit_without_the_image():
 
     def of_rows(rows):
         return Equations(
-            residual[rows, 0], jacobian[rows], prior, np.zeros(13), None, alike[np.ix_(rows, rows)]
+            residual=residual[rows, 0],
+            jacobian=jacobian[rows],
+            prior_information=prior,
+            prior_gradient=np.zeros(13),
+            systematic=alike[np.ix_(rows, rows)],
         )
 
     everything = of_rows(np.arange(48))
-    missed, covariance = left_out(everything, solve(everything, sizes), NOISE)
+    missed, covariance = left_out(solve(everything, sizes), NOISE)
     v = everything.covariance(sizes)
     for k in range(8):
         mine, others = np.arange(6 * k, 6 * k + 6), np.delete(np.arange(48), np.arange(6 * k, 6 * k + 6))

@@ -18,7 +18,7 @@ from jcr.depth.densify import densify
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_between_deg
 from jcr.reconstruct.board import boards
-from jcr.reconstruct.marker import reconstruct
+from jcr.reconstruct.marker import reconstruct_marker
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Intrinsics, Kind
 from places import SHARED
@@ -117,7 +117,7 @@ BOARDS = {
 @pytest.mark.parametrize("spec", BOARDS)
 def test_calibrates_from_every_kind_of_board(tmp_path, spec):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", BOARDS[spec]())
-    reconstruction = reconstruct(capture, spec)
+    reconstruction = reconstruct_marker(capture, spec)
     assert len(reconstruction.image_index) == len(capture)
     hand_eye = calibrate(capture, reconstruction)
     found = hand_eye.gripper_from_camera
@@ -129,7 +129,7 @@ def test_calibrates_from_every_kind_of_board(tmp_path, spec):
 
 def test_an_unknown_lens_comes_from_the_board(tmp_path):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco(), known_lens=False)
-    reconstruction = reconstruct(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
+    reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
     assert abs(reconstruction.intrinsics.fx / LENS.fx - 1) < 0.01
     hand_eye = calibrate(capture, reconstruction)
     assert np.linalg.norm(hand_eye.gripper_from_camera - gripper_from_camera) < 0.01
@@ -144,7 +144,7 @@ def test_an_unknown_lens_comes_from_the_board(tmp_path):
 )
 def test_other_readings_of_a_charuco_board_are_tried_and_named(tmp_path, spec, legacy, read_as):
     capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco(legacy), count=5)
-    reconstruction = reconstruct(capture, spec)
+    reconstruction = reconstruct_marker(capture, spec)
     assert any(read_as in note for note in reconstruction.notes)
     found = calibrate(capture, reconstruction).gripper_from_camera
     assert np.linalg.norm(found - gripper_from_camera) < 0.01
@@ -175,7 +175,7 @@ def test_lines_that_a_detector_drew_over_a_board_are_no_hindrance(tmp_path):
         assert detector.detectMarkers(image)[1] is None or len(detector.detectMarkers(image)[1]) < len(ids)
         cv2.imwrite(str(capture.folder / name), image)
     spec = "charuco:7x6:0.030:0.022:DICT_4X4_50"
-    hand_eye = calibrate(capture, reconstruct(capture, spec))
+    hand_eye = calibrate(capture, reconstruct_marker(capture, spec))
     found = hand_eye.gripper_from_camera
     assert 1e3 * np.linalg.norm(found[:3, 3] - gripper_from_camera[:3, 3]) < 3.0
 
@@ -187,7 +187,7 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
     sheet[140:560, 180:720] = 255
     sheet[170:530, 240:660] = charuco()
     capture, _ = capture_of(tmp_path / "capture", sheet, count=5)
-    reconstruction = reconstruct(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
+    reconstruction = reconstruct_marker(capture, "charuco:7x6:0.030:0.022:DICT_4X4_50")
     write_reconstruction(tmp_path / "reconstruction.npz", reconstruction)
     read = read_reconstruction(tmp_path / "reconstruction.npz")
     assert read.metric_std == reconstruction.metric_std and read.tracks.from_board
@@ -216,7 +216,7 @@ def test_a_board_that_is_none_is_refused_with_the_cure(spec, says):
 def test_pictures_without_the_board_say_so(tmp_path):
     capture, _ = capture_of(tmp_path / "capture", charuco(), count=3)
     with pytest.raises(NotTrustedError, match="0 of 3 images show chessboard:8x5:0.025"):
-        reconstruct(capture, "chessboard:8x5:0.025")
+        reconstruct_marker(capture, "chessboard:8x5:0.025")
 
 
 DATA = SHARED / "data"
@@ -235,7 +235,7 @@ DATA = SHARED / "data"
 )
 def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg, trusted):
     capture = read_capture(DATA / name)
-    hand_eye = calibrate(capture, reconstruct(capture, spec))
+    hand_eye = calibrate(capture, reconstruct_marker(capture, spec))
     reference = json.loads((DATA / name / "reference.json").read_text())
     true = np.array(reference["gripper_from_camera"])
     found = hand_eye.gripper_from_camera
@@ -248,7 +248,7 @@ def test_real_boards_reproduce_their_references(name, spec, limit_mm, limit_deg,
 def test_a_sheet_of_paper_tells_the_size_that_the_robot_asks_for():
     """The sheet of franka_plain_background has sides of 11.388 and 8.056 squares: A4, with squares of 26.07 mm."""
     capture = read_capture(DATA / "franka_plain_background")
-    hand_eye = calibrate(capture, reconstruct(capture, "chessboard:9x6:0.02607"))
+    hand_eye = calibrate(capture, reconstruct_marker(capture, "chessboard:9x6:0.02607"))
     # Nothing is found against it; 95 % of errors stay below 5.05 mm, where 5 mm are needed to grasp.
     kinds = {found.kind for found in hand_eye.findings if found.severity != "informs"}
     assert hand_eye.converged and kinds <= {Kind.NOT_EXACT_ENOUGH}

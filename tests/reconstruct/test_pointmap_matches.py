@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jcr.geometry import apply, inverse, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, pairs_from_arrays
-from jcr.reconstruct.pointmap_matches import MatchOptions, tracks_from_pairs, tracks_from_pointmaps
+from jcr.reconstruct.pointmap_matches import tracks_from_pairs, tracks_from_pointmaps
 from jcr.records import Tracks
 from places import SHARED
 
@@ -96,15 +96,15 @@ def test_pairs_at_any_scale_give_the_same_tracks(table: tuple[ndarray, ndarray])
 
 
 def test_what_one_image_alone_sees_and_what_nobody_trusts_is_not_matched(
-    table: tuple[ndarray, ndarray],
+    table: tuple[ndarray, ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recon_from_camera, points = table
     points = points.copy()
     points[0, :, : WIDTH // 2] += [0, 0, 0.5]  # another surface, half a metre above the table
     confidence = np.ones(points.shape[:3])
     confidence[1, : HEIGHT // 2] = 0.1
-    options = MatchOptions(least_confidence=0.6)
-    tracks = tracks_from_pointmaps(recon_from_camera, points, confidence, lambda x_px: x_px, options)
+    monkeypatch.setattr("jcr.reconstruct.pointmap_matches.LEAST_CONFIDENCE", 0.6)
+    tracks = tracks_from_pointmaps(recon_from_camera, points, confidence, lambda x_px: x_px)
     x, y = tracks.x_px.T
     assert not ((tracks.image == 0) & (x < WIDTH // 2 - 3)).any()
     assert not ((tracks.image == 1) & (y < HEIGHT // 2 - 3)).any()

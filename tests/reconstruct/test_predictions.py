@@ -16,7 +16,8 @@ from jcr.geometry import apply, fit_similarity, inverse, rotation_between_deg, t
 from jcr.reconstruct import backends, predictions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.global_alignment.pairs import pairs_from_arrays
-from jcr.reconstruct.predictions import PredictionsOptions
+from jcr.reconstruct.hub import Weights
+from jcr.reconstruct.predictions import reconstruct_predictions
 from jcr.records import Capture, Intrinsics, Reconstruction
 from places import SHARED
 
@@ -83,7 +84,7 @@ def pointmap_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
 def reconstructed(capture: Capture, arrays: dict[str, Any]) -> Reconstruction:
     path = capture.folder / "predictions.npz"
     np.savez(path, **arrays)
-    return predictions.reconstruct(capture, PredictionsOptions(path))
+    return reconstruct_predictions(capture, path)
 
 
 def assert_poses(result: Reconstruction, truth: ndarray, millimetres: float, degrees: float) -> None:
@@ -200,7 +201,7 @@ def test_faults_in_a_file_are_named(capture: Capture, truth: dict[str, Any]) -> 
             reconstructed(capture, {name: values for name, values in arrays.items() if values is not None})
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="no such file"):
-        predictions.reconstruct(capture, PredictionsOptions(capture.folder / "absent.npz"))
+        reconstruct_predictions(capture, capture.folder / "absent.npz")
 
 
 def test_a_network_gives_the_same_record(
@@ -217,12 +218,12 @@ def test_a_network_gives_the_same_record(
         return images, made, ("weights X: licence Y",)
 
     monkeypatch.setattr(dust3r, "predict", predict)
-    options = Dust3rOptions("X", "Y")
-    result = dust3r.reconstruct(capture, options)
+    options = Dust3rOptions(weights=Weights(Path("X"), "X", "Y"))
+    result = dust3r.reconstruct_dust3r(capture, options)
     assert result.backend == "dust3r" and "weights X: licence Y" in result.notes
     assert_poses(result, truth["gt_poses"], millimetres=3, degrees=0.3)
     unknown = Capture(capture.folder, capture.images, capture.base_from_gripper, capture.image_size)
-    found = dust3r.reconstruct(unknown, options).intrinsics
+    found = dust3r.reconstruct_dust3r(unknown, options).intrinsics
     # The principal point stays where the network has it; the focal length is aligned.
     assert found.fx == pytest.approx(5 * truth["gt_focal"], rel=0.01)
     assert (found.cx, found.cy) == pytest.approx((2.5 * WIDTH + 2, 2.5 * HEIGHT + 2))
@@ -267,12 +268,16 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     from functools import partial
 
     from jcr.reconstruct.views_at_once import mapanything
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 
     model = FakeMapAnything(truth)
-    options = ViewsOptions("mapanything", mapanything.load, Path("X"), "Apache-2.0", Cost(0.0, 0.0, 0.0, 0.0))
-    result = reconstruct(capture, options, predict=partial(mapanything.predict, model))
+    options = ViewsOptions(
+        backend="mapanything",
+        load=mapanything.load,
+        weights=Weights(Path("X"), "X", "Apache-2.0"),
+        cost=Cost(0.0, 0.0, 0.0, 0.0),
+    )
+    result = reconstruct_views_at_once(capture, options, predict=partial(mapanything.predict, model))
     view = model.views[0]
     assert view["img"].shape == (1, 3, 378, 518) and view["data_norm_type"] == ["dinov2"]
     assert view["img"][0, 1].mean() == pytest.approx(-0.456 / 0.224, abs=1e-5)
@@ -292,8 +297,8 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     turned = capture.base_from_gripper.copy()
     turned[1, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ turned[1, :3, :3]
     off = Capture(capture.folder, capture.images, turned, capture.image_size, capture.intrinsics)
-    denied = reconstruct(off, options, predict=partial(mapanything.predict, model)).warnings
-    named = [note for note in denied if "check its pose" in note]
+    found = reconstruct_views_at_once(off, options, predict=partial(mapanything.predict, model))
+    named = [note for note in found.warnings if "check its pose" in note]
     assert len(named) == 1 and named[0].startswith("1.png: its angles to the other views differ")
 
 

@@ -85,4 +85,4 @@ def test_a_folding_distortion_is_dropped_and_said(tmp_path: Path) -> None:
     lens = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480, (-0.9, 0.0, 0.0, 0.0, 0.0))
     prepared = prepare_images(Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), lens))
     assert "folds over" in prepared.warnings[0]
-    assert prepared.lens == Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)
+    assert prepared.intrinsics_of_capture == Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)

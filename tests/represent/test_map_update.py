@@ -124,7 +124,7 @@ def known_reconstruction(
             rotation_residual_rad=np.zeros(views),
         ),
         residuals=PaperResiduals(0.0, 0.0),
-        robot=RobotExamined(RobotNoise(0.0, 0.0, False)),
+        robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
     )
     return reconstruction, hand_eye
 

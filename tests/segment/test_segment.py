@@ -395,7 +395,7 @@ def hand_eye() -> HandEye:
             inliers=np.ones(2, bool), translation_residual_m=none, rotation_residual_rad=none
         ),
         residuals=PaperResiduals(0.0, 0.0),
-        robot=RobotExamined(RobotNoise(0.0, 0.0, False)),
+        robot=RobotExamined(RobotNoise(translation=0.0, rotation=0.0, estimated=False)),
     )
 
 
@@ -515,6 +515,9 @@ def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monk
     pytest.importorskip("transformers", reason="the extra `sam` is not installed")
     with pytest.raises(InputError, match="config.json and model.safetensors"):
         load_sam(str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(InputError, match="not on this machine; jcr models get owner/sam downloads them"):
+        load_sam("owner/sam")
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match=r"pip install 'jcr-handeye\[sam\]'"):
         load_sam("facebook/sam2.1-hiera-tiny")

@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 POINTS_AT_ONCE = 1024
-"""Points whose coupling to the cameras is held in memory together."""
+"""Points whose coupling to the cameras is in memory together."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Derivatives:
     """Derivatives of observations, and their residuals, all times the root of their weights."""
 
@@ -27,7 +27,7 @@ class Derivatives:
     residual: Float[ndarray, "k 2"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Group:
     """Points that are eliminated together, for they are seen by few images of many."""
 
@@ -83,7 +83,7 @@ class Normal:
         return points
 
 
-def with_points_held(
+def with_fixed_points(
     rows: Derivatives, seen: Sightings
 ) -> tuple[Float[ndarray, "d d"], Float[ndarray, " d"]]:
     """Hessian and right side of everything but the points."""
@@ -166,7 +166,17 @@ def _groups(starts: Int[ndarray, " p"], image: Int[ndarray, " k"]) -> list[_Grou
         images, of_image = np.unique(image[rows], return_inverse=True)
         of_point = np.repeat(np.arange(len(points)), counts)
         pairs = np.flatnonzero(np.diff(of_point * len(images) + of_image, prepend=-1))
-        groups.append(_Group(points, rows, _batches(counts), images, pairs, of_point[pairs], of_image[pairs]))
+        groups.append(
+            _Group(
+                points=points,
+                rows=rows,
+                batches=_batches(counts),
+                images=images,
+                pairs=pairs,
+                point=of_point[pairs],
+                image=of_image[pairs],
+            )
+        )
     return groups
 
 

@@ -19,8 +19,8 @@ from jcr.adjust.robots import Adjusted, ArmPoses, Given, Placed, equations_of
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.camera import parameters, project, unproject, with_parameters
 from jcr.geometry import apply, inverse
-from jcr.handeye.components import expected_posterior
 from jcr.handeye.equation import Poses
+from jcr.handeye.posterior import expected_posterior
 from jcr.records import Intrinsics, RobotNoise, Tracks
 
 COLUMNS = 9
@@ -42,7 +42,7 @@ SAME_FEATURE = np.radians(40.0), 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class ForeseenCamera:
-    """A camera, what is known of it beforehand, and how much its images will tell."""
+    """A camera, what is known of it beforehand, and how much its images will show."""
 
     intrinsics: Intrinsics
     prior: IntrinsicsPrior
@@ -55,12 +55,11 @@ class ForeseenCamera:
     def of(adjusted: Adjusted) -> "ForeseenCamera":
         """The first camera of an adjustment, its next images being as those were."""
         images = adjusted.given.evidence
-        problem, view, left = images.problem, images.view, images.problem.freedom.model_error_std
-        weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
+        problem, left = images.problem, images.problem.freedom.model_error_std
         return ForeseenCamera(
             intrinsics=images.scene.cameras[0],
             prior=problem.freedom.intrinsics[0],
-            information_per_px2=float(weight.sum()) / len(problem.seen.rows),
+            information_per_px2=float(images.weight.sum()) / len(problem.seen.rows),
             model_error=float(left[0]) if len(left) else 0.0,
         )
 
@@ -152,7 +151,7 @@ def _shown(
     shown = np.zeros((len(cameras), len(points)), bool)
     away = cameras[seen_from, :3, 3] - points
     far = np.linalg.norm(away, axis=1)
-    turn, ratio = SAME_FEATURE
+    angle, ratio = SAME_FEATURE
     for i, pose in enumerate(cameras):
         x_px = project(intrinsics, x_in_camera := apply(inverse(pose), points))
         inside = (
@@ -162,7 +161,7 @@ def _shown(
         )
         to = pose[:3, 3] - points
         distance = np.linalg.norm(to, axis=1)
-        alike = (away * to).sum(1) > np.cos(turn) * far * distance
+        alike = (away * to).sum(1) > np.cos(angle) * far * distance
         near = (distance < ratio * far) & (far < ratio * distance)
         shown[i] = (inside & alike & near) | (seen_from == i)
     return shown

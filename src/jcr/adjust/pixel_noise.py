@@ -43,7 +43,7 @@ class PixelNoise:
     sigma_px: Float[ndarray, " c"]
     """Of one coordinate, by camera."""
     inflation: float = 1.0
-    """Of the variance of what many observations say together, because neighbours share errors; one for all cameras, for
+    """Of the variance of what many observations show together, because neighbours share errors; one for all cameras, for
     where points follow the few observations of one its own residuals do not show it."""
     common: float = 1.0
     """Share of the variance of a median observation that all have alike; the rest is as its match states it."""
@@ -68,7 +68,7 @@ class PixelNoise:
         return (depth > max(nearest, 1e-9)) * weight
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """What of the observations the estimate needs and no adjustment changes."""
 
@@ -92,7 +92,13 @@ class Layout:
         _, cell = np.unique(keys, axis=1, return_inverse=True)
         freedom = np.maximum(2 * np.bincount(observations.point) - 3, 1)
         stated = (observations.std_px / np.median(observations.std_px)) ** 2 if len(camera) else np.ones(0)
-        return Layout(camera, observations.point, cell.ravel(), stated, chi2.ppf(0.5, freedom))
+        return Layout(
+            camera=camera,
+            point=observations.point,
+            cell=cell.ravel(),
+            stated_variance=stated,
+            median_square=chi2.ppf(0.5, freedom),
+        )
 
     @property
     def states_variances(self) -> bool:
@@ -102,6 +108,10 @@ class Layout:
     def relative_variance(self, common: float) -> Float[ndarray, " k"]:
         """Of each observation over the median one's, where all have this share of that in common."""
         return common + (1 - common) * self.stated_variance
+
+    def squares_of_cells(self, pull: Float[ndarray, "k 2"]) -> float:
+        """Squared sums over cells of what each observation pulls, added up."""
+        return sum(float((np.bincount(self.cell, along) ** 2).sum()) for along in pull.T)
 
 
 def pixel_noise(
@@ -125,9 +135,9 @@ def pixel_noise(
     factor = float(np.median(squares[clean] if clean.any() else squares))
     noise = PixelNoise(np.maximum(np.sqrt(factor * ratio), MIN_SIGMA_PX), common=common)
     pull = noise.weights(residual_px, depth, layout)[:, None] * residual_px
-    sums = sum(float((np.bincount(layout.cell, along) ** 2).sum()) for along in pull.T)
     # Of points that are all behind their cameras nothing pulls.
-    return replace(noise, inflation=max(1.0, sums / max(float((pull**2).sum()), 1e-300)))
+    inflation = layout.squares_of_cells(pull) / max(float((pull**2).sum()), 1e-300)
+    return replace(noise, inflation=max(1.0, inflation))
 
 
 def left_of_points(

@@ -11,10 +11,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.adjust.elimination import point_blocks
-from jcr.adjust.images import derivatives
-from jcr.adjust.robots import Adjusted, of_poses
+from jcr.adjust.projection import derivatives
+from jcr.adjust.robots import Adjusted, reported_poses
 from jcr.geometry import by_similarity
-from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE
+from jcr.handeye.cholesky import cholesky, over
+from jcr.handeye.equation import BASE_ROTATION, BASE_TRANSLATION, SCALE, pose_by_pose
 
 SOME = 300
 """Points whose uncertainty stands for that of all."""
@@ -64,8 +65,7 @@ def _of_points(
     observations = problem.observations
     rows = np.flatnonzero(np.isin(observations.point, some))
     point = np.searchsorted(some, observations.point[rows])
-    weight = images.noise.weights(images.view.residual_px, images.view.depth, problem.layout)
-    by = derivatives(images.scene, images.view, problem, weight)
+    by = derivatives(images.scene, images.view, problem, images.weight)
     by_point = by.by_point[rows]
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     blocks = point_blocks(by_point, starts)
@@ -83,13 +83,14 @@ def _of_columns(adjusted: Adjusted) -> tuple[Float[ndarray, "d p"], Float[ndarra
     """How the columns of the images' evidence step with the unknowns of the mixed model, and their covariance where
     these stand still: of rigs, what the reported poses and the images leave."""
     given, equations = adjusted.given, adjusted.equations
-    rigs, (_, _, by_rig, _) = given.rigs, of_poses(adjusted.most_likely, given.arms)
-    gain = np.linalg.solve(equations.covariance(adjusted.log_sizes), by_rig @ rigs.covariance).T
+    rigs, by_rig = given.rigs, reported_poses(adjusted.most_likely, given.arms).by_rig
+    shown = pose_by_pose(by_rig, rigs.covariance)
+    gain = over(cholesky(equations.covariance(adjusted.log_sizes)), shown).T
     robots, columns = adjusted.first_camera_column, len(given.evidence.gradient)
     by_unknown = np.zeros((columns, len(adjusted.covariance)))
     by_unknown[given.free, robots + np.arange(len(given.free))] = 1.0
     by_unknown[given.by_arm] = -gain @ equations.jacobian
     by_unknown[given.by_arm, robots:] -= rigs.follow
     left = np.zeros((columns, columns))
-    left[np.ix_(given.by_arm, given.by_arm)] = rigs.covariance - gain @ by_rig @ rigs.covariance
+    left[np.ix_(given.by_arm, given.by_arm)] = rigs.covariance - gain @ shown
     return by_unknown, left

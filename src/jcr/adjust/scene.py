@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import parameters, with_parameters
-from jcr.geometry import retract, skew
+from jcr.geometry import retract, skew, step_between
 from jcr.records import Intrinsics, Tracks
 
 
@@ -229,6 +229,26 @@ def similarities(scene: Scene, freedom: Freedom) -> Float[ndarray, "d 7"]:
         if columns is not None:
             out[columns.start : columns.start + 3, 0] = scene.rig_from_camera[c, :3, 3]
     return out
+
+
+@dataclass(frozen=True)
+class RigInformation:
+    """Twice a cost that is quadratic in steps of the first rigs from a place of reference: sᵀ H s + 2 gᵀ s."""
+
+    world_from_rig: Float[ndarray, "m 4 4"]
+    information: Float[ndarray, "r r"]
+    gradient: Float[ndarray, " r"]
+
+    def steps(self, scene: Scene) -> Float[ndarray, " r"]:
+        """How far the rigs of a scene are from the reference."""
+        return step_between(self.world_from_rig, scene.world_from_rig[: len(self.world_from_rig)]).ravel()
+
+
+def information_along(steps: Float[ndarray, "d 7"], strength: float) -> Float[ndarray, "d d"]:
+    """Information of this size along steps: those of a similarity of the world, which nothing else keeps where it is,
+    and without it what is quadratic would rotate and shrink with it."""
+    unseen = np.linalg.qr(steps)[0]
+    return strength * unseen @ unseen.T
 
 
 def similarities_of_rigs(world_from_rig: Float[ndarray, "m 4 4"]) -> Float[ndarray, "r 7"]:

@@ -21,7 +21,9 @@ from jcr.adjust.robots import Adjusted, Placed, equations_of
 from jcr.adjust.scene import OF_IMAGE, PRISM, Freedom, NuisancePrior
 from jcr.camera import parameter_names, parameters
 from jcr.distributions import f as f_distribution
-from jcr.handeye.components import solve
+from jcr.geometry import Transform
+from jcr.handeye.cholesky import cholesky, over
+from jcr.handeye.mixed_model import solve
 from jcr.records import Intrinsics
 
 WEAK = {"fx": 0.3, "fy": 0.3, "cx": 0.2, "cy": 0.2}
@@ -46,7 +48,7 @@ class Alternatives:
     freedom: int
     """Of the robots' residuals, by which their noise was estimated: fewer than the images have by far."""
     dispersion: float
-    """Variance of what pulls at a parameter, over what the weights say."""
+    """Variance of what pulls at a parameter, over what the weights state."""
     names: tuple[str, ...]
     """Of the camera's parameters."""
     units: Float[ndarray, " q"]
@@ -105,7 +107,7 @@ class Tested:
     """The step of the camera's place that comes with it, axes of its parent."""
 
 
-def first_x(placed: Placed) -> Float[ndarray, "4 4"]:
+def first_x(placed: Placed) -> Transform:
     """The place of a wrist camera that is the first of its arm."""
     return placed.x[0]
 
@@ -114,7 +116,7 @@ def alternatives(
     adjusted: Adjusted,
     prior: IntrinsicsPrior,
     camera: int = 0,
-    place: Callable[[Placed], Float[ndarray, "4 4"]] = first_x,
+    place: Callable[[Placed], Transform] = first_x,
     model_error_std: float | None = None,
 ) -> Alternatives:
     """The columns and equations of one camera about an adjustment.
@@ -137,10 +139,8 @@ def alternatives(
     of_camera, of_images = all_free.intrinsics_columns[camera], all_free.nuisance_columns
     rest = begin + np.r_[of_camera.start + own : of_camera.stop, of_images]
     kept = np.setdiff1d(np.arange(len(hessian)), rest)
-    size = 1 / np.sqrt(hessian.diagonal())
-    scaled = size[kept, None] * hessian[np.ix_(kept, kept)] * size[kept]
     coupling = hessian[np.ix_(kept, rest)]
-    by_column = size[kept, None] * np.linalg.solve(scaled, size[kept, None] * coupling)
+    by_column = over(cholesky(hessian[np.ix_(kept, kept)]), coupling)
     start = given.evidence.scene.cameras[camera]
     return Alternatives(
         hessian=hessian[np.ix_(rest, rest)] - coupling.T @ by_column,
@@ -210,10 +210,7 @@ def _with_one(
 
 
 def _place_by_kept(
-    adjusted: Adjusted,
-    place: Callable[[Placed], Float[ndarray, "4 4"]],
-    columns: int,
-    kept: Int[ndarray, " k"],
+    adjusted: Adjusted, place: Callable[[Placed], Transform], columns: int, kept: Int[ndarray, " k"]
 ) -> Float[ndarray, "6 k"]:
     """How far a camera's place moves with each of the kept columns; with no parameter of a camera it does."""
     derivative = adjusted.derivative(place)
@@ -300,10 +297,7 @@ def differences(count: int) -> Float[ndarray, "n d"]:
 
 
 def freed(
-    freedom: Freedom,
-    combinations: Float[ndarray, "e p"],
-    images: Int[ndarray, " m"],
-    camera: int = 0,
+    freedom: Freedom, combinations: Float[ndarray, "e p"], images: Int[ndarray, " m"], camera: int = 0
 ) -> Freedom:
     """A freedom with combinations of the columns of one camera's `Alternatives` free too.
 
@@ -335,7 +329,7 @@ def _std(combinations: Float[ndarray, "n p"], of_each: Float[ndarray, " n"]) -> 
 
 
 def spanned(combinations: Float[ndarray, "e p"]) -> Float[ndarray, "e r"]:
-    """An orthonormal basis of what the combinations free; some may say the same."""
+    """An orthonormal basis of what the combinations free; some may free the same."""
     u, size, _ = np.linalg.svd(combinations, full_matrices=False)
     return u[:, size > 1e-9 * size.max(initial=1e-300)]
 
@@ -372,10 +366,9 @@ def _dispersion(images: ImageEvidence) -> float:
     """Of the weighted residuals, and no less than that of their sums over cells of the images (cluster sampling;
     Liang and Zeger, Biometrika 73, 1986)."""
     problem, view = images.problem, images.view
-    weight = images.noise.weights(view.residual_px, view.depth, problem.layout)
+    weight = images.weight
     pull = weight[:, None] * view.residual_px
     taken = 3 * len(problem.points) + 6 * len(problem.seen.rows)
     share = max(1 - taken / (2 * len(weight)), 0.1)
     scale = 2 * weight.sum() * share
-    clustered = sum(float((np.bincount(problem.layout.cell, along) ** 2).sum()) for along in pull.T)
-    return max(float((pull**2).sum()), clustered) / scale
+    return max(float((pull**2).sum()), problem.layout.squares_of_cells(pull)) / scale

@@ -1,56 +1,68 @@
 """The adjustment of one wrist camera, a rig an image: what a capture's own camera needs of robots.py."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
-from jcr.adjust.robots import Adjusted, ArmPoses, adjust
+from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.adjust.score_test import freed
-from jcr.geometry import apply, fit_similarity, scale_translation
+from jcr.adjust.together import adjust
+from jcr.geometry import Transform, apply, fit_similarity, scale_translation
+from jcr.handeye.equation import Poses
 from jcr.handeye.fit import Unknowns
 from jcr.handeye.systematic import smooth_errors
 from jcr.records import Intrinsics, Tracks
 
 
+@dataclass(frozen=True, kw_only=True)
+class WristOptions:
+    """What is free beside the intrinsics, what was found of the robot before, and where to begin."""
+
+    systematic: Float[ndarray, "s s"] | None = None
+    """Covariance of the systematic errors of the gripper poses at 1 rad; None: that of errors smooth over the poses."""
+    combinations: Float[ndarray, "e p"] | None = None
+    """Of the columns of score_test.Alternatives, that are free too."""
+    exchanged: bool = False
+    """The camera stands still, and the arm carries what it sees."""
+    near: Adjusted | None = None
+    """An adjustment of the same poses and tracks, or of more of them, to begin from."""
+    bent: Float[ndarray, "s b"] | None = None
+    """Errors that were found of the gripper poses (handeye/bent.py), of one standard deviation each."""
+
+
 def adjust_wrist(
-    base_from_gripper: Float[ndarray, "m 4 4"],
+    base_from_gripper: Poses,
     start: Unknowns,
-    recon_from_camera: Float[ndarray, "m 4 4"],
+    recon_from_camera: Poses,
     intrinsics: Intrinsics,
     tracks: Tracks,
     *,
     noise: tuple[float, float] | None = None,
     prior: IntrinsicsPrior | None = None,
-    systematic: Float[ndarray, "s s"] | None = None,
-    combinations: Float[ndarray, "e p"] | None = None,
-    exchanged: bool = False,
-    near: Adjusted | None = None,
-    bent: Float[ndarray, "s b"] | None = None,
+    options: WristOptions = WristOptions(),
 ) -> Adjusted:
     """Images and robot adjusted from a pose fit's (gripper_from_camera, scale, base_from_recon).
 
     `noise` is the robot's (m, rad), at least; it is estimated with the rest. `prior` is what is known of the
-    intrinsics; None: that they are exact. `systematic` is the covariance of the systematic errors of the gripper poses
-    at 1 rad; None: that of errors smooth over the poses. `combinations` of the columns of score_test.Alternatives are
-    free too. `exchanged`: the camera stands still, and the arm carries what it sees. `near` is an adjustment of the same
-    poses and tracks, or of more of them, to begin from. `bent` are errors that were found of the gripper poses
-    (handeye/bent.py), of one standard deviation each.
+    intrinsics; None: that they are exact.
     """
     x, scale, z = start
-    each = np.arange(len(base_from_gripper))
+    each, systematic = np.arange(len(base_from_gripper)), options.systematic
     prior = prior_of(intrinsics, HELD) if prior is None else prior
     freedom = Freedom.of((intrinsics,), (prior,), len(each))
-    if combinations is not None:
-        freedom = freed(freedom, combinations, each)
+    if options.combinations is not None:
+        freedom = freed(freedom, options.combinations, each)
     arm = ArmPoses(
         rigs=each,
         base_from_gripper=base_from_gripper,
         systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
         start=(x, z),
-        exchanged=exchanged,
-        bent=bent,
+        exchanged=options.exchanged,
+        bent=options.bent,
     )
     return adjust(
         Scene(
@@ -63,11 +75,11 @@ def adjust_wrist(
         freedom,
         [arm],
         noise,
-        near=near,
+        near=options.near,
     )
 
 
-def recon_frame(adjusted: Adjusted, tracks: Tracks) -> tuple[float, Float[ndarray, "4 4"]]:
+def recon_frame(adjusted: Adjusted, tracks: Tracks) -> tuple[float, Transform]:
     """Scale (metres per unit) and base_from_recon of the reconstruction whose tracks were adjusted.
 
     Its points against the adjusted ones, weighed down where the two disagree.

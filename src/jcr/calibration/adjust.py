@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.images import median_reprojection_px, view_of
+from jcr.adjust.images import median_reprojection_px
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
+from jcr.adjust.projection import view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import focal_lengths
-from jcr.adjust.wrist import adjust_wrist, recon_frame
+from jcr.adjust.wrist import WristOptions, adjust_wrist, recon_frame
 from jcr.calibration.case import Case
 from jcr.calibration.consider import with_intrinsics_considered
 from jcr.geometry import inverse, retract, scale_translation, step_between
@@ -65,7 +66,7 @@ def adjust_case(
 ) -> Adjusted:
     """The used images and gripper poses of a case adjusted, from its fit to poses or from its accepted adjustment.
 
-    `prior` takes the place of the case's; the rest is as adjust_wrist takes it.
+    `prior` takes the place of the case's; the rest is that of WristOptions.
     """
     fit = case.hand_eye.before or case.hand_eye
     return adjust_wrist(
@@ -76,11 +77,13 @@ def adjust_case(
         case.tracks,
         noise=case.options.robot_noise_m_rad,
         prior=case.intrinsics_prior if prior is None else prior,
-        systematic=case.systematic,
-        combinations=combinations,
-        exchanged=exchanged,
-        near=case.adjusted if case.hand_eye.converged else None,
-        bent=bent,
+        options=WristOptions(
+            systematic=case.systematic,
+            combinations=combinations,
+            exchanged=exchanged,
+            near=case.adjusted if case.hand_eye.converged else None,
+            bent=bent,
+        ),
     )
 
 
@@ -113,7 +116,12 @@ def robot_noise_of(found: Adjusted) -> RobotNoise:
     """The errors of the gripper poses, as an adjustment found them."""
     given = found.given.noise
     return RobotNoise(
-        *found.noise, exceeds(found.noise, given), given, found.systematic, found.systematic_left
+        translation=found.noise[0],
+        rotation=found.noise[1],
+        estimated=exceeds(found.noise, given),
+        given=given,
+        systematic=found.systematic,
+        systematic_left=found.systematic_left,
     )
 
 
@@ -178,16 +186,16 @@ def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
 
 def _leave_one_out(found: Adjusted) -> HeldOut | None:
     """Each image's gripper pose predicted by an adjustment that does not use it."""
-    missed = found.leave_one_out()
-    m = len(missed)
+    left_out = found.leave_one_out()
+    m = len(left_out)
     if m < 4:
         return None
-    metres, radians = np.linalg.norm(missed.reshape(m, 2, 3), axis=2).mean(0)
+    metres, radians = np.linalg.norm(left_out.reshape(m, 2, 3), axis=2).mean(0)
     # The images as they would be with every gripper, and the rig on it, by as much beside its place.
     placed, evidence = found.most_likely, found.given.evidence
     x, z = placed.x[0], placed.z[0]
     gripper = predict(x, placed.scale, z, placed.scene.world_from_rig)
-    in_metres = inverse(z) @ retract(gripper, -missed) @ x
+    in_metres = inverse(z) @ retract(gripper, -left_out) @ x
     rigs = scale_translation(in_metres, 1 / placed.scale)
     moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
     return HeldOut(

@@ -12,7 +12,6 @@ from jcr.arrays_json import Covariance7, Matrix, Numbers7, Part, Spread
 from jcr.calibration.findings_json import FindingJson, derived, findings_of_words, require_one_verdict
 from jcr.calibration.requirement import not_exact_enough
 from jcr.calibration.uncertainty_json import SeenJson, Uncertainty, mm_and_deg
-from jcr.calibration.words import more_images_help
 from jcr.capture.plain_files import first_fault, read_json, shown
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -28,6 +27,7 @@ from jcr.records import (
     ImageVerdict,
     Kind,
     Mount,
+    NextPose,
     PaperResiduals,
     PosePairs,
     Reconstruction,
@@ -36,7 +36,6 @@ from jcr.records import (
     RobotNoise,
     ScaleCheck,
     Verdict,
-    WithGivenIntrinsics,
     strongest_first,
     without_consequences,
 )
@@ -108,19 +107,6 @@ class GivenIntrinsicsKept(Part):
     differs_mm: Spread
     """From where the estimated intrinsics and their transform place a point at the centre of the image."""
 
-    @classmethod
-    def of(cls, found: WithGivenIntrinsics | None) -> "GivenIntrinsicsKept | None":
-        """That of a calibration."""
-        if found is None:
-            return None
-        return cls(
-            gripper_from_camera=found.gripper_from_camera.tolist(),
-            covariance=found.covariance.tolist(),
-            intrinsics=IntrinsicsJson.model_validate(vars(found.intrinsics)),
-            seen=SeenJson(**vars(found.seen)),
-            differs_mm=found.differs_mm,
-        )
-
 
 class Proposal(Part):
     """A gripper pose worth adding, and what would then be known."""
@@ -132,6 +118,12 @@ class Proposal(Part):
     within_95_mm: Spread | None = None
     """Of a point seen as in `uncertainty.seen`; null in files of earlier versions."""
     rotation_95_deg: Spread | None = None
+
+    @classmethod
+    def of(cls, pose: NextPose, like: str) -> "Proposal":
+        """That of a calibration, near the image `like`."""
+        given = {name: value for name, value in vars(pose).items() if name in cls.model_fields}
+        return cls.model_validate(given | {"like": like})
 
 
 class CalibrationFile(Part):
@@ -168,7 +160,7 @@ class CalibrationFile(Part):
     attempts: list[Attempt] = []
     """The back ends that were tried, in order; empty where camera poses were given."""
     notes: list[str] = []
-    """What the stages did of their own accord, and findings in words that nobody need act on."""
+    """What the stages did of their own accord, and findings in words that require no action."""
     mount: Mount = "gripper"
     """base: the camera is fixed and watches what the gripper carries; gripper_from_camera and base_from_recon are then
     null, and uncertainty is that of base_from_camera, along axes of the base."""
@@ -223,6 +215,12 @@ class CalibrationFile(Part):
         return self.model_copy(update=_derived(together, self.notes))
 
     @property
+    def mostly_systematic(self) -> bool:
+        """Whether most of ± is systematic errors of the robot, which more images of the same region leave."""
+        budget = None if self.uncertainty is None else self.uncertainty.budget
+        return budget is not None and budget.mostly_systematic
+
+    @property
     def images_used(self) -> int:
         """How many images the calibration rests on."""
         return sum(image.used for image in self.images)
@@ -244,47 +242,36 @@ def calibration_file(
 ) -> CalibrationFile:
     """The file of a calibration of `capture`; poses that were given are capture and reconstruction in one."""
     names = [capture.images[row] for row in reconstruction.image_index[hand_eye.inliers]]
-    mount = capture.mount if isinstance(capture, Capture) else "gripper"
-    camera, recon = hand_eye.gripper_from_camera.tolist(), hand_eye.base_from_recon.tolist()
-    return CalibrationFile(
-        mount=mount,
-        gripper_from_camera=camera if mount == "gripper" else None,
-        base_from_recon=recon if mount == "gripper" else None,
-        base_from_camera=camera if mount == "base" else None,
-        gripper_from_object=recon if mount == "base" else None,
-        scale=hand_eye.scale,
-        backend=reconstruction.backend,
-        images=image_verdicts(capture, reconstruction, hand_eye),
-        residuals=hand_eye.residuals,
-        uncertainty=Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
-        held_out=hand_eye.held_out,
-        observability=Observed.model_validate(hand_eye.observability, from_attributes=True),
-        robot_noise=Noise.of(hand_eye.robot_noise),
-        intrinsics=IntrinsicsAndStd.of(hand_eye.intrinsics, hand_eye.estimate.intrinsics_std),
-        **_derived(hand_eye.findings, reconstruction.notes),
-        timings_s=timings_s,
-        version=version,
-        next_poses=[
-            Proposal(
-                base_from_gripper=pose.base_from_gripper.tolist(),
-                like=names[pose.like],
-                expected_std=pose.expected_std.tolist(),
-                within_95_mm=pose.within_95_mm,
-                rotation_95_deg=pose.rotation_95_deg,
-            )
-            for pose in hand_eye.next_poses
-        ],
-        scale_check=hand_eye.scale_evidence.network,
-        robot_errors=RobotErrors.of(hand_eye.robot),
-        angle_ratio=hand_eye.robot.angle_ratio,
-        depth_check=hand_eye.scale_evidence.depth,
-        requirement=hand_eye.requirement,
-        attempts=list(attempts),
-        # Of a fixed camera the transform is another one, and it has no name for this.
-        with_given_intrinsics=None
-        if mount == "base"
-        else GivenIntrinsicsKept.of(hand_eye.with_given_intrinsics),
-    )
+    content = {
+        "mount": "gripper",
+        "gripper_from_camera": hand_eye.gripper_from_camera,
+        "base_from_recon": hand_eye.base_from_recon,
+        "scale": hand_eye.scale,
+        "backend": reconstruction.backend,
+        "images": image_verdicts(capture, reconstruction, hand_eye),
+        "residuals": hand_eye.residuals,
+        "uncertainty": Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
+        "held_out": hand_eye.held_out,
+        "observability": hand_eye.observability,
+        "robot_noise": Noise.of(hand_eye.robot_noise),
+        "intrinsics": IntrinsicsAndStd.of(hand_eye.intrinsics, hand_eye.estimate.intrinsics_std),
+        "timings_s": timings_s,
+        "version": version,
+        "next_poses": [Proposal.of(pose, names[pose.like]) for pose in hand_eye.next_poses],
+        "scale_check": hand_eye.scale_evidence.network,
+        "robot_errors": RobotErrors.of(hand_eye.robot),
+        "angle_ratio": hand_eye.robot.angle_ratio,
+        "depth_check": hand_eye.scale_evidence.depth,
+        "requirement": hand_eye.requirement,
+        "attempts": list(attempts),
+        "with_given_intrinsics": hand_eye.with_given_intrinsics,
+    }
+    if isinstance(capture, Capture) and capture.mount == "base":
+        # Of a fixed camera the transform is another one, and there is no name for it with the given intrinsics.
+        fixed = {"mount": "base", "base_from_camera": hand_eye.gripper_from_camera}
+        fixed |= {"gripper_from_object": hand_eye.base_from_recon, "with_given_intrinsics": None}
+        content |= fixed | {"gripper_from_camera": None, "base_from_recon": None}
+    return CalibrationFile.model_validate(content | _derived(hand_eye.findings, reconstruction.notes))
 
 
 def failed_file(
@@ -295,7 +282,7 @@ def failed_file(
     version: str,
     attempts: Sequence[Attempt] = (),
 ) -> CalibrationFile:
-    """The file of a capture whose images gave no camera poses at all; `findings` say why, strongest first."""
+    """The file of a capture whose images gave no camera poses at all; `findings` are the reasons, strongest first."""
     return CalibrationFile(
         mount=capture.mount,
         gripper_from_camera=None,
@@ -390,7 +377,6 @@ def _of_earlier_version(found: CalibrationFile) -> CalibrationFile:
     """With its warnings as findings; only their words are known."""
     findings = findings_of_words(found.warnings, found.converged)
     if found.converged and found.requirement is not None:
-        budget = None if found.uncertainty is None else found.uncertainty.budget
-        short = not_exact_enough(found.requirement, budget is not None and not more_images_help(budget))
+        short = not_exact_enough(found.requirement, found.mostly_systematic)
         findings += [] if short is None else [short]
     return found.model_copy(update=_derived(strongest_first(findings), found.notes))

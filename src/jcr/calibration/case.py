@@ -14,7 +14,7 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, scene_uncertainty
 from jcr.handeye.fit import Cues
-from jcr.records import Capture, HandEye, Reconstruction, Tracks
+from jcr.records import Capture, Finding, HandEye, Reconstruction, Tracks
 
 MIN_OBSERVATIONS = 200
 """Fewer correspondences than this do not refine what the poses show."""
@@ -121,6 +121,18 @@ class Case:
         return (
             self.is_adjustable and not self.tracks.from_pointmaps and self.hand_eye.observability.observable
         )
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check of a case returns."""
+
+    findings: tuple[Finding, ...] = ()
+    """Strongest first."""
+    hand_eye: HandEye | None = None
+    """The calibration with what was measured in it, or the one to keep in place of the present one; None: it stays."""
+    adjusted: Adjusted | None = None
+    """The adjustment that it is made of, where that is another one."""
 
 
 def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:

@@ -7,14 +7,14 @@ Schmidt; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, chapt
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.intrinsics_prior import IntrinsicsPrior
 from jcr.camera import by_parameters, by_point
 from jcr.geometry import apply, inverse, rotation_exp, skew, step_between, transform
 from jcr.handeye.closed_form import initial_estimate
-from jcr.handeye.fit import Cues, fit_poses
+from jcr.handeye.fit import Cues, PoseProblem, fit_poses
 from jcr.records import HandEye, Intrinsics, Tracks
 
 FEWEST = 6
@@ -41,17 +41,22 @@ def with_intrinsics_considered(
         return hand_eye
     moved = np.array(
         [
-            _moved(camera, tracks, rows, intrinsics, prior)
+            _camera_with_other_intrinsics(camera, tracks, rows, intrinsics, prior)
             for camera, rows in zip(recon_from_camera, seen, strict=True)
         ]
     )
-    used: Bool[ndarray, " m"] = np.ones(len(recon_from_camera), dtype=bool)
+    problem = PoseProblem(
+        base_from_gripper=base_from_gripper,
+        recon_from_camera=recon_from_camera,
+        used=np.ones(len(recon_from_camera), dtype=bool),
+        systematic=systematic,
+        noise=hand_eye.robot_noise.given,
+        cues=cues or Cues(),
+    )
 
     def solved(camera: Float[ndarray, "m 4 4"]) -> tuple[Float[ndarray, "4 4"], float]:
-        start = initial_estimate(base_from_gripper, camera, used.astype(float))
-        fit = fit_poses(
-            base_from_gripper, camera, start, used, hand_eye.robot_noise.given, cues, None, systematic, False
-        )
+        start = initial_estimate(base_from_gripper, camera)
+        fit = fit_poses(replace(problem, recon_from_camera=camera), start, averaged=False)
         return fit.gripper_from_camera, fit.scale
 
     x, scale = solved(recon_from_camera)
@@ -68,7 +73,7 @@ def with_intrinsics_considered(
     return replace(hand_eye, estimate=estimate)
 
 
-def _moved(
+def _camera_with_other_intrinsics(
     recon_from_camera: Float[ndarray, "4 4"],
     tracks: Tracks,
     rows: ndarray,
@@ -79,8 +84,8 @@ def _moved(
     x_in_camera = apply(inverse(recon_from_camera), tracks.points_in_recon[tracks.point[rows]].astype(float))
     by_x = by_point(intrinsics, x_in_camera)
     by_pose = np.concatenate([by_x, -by_x @ skew(x_in_camera)], axis=2).reshape(-1, 6)
-    by_lens = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
-    steps = -np.linalg.lstsq(by_pose, by_lens.reshape(len(by_pose), -1), rcond=None)[0].T
+    by_intrinsics = by_parameters(intrinsics, x_in_camera) @ (prior.directions * prior.std)
+    steps = -np.linalg.lstsq(by_pose, by_intrinsics.reshape(len(by_pose), -1), rcond=None)[0].T
     return np.array(
         [recon_from_camera @ inverse(transform(rotation_exp(step[3:]), step[:3])) for step in steps]
     )

@@ -13,7 +13,7 @@ from jcr.records import Capture, Finding, HandEye, Kind, Reconstruction
 LENGTH_STD = 0.01
 """Relative: a pixel's breadth at either end of a length of a hundred pixels."""
 HEIGHT_STD = 1e-3
-"""m, of a ruler held to a camera."""
+"""m, one sigma of a height measured with a ruler."""
 CONTRADICTED = (4.0, 0.02)
 """Standard deviations, and share of the scale, from which a known scale and the robot's motion exclude each other."""
 ONE_AXIS = np.radians(6)
@@ -29,8 +29,8 @@ def height_cue(base_from_gripper: Poses, height: float) -> tuple[Float[ndarray, 
     up = np.sign(u[2, 0]) or 1.0
     axis_in_base, axis_in_gripper = up * u[:, 0], up * vt[0]
     wander = np.linalg.norm(base_from_gripper[:, :3, :3] @ axis_in_gripper - axis_in_base, axis=1)
-    turn = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
-    if np.sqrt((wander**2).mean()) > ONE_AXIS or turn.max() < ONE_AXIS:
+    rotation = rotation_angle(np.swapaxes(base_from_gripper[:1, :3, :3], 1, 2) @ base_from_gripper[:, :3, :3])
+    if np.sqrt((wander**2).mean()) > ONE_AXIS or rotation.max() < ONE_AXIS:
         raise InputError(
             "--known-height: the gripper does not rotate about one common axis, along which a height could be "
             "known; leave the option out"
@@ -88,6 +88,4 @@ def scale_contradiction(free: HandEye, metric_std: float) -> Finding | None:
     sigmas, share = CONTRADICTED
     if abs(off) < max(share, sigmas * float(np.hypot(std, metric_std))):
         return None
-    return Finding(
-        kind=Kind.BOARD_SIZE, severity="rejects", mend="poses", value=float(np.expm1(off)), std=std
-    )
+    return Finding.of(Kind.BOARD_SIZE, "rejects", "poses", value=float(np.expm1(off)), std=std)

@@ -12,12 +12,12 @@ from jcr.distributions import chi2
 from jcr.geometry import step_between
 
 OTHER = "reference"
-"""Names the covariance of a calibration that does not say what it comes from."""
+"""Name of the covariance of a calibration whose file has no budget."""
 NOTHING = 1e-6
 """Share of a difference that is rounding."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Difference:
     """From one gripper_from_camera to another, in gripper axes."""
 
@@ -42,7 +42,7 @@ def compare(calibration: str | Path, reference: str | Path) -> Difference:
 
 
 def difference(ours: Known, other: Known) -> Difference:
-    """The difference of one calibration from another, held against the covariances that they state.
+    """The difference of one calibration from another, compared with the covariances that they state.
 
     A cause of covariance Pₖ explains ΔᵀV⁻¹PₖV⁻¹Δ of ΔᵀV⁻¹Δ, V = ΣPₖ: the squared size of its best linear prediction.
     """
@@ -57,18 +57,25 @@ def difference(ours: Known, other: Known) -> Difference:
         for name, part in (known.parts | {OTHER: rest}).items():
             parts[name] = parts.get(name, np.zeros((6, 6))) + part
     if not np.diag(together).all():  # neither states any, or both are said to be exact
-        return Difference(step[:3], step[3:], None, None, None, {})
+        return Difference(
+            translation_m=step[:3],
+            rotation_vector=step[3:],
+            sigmas=None,
+            chi2=None,
+            p_value=None,
+            explained_by={},
+        )
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
     explained = {name: float(weighed @ part @ weighed) for name, part in parts.items()} if squared else {}
     return Difference(
-        step[:3],
-        step[3:],
-        np.abs(step) / std,
-        squared,
-        float(chi2.sf(squared, 6)),
-        {
+        translation_m=step[:3],
+        rotation_vector=step[3:],
+        sigmas=np.abs(step) / std,
+        chi2=squared,
+        p_value=float(chi2.sf(squared, 6)),
+        explained_by={
             name: part / squared
             for name, part in sorted(explained.items(), key=lambda item: -item[1])
             if name != OTHER or part > NOTHING * squared

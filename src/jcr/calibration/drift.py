@@ -2,7 +2,7 @@
 
 Under the null hypothesis a new image's reported gripper pose differs from the predicted one by the robot's errors, the
 image's own uncertainty and that of the calibration. All new images share the latter, and systematic errors are alike
-where new gripper poses are near old ones: old and new images are therefore solved together (components.py), with a
+where new gripper poses are near old ones: old and new images are therefore solved together (mixed_model.py), with a
 drift of the camera that only new ones see. The squared Mahalanobis distance of the drift follows χ²(6) when nothing
 moved; its tail is averaged over the sizes of the robot's errors. The same with a motion of the scene tells a table
 that was moved.
@@ -20,7 +20,8 @@ from scipy.optimize import root_scalar
 from scipy.stats import chi2, ncx2
 
 from jcr.geometry import retract, step_between
-from jcr.handeye.components import Equations, Solution, lower, most_likely, over_sizes, solve
+from jcr.handeye.cholesky import lower
+from jcr.handeye.components import most_likely, over_sizes
 from jcr.handeye.equation import (
     PRIOR_STD,
     ROTATION,
@@ -31,6 +32,7 @@ from jcr.handeye.equation import (
     residuals_by_camera,
 )
 from jcr.handeye.fit import PoseFit, Unknowns
+from jcr.handeye.mixed_model import Equations, Solution, solve
 from jcr.handeye.systematic import Region
 
 CLEAR = 10.0
@@ -42,7 +44,7 @@ NewPoses = Float[ndarray, "k 4 4"]
 Cause = Literal["camera", "scene", "either"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Drift:
     """How far the camera seems to have moved on the gripper since the calibration."""
 
@@ -72,16 +74,16 @@ def drift(
     steps of these cameras (geometry.retract, recon axes); `systematic` is the covariance of the systematic errors of old
     and new gripper poses at 1 rad.
     """
-    camera = _moved_by(calibrated, old, new, systematic, slice(0, 6))
-    scene = _moved_by(calibrated, old, new, systematic, slice(7, 13))
+    camera = _estimate_motion(calibrated, old, new, systematic, slice(0, 6))
+    scene = _estimate_motion(calibrated, old, new, systematic, slice(7, 13))
     difference = camera.misfit - scene.misfit
     return Drift(
-        camera.offset,
-        camera.covariance,
-        camera.p_value,
-        camera.misfit_p_value,
-        "either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
-        detectable(camera.covariance, alpha),
+        offset=camera.offset,
+        covariance=camera.covariance,
+        p_value=camera.p_value,
+        misfit_p_value=camera.misfit_p_value,
+        cause="either" if abs(difference) < CLEAR else "camera" if difference < 0 else "scene",
+        detectable=detectable(camera.covariance, alpha),
     )
 
 
@@ -96,8 +98,8 @@ def detectable(covariance: Float[ndarray, "6 6"], alpha: float) -> tuple[float, 
     return float(length * worst[0]), float(length * worst[1])
 
 
-@dataclass(frozen=True)
-class _Moved:
+@dataclass(frozen=True, kw_only=True)
+class _Motion:
     """One explanation of the new images: a motion of X, or of base_from_recon."""
 
     offset: Float[ndarray, "6"]
@@ -108,13 +110,13 @@ class _Moved:
     misfit_p_value: float | None
 
 
-def _moved_by(
+def _estimate_motion(
     calibrated: PoseFit,
     old: tuple[Poses, Poses],
     new: tuple[NewPoses, NewPoses, Float[ndarray, "k 6 6"]],
     systematic: Float[ndarray, "s s"],
     columns: slice,
-) -> _Moved:
+) -> _Motion:
     """Generalised least squares of old and new images together, in which new ones see a moved X or base_from_recon."""
     x, scale, z = calibrated.gripper_from_camera, calibrated.scale, calibrated.base_from_recon
     of_x = columns.start == 0
@@ -124,13 +126,12 @@ def _moved_by(
     region = Region.of_poses(stacked)
     prior = np.diag(np.r_[PRIOR_STD**-2.0, np.zeros(6)])
     alone = Equations(
-        residual.ravel(),
-        stacked,
-        prior,
-        np.zeros(13),
-        None,
-        region.left(systematic[:m, :m]),
-        calibrated.given_noise,
+        residual=residual.ravel(),
+        jacobian=stacked,
+        prior_information=prior,
+        prior_gradient=np.zeros(13),
+        systematic=region.left(systematic[:m, :m]),
+        given=calibrated.noise.given,
     )
     log_sizes, information = most_likely(alone)
 
@@ -169,13 +170,13 @@ def _together(
     design = np.concatenate([both, np.concatenate([np.zeros((m, 6)), of_new[:, columns]])], axis=1)
     everywhere = Region(np.delete(both, SCALE, axis=1), np.hstack([region.fit, np.zeros((12, n))]))
     return Equations(
-        np.concatenate([alone.residual, residual_new.ravel()]),
-        design,
-        np.diag(np.r_[np.diag(alone.prior_information), np.zeros(6)]),
-        np.zeros(19),
-        known,
-        everywhere.left(systematic),
-        alone.given,
+        residual=np.concatenate([alone.residual, residual_new.ravel()]),
+        jacobian=design,
+        prior_information=np.diag(np.r_[np.diag(alone.prior_information), np.zeros(6)]),
+        prior_gradient=np.zeros(19),
+        known=known,
+        systematic=everywhere.left(systematic),
+        given=alone.given,
     )
 
 
@@ -185,7 +186,7 @@ def _averaged(
     known_sizes: Iterable[tuple[ndarray, ndarray, Solution]],
     begun: Float[ndarray, "6"],
     freedom: int,
-) -> _Moved:
+) -> _Motion:
     """The motion, and how the new images agree on it, averaged over the sizes of the robot's errors that the old images
     leave open.
 
@@ -202,12 +203,12 @@ def _averaged(
     offset = weight @ steps
     off = steps - offset
     distances = np.einsum("ki,ki->k", steps, np.linalg.solve(each, steps[..., None])[..., 0])
-    return _Moved(
-        offset,
-        np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
-        float(weight @ chi2.sf(distances, 6)),
-        float(weight @ misfits),
-        float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
+    return _Motion(
+        offset=offset,
+        covariance=np.einsum("k,kij->ij", weight, each) + np.einsum("k,ki,kj->ij", weight, off, off),
+        p_value=float(weight @ chi2.sf(distances, 6)),
+        misfit=float(weight @ misfits),
+        misfit_p_value=float(weight @ chi2.sf(misfits, freedom)) if freedom > 0 else None,
     )
 
 

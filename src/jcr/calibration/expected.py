@@ -20,9 +20,9 @@ from jcr.calibration.case import Case
 from jcr.calibration.robot_errors import RobotErrors, of_poses
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.geometry import inverse, rotation_angle
-from jcr.handeye.components import GIVEN_SHARE, TYPICAL
 from jcr.handeye.equation import Poses, point_ahead, uncertainty
 from jcr.handeye.fit import Cues, expected_fit
+from jcr.handeye.mixed_model import GIVEN_SHARE, TYPICAL
 from jcr.handeye.next_poses import assumed_camera, candidates, looked_at, nearest, next_poses
 from jcr.least_squares import one_blas_thread
 from jcr.records import Estimate, HandEye, Intrinsics, NextPose, RobotNoise, Seen, Where
@@ -33,7 +33,7 @@ robot leave; and poses of a capture from which on the most informative ones are 
 FEWEST = 3
 """Poses, from which on something is expected."""
 USUAL_FOCAL = 0.8
-"""Of the width: a focal length that nobody knows, of a camera that sees 64° across."""
+"""Of the width: an unknown focal length: of a camera that sees 64° across."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,11 +183,17 @@ def assumed(
 
 
 def typical_noise(given: tuple[float, float] | None = None) -> RobotNoise:
-    """Errors of a robot that nobody has measured; `given` (m, rad) is a lower bound on the random ones."""
+    """Typical errors of a robot whose errors are not measured; `given` (m, rad) is a lower bound on the random ones."""
     metres, radians, systematic = TYPICAL
     if given is not None:
         metres, radians = np.hypot(1.0, GIVEN_SHARE) * np.array(given)
-    return RobotNoise(float(metres), float(radians), False, given, float(systematic))
+    return RobotNoise(
+        translation=float(metres),
+        rotation=float(radians),
+        estimated=False,
+        given=given,
+        systematic=float(systematic),
+    )
 
 
 def worse_of(noise: RobotNoise, other: RobotNoise) -> RobotNoise:

@@ -57,8 +57,6 @@ def findings_of_words(warnings: Sequence[str], converged: bool) -> list[Finding]
     """Warnings of a file of an earlier version, whose words alone are known; the first says why it is rejected."""
     first: Severity = "warns" if converged else "rejects"
     return [
-        Finding(
-            kind=Kind.EARLIER_VERSION, severity="warns" if k else first, details={"text": said, "remedy": ""}
-        )
+        Finding.of(Kind.EARLIER_VERSION, "warns" if k else first, text=said, remedy="")
         for k, said in enumerate(warnings)
     ]

@@ -10,7 +10,7 @@ from jcr.errors import InputError
 from jcr.records import Where
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
     """How the hand-eye calibration is found."""
 

@@ -15,7 +15,7 @@ from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.records import Finding, HandEye, Kind, PosePairs
 
 METRIC_STD = 0.005
-"""Relative; a printed marker has the size that its maker says to half a percent."""
+"""Relative; a printed marker has its stated size to half a percent."""
 
 
 def calibrate_poses(pairs: PosePairs, options: CalibrateOptions | None = None) -> HandEye:
@@ -43,13 +43,13 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
     free = solve_hand_eye(gripper, camera, robot_noise=noise, cues=cues, systematic=systematic)
     scale = 1.0 if options.scale is None and pairs.is_metric else options.scale
     hand_eye = free
-    # A known size makes few samples worth more; where the robot's motion excludes it, the motion is believed.
+    # A known size makes few samples worth more; where the robot's motion excludes it, the motion decides.
     if scale is not None and (options.scale is not None or not free.converged or is_one(free)):
         hand_eye = solve_hand_eye(
             gripper, camera, robot_noise=noise, cues=cues, systematic=systematic, scale=scale
         )
         if not free.observability.observable and scale == 1.0:
-            return hand_eye.with_findings(Finding(kind=Kind.SCALE_ASSUMED, severity="warns", mend="motion"))
+            return hand_eye.with_findings(Finding.of(Kind.SCALE_ASSUMED, "warns", "motion"))
     if not hand_eye.converged:
         found = better_reading(gripper, camera)
         if found is None:
@@ -59,13 +59,13 @@ def _calibrated_poses(pairs: PosePairs, options: CalibrateOptions, robot: RobotE
         return hand_eye.with_findings(convention_finding(found, severity))
     if pairs.is_metric and not is_one(hand_eye):
         return hand_eye.with_findings(
-            Finding(
-                kind=Kind.BOARD_SIZE,
-                severity="warns",
-                mend="intrinsics",
+            Finding.of(
+                Kind.BOARD_SIZE,
+                "warns",
+                "intrinsics",
                 value=hand_eye.scale - 1,
                 std=hand_eye.scale * float(np.sqrt(hand_eye.covariance[6, 6])),
-                details={"marker": 1.0},
+                marker=1.0,
             )
         )
     return hand_eye

@@ -18,7 +18,7 @@ from jcr.calibration.robot_errors import RobotErrors
 from jcr.calibration.seen import Scene, in_use, within_95
 from jcr.handeye.next_poses import assumed_camera
 from jcr.handeye.observability import excitation
-from jcr.records import BENT, Budget, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
+from jcr.records import BENT, Finding, HandEye, Kind, Mend, NextPose, Plan, Requirement, Where
 
 GRASPING = (5.0, 1.0)
 """mm, degrees: a parallel gripper that opens 10 mm wider than its object has 5 mm to either side, and a degree moves the
@@ -50,7 +50,7 @@ def advised(
         reach, proposed = _worthwhile(hand_eye, used, required, assumptions, robot)
         required = replace(required, more_images=reach)
     else:
-        # An X that is not trusted is not used, nor a robot that is worse than usual promised away.
+        # A rejected X is not used, and a robot that is worse than usual is not expected to improve.
         noise = worse_of(hand_eye.robot_noise, typical_noise())
         assumptions = replace(assumptions, gripper_from_camera=assumed_camera(used), noise=noise, camera=None)
         ahead = Ahead.of(assumptions, used, robot, PROPOSED)
@@ -58,7 +58,7 @@ def advised(
     seen = excitation(used, hand_eye.gripper_from_camera) if len(used) > 1 else None
     earlier = tuple(one for one in hand_eye.findings if one.kind is not Kind.NOT_EXACT_ENOUGH)
     hand_eye = replace(hand_eye, plan=Plan(seen, tuple(proposed), required), findings=earlier)
-    short = not_exact_enough(required, mostly_systematic(hand_eye.budget))
+    short = not_exact_enough(required, hand_eye.budget is not None and hand_eye.budget.mostly_systematic)
     return hand_eye if short is None or not hand_eye.converged else hand_eye.with_findings(short)
 
 
@@ -75,21 +75,13 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
         for name, value in vars(required).items()
         if value is not None
     }
-    return Finding(
-        kind=Kind.NOT_EXACT_ENOUGH,
-        severity="rejects" if required.asked else "warns",
-        mend=mend,
+    return Finding.of(
+        Kind.NOT_EXACT_ENOUGH,
+        "rejects" if required.asked else "warns",
+        mend,
         value=1e-3 * required.reached_mm,
-        details=numbers,
+        **numbers,
     )
-
-
-def mostly_systematic(budget: Budget | None) -> bool:
-    """Whether most of the uncertainty is systematic errors of the robot, which images of the same region leave."""
-    if budget is None:
-        return False
-    others = budget.robot_random, budget.intrinsics, budget.images, budget.faults
-    return bool(np.trace(budget.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
 
 
 def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
@@ -106,8 +98,16 @@ def _required(hand_eye: HandEye, options: CalibrateOptions) -> Requirement:
     if at == "scene" and found.scene is not None:
         reached_mm = 1e3 * found.scene.within_95_m
         reached_deg = float(np.degrees(within_95(found.scene.covariance[3:6, 3:6])))
-    asked = options.require is not None
-    return Requirement(*(options.require or GRASPING), asked, distance_mm, reached_mm, reached_deg, at=at)
+    translation_mm, rotation_deg = options.require or GRASPING
+    return Requirement(
+        translation_mm=translation_mm,
+        rotation_deg=rotation_deg,
+        asked=options.require is not None,
+        distance_mm=distance_mm,
+        reached_mm=reached_mm,
+        reached_deg=reached_deg,
+        at=at,
+    )
 
 
 def _worthwhile(

@@ -52,7 +52,7 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
     """What is known of the errors of the capture's gripper poses and of `later` ones of the same robot.
 
     InputError where the poses are not those of the arm that the user named, or all too long by one factor for that of
-    their joint angles; else what a capture says of itself is only doubted.
+    their joint angles; an arm that only the capture names is then not used.
     """
     gripper, joints = capture.base_from_gripper, capture.joints
     if later is not None:
@@ -65,7 +65,7 @@ def robot_errors(capture: Capture, options: CalibrateOptions, later: Capture | N
     except InputError as error:
         if options.robot is not None:
             raise InputError(f"--robot {options.robot}: {error}") from None
-        unused = Finding(kind=Kind.ROBOT_UNUSED, severity="warns", mend="robot", details={"text": str(error)})
+        unused = Finding.of(Kind.ROBOT_UNUSED, "warns", "robot", text=str(error))
         return replace(errors_of(gripper), unused=unused)
 
 

@@ -2,8 +2,8 @@
 
 A pixel x at a distance d is the point p = d·u(K, x) in the camera, u being the unit ray, and X·p in the gripper. Its
 error comes from the intrinsics K, from X and, where the distance is one of the reconstruction, from the scale; the
-three were estimated together, and a principal point that is off by what a rotation of the camera makes good harms
-nobody who uses both. Each alone exaggerates, therefore; this is their joint covariance, carried to the point
+three were estimated together, and a principal point that is off by what a rotation of the camera makes good has
+no effect where both are used. Each alone exaggerates, therefore; this is their joint covariance, carried to the point
 (projection uncertainty, as mrcal has it for a camera by itself: Kogan, "mrcal", "Projection uncertainty").
 """
 

@@ -7,11 +7,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import AfterValidator, model_validator
 
-from jcr.arrays_json import Covariance7, Part, PartCovariance7, Spread, Spread3
+from jcr.arrays_json import Covariance7, Part, PartCovariance7, Spread, Spread3, Square
 from jcr.calibration.seen import joint_covariance
-from jcr.calibration.words import worst_direction
 from jcr.camera import parameter_names
 from jcr.records import COVARIANCE_ORDER, Budget, Estimate, InUse
+from jcr.records.words import worst_direction
 
 
 def mm_and_deg(metres: float, radians: float) -> dict[str, float]:
@@ -57,6 +57,13 @@ class UncertaintyBudget(Part):
             return None
         return cls(**{name: Share.of(part) for name, part in vars(budget).items()})
 
+    @property
+    def mostly_systematic(self) -> bool:
+        """Whether the robot's systematic errors are most of it."""
+        others = (self.robot_random, self.intrinsics, self.images, self.faults)
+        squares = sum(share.translation_mm**2 for share in others if share is not None)
+        return self.robot_systematic.translation_mm**2 >= squares
+
 
 class SeenJson(Part):
     """How exactly a point that the camera sees is placed; 95 % of errors are smaller."""
@@ -83,7 +90,7 @@ class SeenAndCorners(SeenJson):
 class Joint(Part):
     """Covariance of X, scale and intrinsics together, from which the place of any seen point follows."""
 
-    covariance: list[list[float]]
+    covariance: Square
     order: list[str]
     """Of `uncertainty`, then fx, fy, cx, cy and the distortion."""
 
@@ -99,7 +106,7 @@ class Joint(Part):
         if estimate.intrinsics is None or estimate.intrinsics_cross is None:
             return None
         order = [*COVARIANCE_ORDER, *parameter_names(estimate.intrinsics)]
-        return cls(covariance=joint_covariance(estimate).tolist(), order=order)
+        return cls.model_validate({"covariance": joint_covariance(estimate), "order": order})
 
 
 class Uncertainty(Part):
@@ -130,7 +137,7 @@ class Uncertainty(Part):
             scale_std_percent=float(100 * std[6]),
             covariance=estimate.covariance.tolist(),
             order=list(COVARIANCE_ORDER),
-            worst=worst_direction(estimate),
+            worst=worst_direction(estimate.gripper_from_camera, estimate.covariance),
             budget=UncertaintyBudget.of(estimate.budget),
             seen=None if in_use is None else SeenAndCorners.of(in_use),
             scene_95_mm=None if in_use is None or in_use.scene is None else 1e3 * in_use.scene.within_95_m,

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.handeye.solve import judged
 from jcr.records import Finding, HandEye, verdict_of
 

@@ -1,25 +1,21 @@
 """A calibration in words: what terminal, log.txt and report say of it alike, each thing put into words once."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.records import Attempt, DepthCheck, Estimate, HeldOut, ScaleCheck, is_explained, verdict_of
+from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
+from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
+from jcr.records import Attempt, DepthCheck, HeldOut, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
-    from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
 
 NOTHING = 0.02
 """Of the largest part of a budget: its square is nothing beside that of the whole."""
 
 
-def summary(content: "CalibrationFile") -> str:
+def summary(content: CalibrationFile) -> str:
     """What was found, what was left out, and what would help."""
     lines = found(content)
     lines += [f"  not used: {image.image}: {image.reason}" for image in content.images if not image.used]
@@ -31,11 +27,7 @@ def summary(content: "CalibrationFile") -> str:
             seen = f"{significant(last.within_95_mm)} mm and {significant(last.rotation_95_deg)}°"
             then = f"a seen point within {seen} (95 % of errors), {then}"
         near = ", ".join(pose.like for pose in content.next_poses)
-        if (
-            content.uncertainty is not None
-            and content.uncertainty.budget is not None
-            and not more_images_help(content.uncertainty.budget)
-        ):
+        if content.mostly_systematic:
             lines.append(
                 "most of ± comes from systematic robot errors: more images of the same region will hardly help; images "
                 "of another region of the workspace, or the joint angles (capture.json: joints and robot), would"
@@ -49,7 +41,7 @@ def summary(content: "CalibrationFile") -> str:
     return "\n".join(lines) + "\n"
 
 
-def found(content: "CalibrationFile") -> list[str]:
+def found(content: CalibrationFile) -> list[str]:
     """The transform and how sure it is, a line each; of a failure its reason."""
     uncertainty, scale = content.uncertainty, content.scale
     if uncertainty is None or scale is None:
@@ -76,7 +68,7 @@ def found(content: "CalibrationFile") -> list[str]:
         lines.append(f"  {given_in_words(content.with_given_intrinsics)}")
     lines.append(f"scale {scale:.6g} m per unit ± {uncertainty.scale_std_percent:.2g} %")
     if content.scale_check is not None:
-        lines.append(f"  {scale_in_words(content.scale_check)}")
+        lines.append(f"  {network_scale(content.scale_check.off_percent, content.scale_check.std_percent)}")
     if content.depth_check is not None:
         lines.append(depth_in_words(content.depth_check))
     if (held_out := content.held_out) is not None:
@@ -84,7 +76,7 @@ def found(content: "CalibrationFile") -> list[str]:
     return lines
 
 
-def seen_in_words(seen: "SeenAndCorners") -> str:
+def seen_in_words(seen: SeenAndCorners) -> str:
     """What the uncertainty of a point that the camera sees is made of, and where it is largest."""
     return (
         f"of a seen point: {significant(seen.lateral_95_mm)} mm across the ray and {significant(seen.along_95_mm)} mm "
@@ -93,7 +85,7 @@ def seen_in_words(seen: "SeenAndCorners") -> str:
     )
 
 
-def given_in_words(given: "GivenIntrinsicsKept") -> str:
+def given_in_words(given: GivenIntrinsicsKept) -> str:
     """How far the given intrinsics lead from the estimated ones where it matters."""
     return (
         f"with the given intrinsics and their transform (with_given_intrinsics) the same point is "
@@ -101,7 +93,7 @@ def given_in_words(given: "GivenIntrinsicsKept") -> str:
     )
 
 
-def verdict_in_words(content: "CalibrationFile") -> str:
+def verdict_in_words(content: CalibrationFile) -> str:
     """The verdict, with the first reason where it is rejected or accepted with warnings."""
     reasons = [sentence(one) for one in content.findings if one.severity != "informs"]
     return ": ".join((verdict_of(content.findings), *reasons[:1]))
@@ -112,32 +104,7 @@ def _as_quaternion(matrix: Float[ndarray, "4 4"]) -> str:
     return " ".join(f"{number:.6f}" for number in (*matrix[:3, 3], *quat_xyzw))
 
 
-def worst_direction(estimate: Estimate) -> str:
-    """The least certain direction of the translation in words, e.g. "along the optical axis: ±4.0 mm"."""
-    variance, vectors = np.linalg.eigh(estimate.covariance[:3, :3])
-    direction = vectors[:, 2]
-    std_mm = 1e3 * float(np.sqrt(variance[2]))
-    named = {
-        "the optical axis": estimate.gripper_from_camera[:3, 2],
-        "the image's x axis": estimate.gripper_from_camera[:3, 0],
-        "the image's y axis": estimate.gripper_from_camera[:3, 1],
-    }
-    name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
-    if abs(axis @ direction) < np.cos(np.radians(30)):
-        name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
-    # An offset that no motion shows may be uncertain by metres.
-    size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
-    return f"along {name}: ±{size}"
-
-
-def more_images_help(budget: "UncertaintyBudget") -> bool:
-    """Whether more images of the same region shrink the uncertainty, which is then mostly not systematic."""
-    others = [budget.robot_random, budget.intrinsics, budget.images, budget.faults]
-    squares = sum(share.translation_mm**2 for share in others if share is not None)
-    return budget.robot_systematic.translation_mm**2 < squares
-
-
-def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
+def budget_in_words(budget: UncertaintyBudget) -> dict[str, str]:
     """What the uncertainty comes from, largest first, each with its size; negligible parts are left out."""
     named = {
         "random robot errors": budget.robot_random,
@@ -159,7 +126,7 @@ def budget_in_words(budget: "UncertaintyBudget") -> dict[str, str]:
     }
 
 
-def log(content: "CalibrationFile") -> str:
+def log(content: CalibrationFile) -> str:
     """log.txt: which back ends were tried, how long each stage took, what was found, what the user should know."""
     tried = [
         f"attempt {k}: {attempt_in_words(attempt, len(content.images))}"
@@ -209,8 +176,3 @@ def depth_in_words(check: DepthCheck) -> str:
         for z in check.distances_m
     )
     return f"depth camera: its lengths {size}; noise {noise} (1 σ); the map uses corrected depth"
-
-
-def scale_in_words(check: ScaleCheck) -> str:
-    """How far a network's own scale is from the robot's, and how sure that is."""
-    return network_scale(check.off_percent, check.std_percent)

@@ -125,4 +125,11 @@ def _arm(chain: list, where: str) -> Arm:
         frame = np.eye(4)
     both = np.array(limits, float)
     rest = np.where((both[:, 0] <= 0) & (both[:, 1] >= 0), 0.0, both.mean(1))
-    return Arm("robot of the URDF", np.stack(frames), np.array(axes, float), frame, both, rest)
+    return Arm(
+        name="robot of the URDF",
+        parent_from_joint=np.stack(frames),
+        axes=np.array(axes, float),
+        last_from_gripper=frame,
+        limits=both,
+        rest=rest,
+    )

@@ -68,9 +68,9 @@ def calibrated_elsewhere(
     options: CalibrateOptions,
     progress: Progress,
 ) -> CameraFound:
-    """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those said of it."""
+    """A second camera on the gripper whose views do not overlap the first one's; `shared` is what those showed of it."""
     own = of_camera(capture, camera)
-    other_scene = Finding(kind=Kind.ANOTHER_SCENE, severity="warns", details={"camera": capture.camera_name})
+    other_scene = Finding.of(Kind.ANOTHER_SCENE, "warns", camera=capture.camera_name)
     try:
         reconstruction = reconstruct(own, replace(reconstruct_options, backend="auto"), progress)
         found = calibrate(own, reconstruction, options)
@@ -88,13 +88,19 @@ def calibrated_elsewhere(
 def found_alone(
     own: Capture, camera: CellCamera, reconstruction: Reconstruction, found: HandEye, scene_distance: float
 ) -> CameraFound:
-    """What the calibration of a camera by its own images says of it."""
+    """A camera as the calibration by its own images places it."""
     images = []
     for verdict in image_verdicts(own, reconstruction, found):
         row = own.images.index(verdict.image)
         points = int((reconstruction.tracks.image == np.flatnonzero(reconstruction.image_index == row)).sum())
         images.append(
-            ImageFound(verdict.image, verdict.used, points, verdict.reprojection_px, verdict.reason)
+            ImageFound(
+                image=verdict.image,
+                used=verdict.used,
+                points=points,
+                reprojection_px=verdict.reprojection_px,
+                reason=verdict.reason,
+            )
         )
     return CameraFound(
         name=camera.name,
@@ -112,10 +118,5 @@ def found_alone(
 
 def not_registered(camera: CellCamera, error: NotTrustedError) -> CameraFound:
     """Of a camera whose images could not be reconstructed."""
-    return CameraFound(
-        name=camera.name,
-        mount=camera.mount,
-        arm=camera.arm,
-        images=tuple(ImageFound(image, False, 0, None, "not registered") for image in camera.images),
-        findings=no_reconstruction(error),
-    )
+    count = len(camera.images)
+    return CameraFound.not_placed(camera, no_reconstruction(error), [0] * count, ["not registered"] * count)

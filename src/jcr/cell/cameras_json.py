@@ -38,7 +38,7 @@ class TransformUncertainty(Part):
 
 
 class CameraPlaced(Part):
-    """One camera; of one that was not found the transforms are null, and the first warning says why."""
+    """One camera; of one that was not found the transforms are null, and the first warning is the reason."""
 
     name: str
     mount: Mount
@@ -160,7 +160,7 @@ def read_cameras(folder: Path) -> CamerasFile | None:
     file = folder / FILE
     if not is_written(file):
         return None
-    read_json(file)  # says what is no JSON
+    read_json(file)  # raises InputError with the place of a fault
     try:
         content = CamerasFile.model_validate_json(file.read_bytes(), strict=True)
     except ValidationError as error:

@@ -1,9 +1,9 @@
 """Eye-to-hand: a fixed camera that watches what the gripper carries. The hand-eye equation with its roles exchanged.
 
-Seen from the carried thing the camera moves as if the base had it in its hand: with the inverse gripper poses everything
-that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only the robot's
-errors are not those of inverse poses, so that the answer and its covariance are found once more with the errors where
-they are (adjust/robots.py).
+In the frame of the carried object the camera moves as a wrist camera does in the base: with the inverse gripper poses
+everything that calibrates a wrist camera calibrates this one, from matches that the robot checks to the verdict. Only
+the robot's errors are not those of inverse poses, so that the answer and its covariance are found once more with the
+errors where they are (adjust/robots.py).
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ from jcr.records import Capture, CellCamera, Finding, HandEye, Kind, Reconstruct
 def exchanged(capture: Capture) -> Capture:
     """The capture as if its base were the gripper: for reconstruction and calibration of a camera that is fixed.
 
-    What it says of the arm is left out, for the kinematics are those of the poses as they were.
+    The arm's name, URDF and joints are left out, for the kinematics are those of the poses as they were.
     """
     return replace(
         capture,
@@ -108,7 +108,5 @@ def _explained(capture: Capture, reconstruction: Reconstruction, found: HandEye)
     on_gripper = solve_hand_eye(capture.base_from_gripper[rows], reconstruction.recon_from_camera)
     if not on_gripper.converged:
         return found
-    why = Finding(
-        kind=Kind.WRONG_MOUNT, severity="rejects", mend="mount", details={"camera": capture.camera_name}
-    )
+    why = Finding.of(Kind.WRONG_MOUNT, "rejects", "mount", camera=capture.camera_name)
     return found.with_findings(why)

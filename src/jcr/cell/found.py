@@ -1,6 +1,6 @@
 """What was found of a cell's further cameras."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.geometry import skew
-from jcr.records import Assessed, Intrinsics, Mount
+from jcr.records import Assessed, CellCamera, Finding, Intrinsics, Mount
 
 if TYPE_CHECKING:
     from jcr.adjust.robots import Adjusted, Placed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageFound:
     """What became of one image."""
 
@@ -44,6 +44,17 @@ class CameraFound(Assessed):
     """m along the optical axis to what it sees."""
     intrinsics: Intrinsics | None = None
     intrinsics_std: Float[ndarray, " q"] | None = None
+
+    @classmethod
+    def not_placed(
+        cls, camera: CellCamera, why: tuple[Finding, ...], counts: Sequence[int], reasons: Sequence[str]
+    ) -> "CameraFound":
+        """A camera that is rejected; of each image the points that it shares, and why it is not used."""
+        images = [
+            ImageFound(image=image, used=False, points=count, reprojection_px=None, reason=reason)
+            for image, count, reason in zip(camera.images, counts, reasons, strict=True)
+        ]
+        return cls(name=camera.name, mount=camera.mount, arm=camera.arm, images=tuple(images), findings=why)
 
     @property
     def std_at_scene(self) -> float | None:

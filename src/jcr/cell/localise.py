@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FOCAL_OF_WIDTH = 0.9
 """Of a camera without known intrinsics: where the search for its focal length starts."""
 LEAST_SPREAD = 0.05
-"""Of the image's area that the points must span; crowded ones say little of the place."""
+"""Of the image's area that the points must span; crowded ones determine the place badly."""
 TRIALS = 20_000
 FEW = 120
 """Points by SIFT below which networks look for more."""
@@ -87,7 +87,7 @@ class Learned:
         return features.x_px[last], pairs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Shared:
     """The points that an image shares with images of known pose, and where it was taken from."""
 
@@ -183,9 +183,9 @@ def _located(
         return int(good.sum())
     candidate = np.flatnonzero(good)
     x_px, points_seen = seen.x_px[candidate], points[candidate]
-    placed = _placed(x_px, points_seen, intrinsics, is_given, seed)
+    placed = _estimate_place(x_px, points_seen, intrinsics, is_given, seed)
     if is_given:
-        placed = _with_more(placed, _placed(x_px, points_seen, intrinsics, False, seed))
+        placed = _with_more(placed, _estimate_place(x_px, points_seen, intrinsics, False, seed))
     if placed is None:
         return 0
     recon_from_camera, intrinsics, inlier = placed
@@ -205,13 +205,13 @@ def _located(
     number = np.zeros(count, int)
     number[agreed] = np.arange(len(agreed))
     return Shared(
-        recon_from_camera,
-        intrinsics,
-        points[agreed],
-        seen.x_px[agreed],
-        row[kept],
-        seen.row_x_px[kept],
-        number[feature[kept]],
+        recon_from_camera=recon_from_camera,
+        intrinsics=intrinsics,
+        points_in_recon=points[agreed],
+        x_px=seen.x_px[agreed],
+        row=row[kept],
+        row_x_px=seen.row_x_px[kept],
+        row_point=number[feature[kept]],
     )
 
 
@@ -226,7 +226,7 @@ _Place = tuple[Float[ndarray, "4 4"], Intrinsics, ndarray]
 """Pose, intrinsics and inliers."""
 
 
-def _placed(
+def _estimate_place(
     x_px: Float[ndarray, "p 2"],
     points: Float[ndarray, "p 3"],
     intrinsics: Intrinsics,

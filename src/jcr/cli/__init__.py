@@ -10,12 +10,10 @@ import contextlib
 import errno
 import io
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 from jcr.cli.output import Quiet
 from jcr.errors import InputError, NotTrustedError, did_you_mean, printable
@@ -91,8 +89,6 @@ _DISK = {
 
 LONGEST_LINE = 2000
 """Characters of a message."""
-VALUES = {"FLOAT": "number", "INT": "whole number", "STR": "text"}
-"""tyro's names for the values of an option, and ours."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -128,19 +124,20 @@ def dispatch(arguments: Sequence[str]) -> int:
         sys.stdout.write(f"jcr {__version__}\n")
         return 0
     if name == "--completion":
-        from jcr.cli.completion import script
-
-        try:
-            sys.stdout.write(script(" ".join(rest)))
-        except InputError as error:
-            return _fail(2, str(error))
-        return 0
+        return _guarded(lambda: _complete(" ".join(rest)))
     if name not in COMMANDS:
         like = did_you_mean(name, COMMANDS)
         return _fail(
             2, f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (jcr --help)"
         )
     return call(lambda: import_module(f"jcr.cli.{name.replace('-', '_')}"), f"jcr {name}", rest)
+
+
+def _complete(shell: str) -> int:
+    from jcr.cli.completion import script
+
+    sys.stdout.write(script(shell, COMMANDS))
+    return 0
 
 
 def _listed(group: str) -> str:
@@ -150,8 +147,12 @@ def _listed(group: str) -> str:
 
 def call(load: Callable[[], ModuleType], program: str, arguments: Sequence[str]) -> int:
     """The exit status of the command whose module `load` gives; what goes wrong is one line on stderr."""
+    return _guarded(lambda: _call(load(), program, arguments))
+
+
+def _guarded(action: Callable[[], int]) -> int:
     try:
-        status = _call(load(), program, arguments)
+        status = action()
         sys.stdout.flush()
         return status
     except InputError as error:
@@ -192,82 +193,21 @@ def _interrupted(error: BaseException | None) -> bool:
     return False
 
 
-def configuration() -> tuple[Any, ...]:
-    """How tyro makes options of the fields of a command's `Arguments`."""
-    import tyro
-
-    return (
-        tyro.conf.OmitArgPrefixes,
-        tyro.conf.FlagCreatePairsOff,
-        tyro.conf.PositionalMetavarFromFieldName,
-        tyro.conf.DisallowNone,
-    )
-
-
 def _call(command: ModuleType, program: str, arguments: Sequence[str]) -> int:
-    import tyro
-
     from jcr.cli.help import EVERYTHING, help_text
+    from jcr.cli.usage import parsed
 
     if asked := {"-h", "--help", EVERYTHING}.intersection(arguments):
         sys.stdout.write(help_text(command, program, EVERYTHING in asked))
         return 0
-    # tyro draws a box around a usage error; ours is one line, so its text is caught and flattened.
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            parsed = tyro.cli(
-                command.Arguments, prog=program, args=list(arguments), config=configuration(), add_help=False
-            )
-    except SystemExit:
-        like = _like_unknown_option(command, arguments)
-        return _fail(2, f"{_flatten(complaint.getvalue())}{like} ({program} --help)")
+    record = parsed(command.Arguments, program, arguments)
     require_address_space()
     with contextlib.ExitStack() as silence:
-        if parsed.output.quiet:
+        if record.output.quiet:
             nowhere = silence.enter_context(open(os.devnull, "wb"))
             quiet = silence.enter_context(Quiet(nowhere, sys.stderr))
             silence.enter_context(contextlib.redirect_stderr(quiet))
-        return command.main(parsed)
-
-
-def _flatten(box: str) -> str:
-    """The first message of tyro's box, on one line; where the terminal is ASCII, its title has a block of its own."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", box).strip()
-    lines = [line.strip(" │") for line in text.splitlines() if not re.match(r"^[╭╰├]", line.strip())]
-    blocks = re.split(r"^[─━-]{3,}$", "\n".join(lines), flags=re.MULTILINE)
-    message = blocks[0] if text.startswith("╭") or len(blocks) == 1 else blocks[1]
-    line = re.sub(r"\s+", " ", message).strip() or "the arguments cannot be understood"
-    line = re.sub(r"Error parsing (\S+): could not convert string to float:", r"\1 takes a number, not", line)
-    line = re.sub(r"Error parsing (\S+): invalid literal for int.*?:", r"\1 takes a whole number, not", line)
-    line = re.sub(r"Error parsing (\S+): no type matching \{(.*?)\} .*? from \[(.*?)\]\..*", _values, line)
-    return re.sub(r"invalid choice '(.*?)'(.*?)\. Expected one of \((.*?)\)\.?", _choices, line)
-
-
-def _values(refused: re.Match[str]) -> str:
-    """tyro names Python's types for an option of several values, and each of its attempts."""
-    option, types, given = refused.groups()
-    words = [VALUES.get(name, name.lower()) for name in types.split()]
-    return f"{option} takes {len(words)} values ({', '.join(words)}), not {given}"
-
-
-def _choices(refused: re.Match[str]) -> str:
-    """tyro lists choices in the order of a set, among them the None that stands for none given."""
-    word, argument, listed = refused.groups()
-    known = sorted(set(re.findall(r"'([^']*)'", listed)) - {"None"})
-    return f"invalid choice '{word}'{argument}{did_you_mean(word, known)}; choose from {', '.join(known)}"
-
-
-def _like_unknown_option(command: ModuleType, arguments: Sequence[str]) -> str:
-    """The option of a command that is like the first one that it does not have; nothing where it has all."""
-    from jcr.cli.completion import arguments_of
-
-    known = {argument.flag for argument in arguments_of(command.Arguments) if argument.flag is not None}
-    given = (word.partition("=")[0] for word in arguments if re.match(r"--[a-z]", word))
-    unknown = next(
-        (word for word in given if word.replace("_", "-") not in {*known, "--help", "--help-all"}), None
-    )
-    return "" if unknown is None else did_you_mean(unknown, known)
+        return command.main(record)
 
 
 def _fail(status: int, message: str) -> int:

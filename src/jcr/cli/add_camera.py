@@ -9,13 +9,13 @@ import tyro
 from jcr.cli.output import Output
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Locate a fixed camera (base_from_camera) from its images of the scene of a run.
 
     OUT is the run folder; the capture of the run must still be at its old path. No marker is needed: the images are
     matched with those of the wrist camera. One image is enough. Without intrinsics the focal length is estimated too,
-    and the output says if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
+    and the output names it if the image does not determine it. The camera becomes part of the run (OUT/cameras.json, the
     report, `jcr export`). If it cannot be located, nothing is written and the exit status is 3.
 
     examples:
@@ -25,7 +25,7 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    pictures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES...")]
+    images: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES...")]
     """Images of one fixed camera, all of the same size."""
     name: str | None = None
     """Name of the camera; by default the file name of the first image."""
@@ -35,7 +35,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Place the camera and say where it is."""
+    """Locate the camera and print its pose."""
     import re
 
     from jcr.cell.cameras_json import in_words
@@ -43,12 +43,12 @@ def main(arguments: Arguments) -> int:
     from jcr.pipeline import add_camera
     from jcr.progress import progress_bars
 
-    if not arguments.pictures:
+    if not arguments.images:
         raise InputError("no image; name one or more of the camera to place")
-    name = arguments.name or re.sub(r"^[^A-Za-z]+|[^A-Za-z0-9_]+", "_", arguments.pictures[0].stem).strip("_")
+    name = arguments.name or re.sub(r"^[^A-Za-z]+|[^A-Za-z0-9_]+", "_", arguments.images[0].stem).strip("_")
     name = name or "camera"
     with progress_bars() as progress:
-        result = add_camera(arguments.out, name, arguments.pictures, arguments.intrinsics, progress=progress)
+        result = add_camera(arguments.out, name, arguments.images, arguments.intrinsics, progress=progress)
     assert result.cameras is not None
     mine = result.cameras.model_copy(update={"cameras": result.cameras.cameras[-1:], "arms": []})
     arguments.output.result("\n".join(in_words(mine)) + "\n", mine.as_json()["cameras"][0])

@@ -10,6 +10,7 @@ from jcr.batch import BatchOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
+from jcr.cli.source import run_options
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.options import CloudOptions, MapOptions
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from jcr.batch import Row
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Run many captures, each into its own folder in OUT, and rank them in OUT/summary.csv and .html.
 
@@ -47,21 +48,13 @@ def main(arguments: Arguments) -> int:
     """Run all and print the table."""
     from jcr.batch import batch, is_accepted
     from jcr.errors import InputError, NotTrustedError
-    from jcr.pipeline import RunOptions
     from jcr.progress import progress_bars
 
     if len(arguments.paths) < 2:
         raise InputError("batch: name one capture or more, then the folder for the results")
-    options = RunOptions(
-        reconstruct=arguments.reconstruct,
-        calibrate=arguments.calibrate,
-        depth=arguments.depth,
-        cloud=arguments.cloud,
-        map=arguments.map,
-    )
     *captures, out = arguments.paths
     with progress_bars() as progress:
-        rows = batch(captures, out, options, arguments.batch, progress, arguments.read)
+        rows = batch(captures, out, run_options(arguments), arguments.batch, progress, arguments.read)
     arguments.output.result(
         _table(rows) + f"table: {out / 'summary.html'}\n", {"captures": [asdict(row) for row in rows]}
     )

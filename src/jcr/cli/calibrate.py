@@ -10,12 +10,12 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
-from jcr.cli.source import source
+from jcr.cli.source import run_options, source
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Calibrate a capture, without dense depth and map: calibration.json, report.html and log.txt.
 
@@ -40,13 +40,11 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Calibrate and print what was found."""
-    from jcr.pipeline import RunOptions, calibrate, calibrate_poses
+    from jcr.pipeline import calibrate, calibrate_poses
     from jcr.progress import progress_bars
     from jcr.records import PosePairs
 
-    options = RunOptions(
-        reconstruct=arguments.reconstruct, calibrate=arguments.calibrate, depth=arguments.depth
-    )
+    options = run_options(arguments)
     with progress_bars() as progress:
         capture = source(arguments.capture, arguments.read, arguments.out, progress)
         if isinstance(capture, PosePairs):

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from jcr.records import Capture, PosePairs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Check a capture: files, units, motion, observability, pose convention, and which poses to add.
 
-    The exit status is 3 if its calibration would be rejected; the message says why, and what to do.
+    The exit status is 3 if its calibration would be rejected; the message has the reason and the remedy.
 
     examples:
       jcr check captures/table
@@ -87,10 +87,10 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     from jcr.check import QUICK
     from jcr.rounding import significant
 
-    turn = np.degrees(found.largest_turn_rad)
+    rotation = np.degrees(found.largest_turn_rad)
     lines = [
         _as_read(capture),
-        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {turn:.0f}°",
+        f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {rotation:.0f}°",
     ]
     # Of what disagrees, what was expected of it and how well the rest agrees are no comfort.
     if found.expected is not None and not found.faults:
@@ -124,8 +124,8 @@ def _as_read(capture: "Capture | PosePairs") -> str:
     if isinstance(capture, PosePairs):
         return f"{len(capture)} samples with the poses of gripper and camera, no images"
     width, height = capture.image_size
-    lens = "given" if capture.intrinsics is not None else "unknown, to be estimated"
-    return f"{len(capture)} images of {width}x{height}, intrinsics {lens}"
+    intrinsics = "given" if capture.intrinsics is not None else "unknown, to be estimated"
+    return f"{len(capture)} images of {width}x{height}, intrinsics {intrinsics}"
 
 
 def _expected(expected: "Expectation", images: int, is_measured: bool) -> list[str]:
@@ -135,12 +135,12 @@ def _expected(expected: "Expectation", images: int, is_measured: bool) -> list[s
     seen, std = expected.seen, expected.std
     of = "found in the images" if is_measured else "usual"
     offset = " ".join(significant(1e3 * value) for value in std[:3])
-    turn = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
+    rotation = " ".join(significant(float(np.degrees(value))) for value in std[3:6])
     return [
         f"expected of {images} images: a point seen at {significant(1e-3 * seen.distance_mm)} m is placed within "
         f"{significant(seen.within_95_mm)} mm and {significant(seen.rotation_95_deg)}° (95 % of errors)",
-        f"  the camera on the gripper ± {offset} mm, {turn} °, scale {significant(100 * std[6])} % (1 σ); robot errors "
-        f"and image noise as {of}",
+        f"  the camera on the gripper ± {offset} mm, {rotation} °, scale {significant(100 * std[6])} % (1 σ); "
+        f"robot errors and image noise as {of}",
     ]
 
 

@@ -11,7 +11,7 @@ from jcr.cli.output import Output, warn
 from jcr.export.options import ExportOptions, FormatName
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Write a run's calibration or map in another tool's format; without FORMAT, list the formats.
 
@@ -41,7 +41,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Write the file and say where; 3 where the calibration is rejected, and nothing was written."""
+    """Write the file and print its path; 3 where the calibration is rejected, and nothing was written."""
     from jcr.export.formats import FORMATS, written
     from jcr.export.ros import static_transform_publisher
 

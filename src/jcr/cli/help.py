@@ -1,23 +1,18 @@
 """Help of a command, in plain text: the options that most users set, or all."""
 
 import inspect
-import re
 import shutil
 import textwrap
-import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-import tyro
+from jcr.cli.arguments import Argument, groups
 
 EVERYTHING = "--help-all"
 COLUMN = 26
 """Where what is said of an argument begins."""
 NARROWEST, WIDEST = 60, 110
-NO_DEFAULT = re.compile(r" *\(default: *(?:None|True|False|)\)")
-"""What the parser says of options that have no value, and of switches."""
 COMMON = (
     "--pose-convention",
     "--pose-units",
@@ -43,52 +38,6 @@ COMMON = (
 )
 """Options that help lists of a command that has many; `--help-all` lists the rest too."""
 MANY = 16
-
-
-@dataclass(frozen=True)
-class Argument:
-    """One argument as help shows it."""
-
-    flag: str
-    """--name; empty for one that is given by its place."""
-    value: str
-    """How its value is named, or its choices in braces; empty for a switch."""
-    text: str
-
-
-@dataclass(frozen=True)
-class Group:
-    """Arguments under one heading."""
-
-    title: str
-    about: str
-    arguments: tuple[Argument, ...]
-
-
-def groups(record: Any, program: str) -> list[Group]:
-    """The arguments of a command's `Arguments` but for its help, as the parser has them."""
-    from jcr.cli import configuration
-
-    with warnings.catch_warnings():
-        # The only way to ask tyro for what it has parsed; it is to go with nothing in its place yet.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        parser = tyro.extras.get_parser(record, prog=program, config=configuration())
-    found = []
-    for group in parser._action_groups:
-        arguments = tuple(_argument(action) for action in group._group_actions if action.dest != "help")
-        if arguments:
-            found.append(Group(group.title or "", group.description or "", arguments))
-    return found
-
-
-def _argument(action: Any) -> Argument:
-    value = "" if action.nargs == 0 else action.metavar or ""
-    text = " ".join(str(action.help).replace("%%", "%").split())
-    return Argument(
-        flag=action.option_strings[-1] if action.option_strings else "",
-        value=" ".join(value) if isinstance(value, tuple) else value,
-        text=NO_DEFAULT.sub("", text),
-    )
 
 
 def help_text(command: ModuleType, program: str, everything: bool) -> str:

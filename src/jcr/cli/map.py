@@ -11,7 +11,7 @@ from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """(Re)build cloud, map and report of a run with other options, or with further images.
 
@@ -35,7 +35,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Build the map and say where it is."""
+    """Build the map and print its path."""
     from jcr.pipeline import build_map
     from jcr.progress import progress_bars
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jcr.cli.output import Output
+from jcr.cli.output import Output, plain
 
 if TYPE_CHECKING:
     from jcr.segment.measure import Measured
@@ -43,29 +43,9 @@ def main(arguments: Arguments) -> int:
 
 def content(measured: "Measured") -> dict[str, object]:
     """The result as JSON has it: metres, base frame, standard deviations of one sigma."""
-    support = measured.support
-    return {
-        "support": {
-            "base_from_support": support.base_from_support.tolist(),
-            "noise": support.noise,
-            "roughness": support.roughness,
-        },
-        "objects": [
-            {
-                "label": size.label,
-                "name": size.name,
-                "points": size.points,
-                "height": size.height,
-                "height_std": size.height_std,
-                "top_seen": size.top_seen,
-                "footprint_in_base": size.footprint_in_base.tolist(),
-                "base_from_box": size.base_from_box.tolist(),
-                "box_size": size.box_size.tolist(),
-                "box_std": size.box_std.tolist(),
-            }
-            for size in measured.objects
-        ],
-    }
+    support = plain(measured.support)
+    del support["on_plane"]  # a flag for each point of the cloud
+    return {"support": support, "objects": [plain(size) for size in measured.objects]}
 
 
 def table(measured: "Measured") -> str:

@@ -1,6 +1,5 @@
 """`jcr models`: networks and other back ends, their licences, and the weights on this machine; `get` downloads some."""
 
-import re
 import sys
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
@@ -9,9 +8,8 @@ import tyro
 
 from jcr.cli.output import Output
 from jcr.errors import InputError
-from jcr.pages import pages
-from jcr.progress import progress_bars, silent
 from jcr.reconstruct.backends import BACKENDS, Backend, weights_command
+from jcr.reconstruct.hub import HUB_FILES, HUB_ID, download
 
 
 @dataclass(frozen=True)
@@ -30,17 +28,15 @@ class Arguments:
     action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
     """list; or get: download the weights of a back end."""
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
-    """For get: the back end whose weights are downloaded."""
+    """For get: the back end whose weights are downloaded, or a hub id for --weights or --sam-weights."""
     accept_licence: bool = False
-    """For get: accept a non-commercial licence, which is asked for once otherwise."""
+    """For get: accept a non-commercial licence, which is asked for otherwise."""
     revision: str | None = None
-    """For get: a commit of the weights (unset: the one that was downloaded first, or the newest)."""
-    markdown: bool = False
-    """Print the table of the page `jcr docs backends`."""
+    """For get: another commit of the weights than the one this release was written for; give its folder to --weights."""
     output: Output = field(default_factory=Output)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Model:
     """A row of the list."""
 
@@ -67,15 +63,15 @@ def models() -> list[Model]:
     """The back ends, in the order of `auto`."""
     return [
         Model(
-            row.name,
-            row.hub_id,
-            row.licence,
-            row.commercial,
-            SCALES[row.metric],
-            row.parameters,
-            row.download_gb,
-            _present(row),
-            row.accuracy,
+            backend=row.name,
+            weights=row.hub_id,
+            licence=row.licence,
+            commercial=row.commercial,
+            scale=SCALES[row.metric],
+            parameters_m=row.parameters,
+            download_gb=row.download_gb,
+            present=_present(row),
+            accuracy=row.accuracy,
         )
         for row in BACKENDS.values()
     ]
@@ -105,41 +101,6 @@ def as_text(rows: list[Model]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def as_markdown() -> str:
-    """The back ends as a table, without what differs from machine to machine."""
-    head = [
-        "back end",
-        "options of its own",
-        "auto",
-        "scale",
-        "parameters",
-        "download",
-        "licence",
-        "measured",
-    ]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for row in BACKENDS.values():
-        flags = [f"`--{name.replace('_', '-')}`" for name in row.options]
-        cells = [
-            f"`{row.name}`",
-            ", ".join(flags),
-            "yes" if row.auto else "no",
-            SCALES[row.metric],
-            f"{row.parameters} M" if row.parameters else "",
-            f"{row.download_gb:g} GB" if row.download_gb else "",
-            row.licence,
-            re.sub(r"\(jcr docs ([\w/-]+)\)", _link, row.accuracy),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _link(named: re.Match[str]) -> str:
-    """From the page of back ends to the one that a command prints."""
-    file = pages()[named[1]]
-    return f"([{named[1]}](../{file.parent.name}/{file.name}))"
-
-
 def main(arguments: Arguments) -> int:
     """Print the list, or get weights."""
     if arguments.action == "get":
@@ -147,39 +108,36 @@ def main(arguments: Arguments) -> int:
     if arguments.name is not None or arguments.accept_licence or arguments.revision is not None:
         raise InputError("jcr models: a name, --accept-licence and --revision are for jcr models get NAME")
     rows = models()
-    text = as_markdown() if arguments.markdown else as_text(rows)
-    arguments.output.result(text, {"models": [asdict(row) for row in rows]})
+    arguments.output.result(as_text(rows), {"models": [asdict(row) for row in rows]})
     return 0
 
 
 def _get(arguments: Arguments) -> int:
-    """The weights of one back end, downloaded, checked, and put where it looks for them."""
+    """The weights of one back end, or of a hub id, downloaded, checked, and put where runs look for them."""
     with_weights = [row.name for row in BACKENDS.values() if row.hub_id]
-    if arguments.name not in with_weights:
-        named = "name one" if arguments.name is None else f"{arguments.name} has none to get"
-        raise InputError(f"jcr models get: {named}; there are {', '.join(with_weights)}")
-    row = BACKENDS[arguments.name]
-    from jcr.reconstruct.hub_download import download, keep_pin, pins
-
-    if not row.commercial and not pins().get(row.hub_id, {}).get("licence_accepted"):
-        if not arguments.accept_licence and not _accepted(row):
-            raise InputError(
-                f"jcr models get {row.name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
-            )
-        keep_pin(row.hub_id, {"licence_accepted": True})
-    with progress_bars() as progress:
-        report = silent if arguments.output.quiet else progress
-        folder = download(row.hub_id, row.files, arguments.revision, report)
-    text = f"{row.hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
-    if not row.is_installed():
+    name = arguments.name
+    row = BACKENDS.get(name or "")
+    if name is None or not (HUB_ID.fullmatch(name) or name in with_weights):
+        named = "name one" if name is None else f"{name} has none to get"
+        raise InputError(
+            f"jcr models get: {named}; there are {', '.join(with_weights)}, and hub ids OWNER/NAME"
+        )
+    hub_id, files, revision = (row.hub_id, row.files, row.revision) if row else (name, HUB_FILES, None)
+    if row and not (row.commercial or row.has_weights() or arguments.accept_licence or _accepts(row)):
+        raise InputError(
+            f"jcr models get {name}: its licence is {row.licence}; accept it with --accept-licence, or take da3"
+        )
+    folder = download(hub_id, files, arguments.revision or revision, arguments.output.quiet)
+    text = f"{hub_id}: revision {folder.name[:12]}, checked, in {folder}\n"
+    if row and not row.is_installed():
         text += f"its package is missing: {row.install}\n"
-    facts = {"backend": row.name, "weights": row.hub_id, "revision": folder.name, "folder": str(folder)}
-    arguments.output.result(text, facts)
+    facts = {"backend": row.name if row else None, "weights": hub_id, "revision": folder.name}
+    arguments.output.result(text, facts | {"folder": str(folder)})
     return 0
 
 
-def _accepted(row: Backend) -> bool:
-    """Ask, where there is somebody to answer."""
+def _accepts(row: Backend) -> bool:
+    """Whether the user accepts a licence; False where nobody can be asked."""
     if not sys.stdin.isatty():
         return False
     sys.stderr.write(f"{weights_command(row)}.\nIts licence: {row.licence}\nDo you accept it? [y/N] ")

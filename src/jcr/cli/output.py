@@ -1,4 +1,4 @@
-"""What every command says and where: its result on stdout, all else on stderr."""
+"""What every command prints and where: its result on stdout, all else on stderr."""
 
 import io
 import json
@@ -21,6 +21,13 @@ class Output:
         """Print the result at once: `facts` with --json, else the text for people."""
         sys.stdout.write(json.dumps(facts) + "\n" if self.json else text)
         sys.stdout.flush()
+
+
+def plain(record: object) -> dict[str, Any]:
+    """The fields of a record for JSON, its arrays as lists."""
+    return {
+        name: value.tolist() if hasattr(value, "tolist") else value for name, value in vars(record).items()
+    }
 
 
 class Quiet(io.TextIOWrapper):

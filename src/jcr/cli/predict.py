@@ -12,7 +12,7 @@ from jcr.reconstruct.backends import PairBackendName
 from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Predict the pointmaps of a capture's pairs of images, for `jcr align` or `--backend predictions`.
 
@@ -52,8 +52,7 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"{arguments.out}: predictions are written as npz; give a name that ends in .npz")
     capture = read_capture(arguments.capture)
     asked = ReconstructOptions(arguments.backend, device=arguments.device, weights=arguments.weights)
-    weights, licence = weights_of(asked)
-    options = Dust3rOptions(weights, licence, device_of(asked), arguments.pairs)
+    options = Dust3rOptions(weights=weights_of(asked), device=device_of(asked), pairs=arguments.pairs)
     with progress_bars() as progress:
         _, predictions, notes = predict(capture, options, progress)
     write_pairs(arguments.out, predictions)

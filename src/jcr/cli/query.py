@@ -18,7 +18,7 @@ from jcr.files import write_bytes, write_text
 _COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Query the map of a run at points: occupancy, unknown, distance, its gradient, colour and label.
 
@@ -55,15 +55,15 @@ def main(arguments: Arguments) -> int:
     columns = (*columns, red, green, blue, sample.label)
     rows = np.rec.fromarrays(columns, names=_COLUMNS)  # pyright: ignore[reportArgumentType]
     unseen = f"{100 * float(np.mean(sample.unknown)):.0f} % of them unseen" if len(rows) else "none"
-    told = f"{len(rows)} points, {unseen}{labelled(sample.label, scene.label_names)}\n"
+    summary = f"{len(rows)} points, {unseen}{labelled(sample.label, scene.label_names)}\n"
     answers: dict[str, object] = {"label_names": list(scene.label_names)}
     if arguments.output.json:
         answers |= {name: _finite(rows[name]) for name in _COLUMNS.split(",")}
     if arguments.write or not arguments.output.json:
         path = arguments.write or arguments.points.with_suffix(".answers.csv")
         _write(path, rows)
-        told = f"wrote {path}: {told}"
-    arguments.output.result(told, answers)
+        summary = f"wrote {path}: {summary}"
+    arguments.output.result(summary, answers)
     return 0
 
 

@@ -11,14 +11,14 @@ from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
-from jcr.cli.source import source
+from jcr.cli.source import run_options, source, with_images
 from jcr.depth.options import DepthOptions
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.segment.options import SegmentOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Reconstruct, calibrate, map and report a capture.
 
@@ -52,29 +52,17 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Run every stage and print what was found."""
-    from jcr.errors import InputError
     from jcr.mapping import require_dense
-    from jcr.pipeline import RunOptions, finished, run
+    from jcr.pipeline import finished, run
     from jcr.progress import progress_bars
-    from jcr.records import PosePairs
 
     map_options = None if arguments.no_map else arguments.map
     if map_options is not None:
         require_dense(arguments.depth)  # before a recording is read
-    options = RunOptions(
-        reconstruct=arguments.reconstruct,
-        calibrate=arguments.calibrate,
-        depth=arguments.depth,
-        cloud=arguments.cloud,
-        map=map_options,
-        segment=arguments.segment,
-    )
+    options = run_options(arguments, map=map_options)
     with progress_bars() as progress:
-        capture = source(arguments.capture, arguments.read, arguments.out, progress)
-        if isinstance(capture, PosePairs):
-            raise InputError(
-                f"{arguments.capture}: gives poses and no images, nothing to map; use `jcr calibrate`"
-            )
+        found = source(arguments.capture, arguments.read, arguments.out, progress)
+        capture = with_images(found, arguments.capture, "nothing to map; use `jcr calibrate`")
         if (before := finished(capture, arguments.out, options)) is not None:
             sys.stderr.write(f"unchanged: {arguments.out} is the run of this capture with these options\n")
             show_calibration(before, arguments.output)

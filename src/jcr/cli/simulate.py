@@ -33,7 +33,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Write the capture and say where."""
+    """Write the capture and print its path."""
     from jcr.progress import progress_bars
 
     with progress_bars() as progress:

@@ -4,14 +4,16 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 
 if TYPE_CHECKING:
     from jcr.progress import Progress
     from jcr.records import Capture, PosePairs
+    from jcr.results import RunOptions
 
 
 def _announce(path: Path) -> None:
@@ -25,12 +27,32 @@ def source(path: Path, options: ReadOptions, out: Path, progress: "Progress") ->
     """What lies at a path, a recording's frames put in the run folder `out`; remarks of the reader on stderr."""
     _announce(path)
     from jcr.capture.read import read_source
-    from jcr.run_folder import CAPTURE, held
+    from jcr.run_folder import CAPTURE, locked
 
-    with held(out):
+    with locked(out):
         found = read_source(path, options, into=out / CAPTURE, progress=progress)
     for note in found.notes:
         sys.stderr.write(f"note: {note}\n")
+    return found
+
+
+def run_options(arguments: Any, **chosen: Any) -> "RunOptions":
+    """The options of the stages among a command's arguments, `chosen` ones in their place."""
+    from jcr.results import RunOptions
+
+    given = {
+        one.name: getattr(arguments, one.name) for one in fields(RunOptions) if hasattr(arguments, one.name)
+    }
+    return RunOptions(**given | chosen)
+
+
+def with_images(found: "Capture | PosePairs", path: Path, needed: str) -> "Capture":
+    """The capture; InputError, which ends with what is `needed`, where there are poses alone."""
+    from jcr.errors import InputError
+    from jcr.records import PosePairs
+
+    if isinstance(found, PosePairs):
+        raise InputError(f"{path}: gives poses and no images, {needed}")
     return found
 
 

@@ -9,14 +9,14 @@ import tyro
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, warn
-from jcr.cli.source import looked_at
+from jcr.cli.source import looked_at, with_images
 from jcr.verify import VerifyOptions
 
 if TYPE_CHECKING:
     from jcr.verify import Verification
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Test a calibration with new images: has the camera moved on the gripper since?
 
@@ -43,15 +43,13 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Verify and say what to do."""
-    from jcr.errors import InputError
+    """Verify and print what to do."""
     from jcr.progress import progress_bars
-    from jcr.records import PosePairs
     from jcr.verify import verify, verify_camera
 
     if arguments.camera is not None:
         with progress_bars() as progress:
-            return _told(
+            return _print_found(
                 verify_camera(
                     arguments.out, arguments.camera, [arguments.capture], arguments.verify, progress
                 ),
@@ -61,13 +59,12 @@ def main(arguments: Arguments) -> int:
         progress_bars() as progress,
         looked_at(arguments.capture, arguments.read, progress, at_least=1) as new,
     ):
-        if isinstance(new, PosePairs):
-            raise InputError(f"{arguments.capture}: gives poses and no images, which verify needs")
-        found = verify(arguments.out, new, arguments.verify, progress)
-    return _told(found, arguments.output)
+        capture = with_images(new, arguments.capture, "which verify needs")
+        found = verify(arguments.out, capture, arguments.verify, progress)
+    return _print_found(found, arguments.output)
 
 
-def _told(found: "Verification", output: Output) -> int:
+def _print_found(found: "Verification", output: Output) -> int:
     """Print it; NotTrustedError where something has moved."""
     from jcr.errors import NotTrustedError
 

@@ -10,7 +10,7 @@ import tyro
 from jcr.cli.output import Output
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
     """Show a run in the browser: points, cameras, grippers, robot, the map's layers, a sphere to drag.
 
@@ -45,12 +45,12 @@ def main(arguments: Arguments) -> int:
     from jcr.run_folder import RunFolder
 
     if arguments.urdf is None and (arguments.joints or arguments.tip):
-        raise InputError("--joints and --tip tell how a robot stands; name its --urdf too")
+        raise InputError("--joints and --tip are of a robot; name its --urdf too")
     if arguments.urdf is not None and (arguments.joints is None) == (arguments.tip is None):
         raise InputError(
             "--urdf: give either --joints FILE, or --tip LINK, the link whose poses the capture has"
         )
-    RunFolder(arguments.out).calibration()  # says in a moment where there is none
+    RunFolder(arguments.out).calibration()  # raises at once where there is none
     for package in ("viser", "matplotlib", "torch"):
         extra(package, "view", "jcr view")
     from jcr.view.robot import read_joints, read_urdf, solve_joints

@@ -45,7 +45,7 @@ def extend(
     an earlier one, the earlier's confidence is 0. Raises InputError for an image that shares no view with the
     others.
     """
-    dense, lens = reconstruction.dense, reconstruction.intrinsics
+    dense = reconstruction.dense
     pinhole = dense.intrinsics
     base_from_camera = added.base_from_gripper @ hand_eye.gripper_from_camera
     recon_from_new = scale_translation(
@@ -53,7 +53,7 @@ def extend(
     )
     old, new = len(reconstruction.recon_from_camera), len(added)
     recon_from_camera = np.concatenate([reconstruction.recon_from_camera, recon_from_new])
-    undistort = undistortion(lens, pinhole)
+    undistort = undistortion(reconstruction.intrinsics, pinhole)
     images = [undistort(read_image(added.folder / name)) for name in added.images]
     colors = np.concatenate([dense.colors, np.stack(images)])
     tracks = _with_projections(reconstruction.tracks, recon_from_new, pinhole, old)

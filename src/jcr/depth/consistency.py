@@ -1,124 +1,188 @@
-"""What other images say of a depth: compiled checks across views."""
+"""What other images show at a depth: compiled checks across views, 16 pixels of a row at once in vector registers."""
 
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import signature
+from numba.extending import intrinsic
+from numpy import ndarray
 
 from jcr.compiled import compiled, inlined
+from jcr.depth.lanes import INT, LONG, Lanes
 
+LANES = 16
 SEEN_THROUGH = 0.01
 """A neighbour whose depth is farther by this share sees through the point. Beside an object's outline the plain
-table often gets the object's depth; the neighbours that look past the object there know better."""
-_ONE, _HALF, _FAR = np.float32(1), np.float32(0.5), np.float32(SEEN_THROUGH)
-# A number of Python among these makes a sum of double precision.
+table often gets the object's depth; the neighbours that look past the object there show the table's."""
 
 
-@inlined
-@no_type_check
-def _in_other(n, ray, inverse_depth, a, b):
-    """Pixel x, y of a point in the n-th other image, and its depth there by that here."""
-    rx, ry = ray
-    z = a[n, 2, 0] * rx + a[n, 2, 1] * ry + a[n, 2, 2] + b[n, 2] * inverse_depth
-    iz = _ONE / z
-    x = (a[n, 0, 0] * rx + a[n, 0, 1] * ry + a[n, 0, 2] + b[n, 0] * inverse_depth) * iz
-    y = (a[n, 1, 0] * rx + a[n, 1, 1] * ry + a[n, 1, 2] + b[n, 1] * inverse_depth) * iz
-    return x, y, z
+def evidence(
+    inverse_depth: Float[ndarray, "m h w"], known: Bool[ndarray, "m h w"], sees: Bool[ndarray, "m h w"]
+) -> Float[ndarray, "m h _"]:
+    """What `agreement` compares: inverse depths, 0 where not `known`, negative where the image sees through no point."""
+    return padded(np.where(known, np.where(sees, inverse_depth, -inverse_depth), 0))
 
 
-@inlined
-@no_type_check
-def _interpolated(inverse_depth, known, j, x, y):
-    """Inverse depth of image j between its pixels, where all four are known, or else of the nearest."""
-    left, top = np.uint32(x), np.uint32(y)
-    right, low = left + np.uint32(1), top + np.uint32(1)
-    if known[j, top, left] and known[j, top, right] and known[j, low, left] and known[j, low, right]:
-        fx, fy = x - np.float32(left), y - np.float32(top)
-        upper = inverse_depth[j, top, left] * (_ONE - fx) + inverse_depth[j, top, right] * fx
-        lower = inverse_depth[j, low, left] * (_ONE - fx) + inverse_depth[j, low, right] * fx
-        return upper * (_ONE - fy) + lower * fy
-    return inverse_depth[j, np.uint32(y + _HALF), np.uint32(x + _HALF)]
+def padded(maps: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
+    """Maps (m,h,w,…) as float32 with w continued by zeros to a multiple of the lanes."""
+    margins = [(0, 0)] * maps.ndim
+    margins[2] = (0, -maps.shape[2] % LANES)
+    return np.pad(maps.astype(np.float32, copy=False), margins)
 
 
 @compiled
 @no_type_check
-def agreement(i, inverse_depth, known, trusted, others, a, b, centre, k, tolerance):
-    """Mean inverse depth (h,w) of image i with the images that agree at each pixel, how many do, how many see through.
+def agreement(i, compared, others, a, b, centre, k, width, tolerance):
+    """Maps (4,h,w) of image i: mean inverse depth with the images that agree, how many agree, how many see through.
 
-    The fourth map is the information of those that agree: the sum of squares of how far (px) the point moves in them
-    per inverse depth. An image sees through only where it is `trusted` (m,h,w). `a` (n,3,3) is K R and `b` (n,3) K t to
-    each other image; `centre` (n) its camera's z in image i.
+    The fourth is the information of those that agree: the sum of squares of how far (px) the point moves in them per
+    inverse depth. `compared` is the `evidence` of images of this `width`; `a` (n,3,3) is K R and `b` (n,3) K t to
+    each other image, `centre` (n) its camera's z in image i; `tolerance` is relative.
     """
-    h, w = inverse_depth.shape[1:]
-    right, bottom, tolerance = np.float32(w - 1), np.float32(h - 1), np.float32(tolerance)
-    mean = np.zeros((h, w), np.float32)
-    count = np.zeros((h, w), np.uint8)
-    through = np.zeros((h, w), np.uint8)
-    information = np.zeros((h, w), np.float32)
+    _, h, w = compared.shape
+    one, tolerance = np.float32(1), np.float32(tolerance)
+    sums = np.zeros((4, h, w), np.float32)
     for v in range(h):
-        for u in range(w):
-            here = inverse_depth[i, v, u]
-            mean[v, u] = here
-            if not known[i, v, u]:
-                continue
-            ray = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
-            total, moved, agreeing, seeing = here, np.float32(0), 0, 0
-            for n in range(len(others)):
-                x, y, z = _in_other(n, ray, here, a, b)
-                if not (z > 0 and x >= 0 and y >= 0 and x < right and y < bottom):
-                    continue
-                j, nx, ny = others[n], np.uint32(x + _HALF), np.uint32(y + _HALF)
-                if not known[j, ny, nx]:
-                    continue
-                ratio = z / here * _interpolated(inverse_depth, known, j, x, y)
-                if abs(ratio - _ONE) < tolerance:
-                    # The point moves along the other's ray until it has the other's depth; its z here follows.
-                    total += _ONE / (centre[n] + (_ONE / here - centre[n]) / ratio)
-                    agreeing += 1
-                    moves_x, moves_y = (b[n, 0] - x * b[n, 2]) / z, (b[n, 1] - y * b[n, 2]) / z
-                    moved += moves_x * moves_x + moves_y * moves_y
-                elif ratio < _ONE - _FAR and trusted[j, ny, nx]:
-                    seeing += 1
-            mean[v, u] = total / np.float32(1 + agreeing)
-            count[v, u], through[v, u], information[v, u] = agreeing, seeing, moved
-    return mean, count, through, information
+        for n in range(len(others)):
+            rays = _row(v, n, a, b, k, width, h)
+            for u in range(0, w, LANES):
+                _compare_depths(sums, compared, (i, others[n], v, u), rays, (centre[n], tolerance))
+        for u in range(width):
+            sums[0, v, u] = (abs(compared[i, v, u]) + sums[0, v, u]) / (one + sums[1, v, u])
+    return sums[:, :, :width]
 
 
 @compiled
 @no_type_check
-def colours_agree(i, inverse_depth, wanted, matched_depth, matched, colors, others, a, b, k, tolerance):
-    """Of the pixels of image i that are wanted: how many others show the point in its colour, in another, see through.
+def colours_agree(i, inverse_depth, surfaces, others, a, b, k, width, tolerance):
+    """How many others (3,h,w) show the points of image i in their colour, how many in another, how many see through.
 
-    A point is hidden from an image whose matched depth there is nearer; such an image says nothing.
+    `inverse_depth` (h,w) is 0 where no point is asked for; `surfaces` (m,h,w,4) holds every image's matched inverse
+    depth, or 0, and its colour. A point is hidden from an image whose matched depth there is nearer, and not counted.
     """
     h, w = inverse_depth.shape
-    right, bottom, most = np.float32(w - 1), np.float32(h - 1), np.float32(tolerance * tolerance)
-    same = np.zeros((h, w), np.uint8)
-    other_colour = np.zeros((h, w), np.uint8)
-    through = np.zeros((h, w), np.uint8)
+    most = np.float32(tolerance * tolerance)
+    sums = np.zeros((3, h, w), np.float32)
     for v in range(h):
-        for u in range(w):
-            if not wanted[v, u]:
-                continue
-            here = inverse_depth[v, u]
-            ray = (np.float32(u) - k[2]) / k[0], (np.float32(v) - k[3]) / k[1]
-            for n in range(len(others)):
-                x, y, z = _in_other(n, ray, here, a, b)
-                if not (z > 0 and x >= 0 and y >= 0 and x < right and y < bottom):
-                    continue
-                j, nx, ny = others[n], np.uint32(x + _HALF), np.uint32(y + _HALF)
-                if matched[j, ny, nx]:
-                    ratio = z / here * matched_depth[j, ny, nx]
-                    if ratio > _ONE + _FAR:
-                        continue
-                    if ratio < _ONE - _FAR:
-                        through[v, u] += 1
-                        continue
-                difference = np.float32(0)
-                for c in range(3):
-                    d = colors[i, v, u, c] - colors[j, ny, nx, c]
-                    difference += d * d
-                if difference < most:
-                    same[v, u] += 1
-                else:
-                    other_colour[v, u] += 1
-    return same, other_colour, through
+        for n in range(len(others)):
+            rays = _row(v, n, a, b, k, width, h)
+            for u in range(0, w, LANES):
+                _compare_colours(sums, inverse_depth, surfaces, (i, others[n], v, u), rays, most)
+    return sums[:, :, :width]
+
+
+@inlined
+@no_type_check
+def _row(v, n, a, b, k, width, height):
+    """What a ray's x, its constant part and inverse depth add to x, y and z in the n-th other image, in row v.
+
+    Then the largest x and y there, and cx and 1/fx.
+    """
+    ry = (np.float32(v) - k[3]) / k[1]
+    x = a[n, 0, 0], a[n, 0, 1] * ry + a[n, 0, 2], b[n, 0]
+    y = a[n, 1, 0], a[n, 1, 1] * ry + a[n, 1, 2], b[n, 1]
+    z = a[n, 2, 0], a[n, 2, 1] * ry + a[n, 2, 2], b[n, 2]
+    return x, y, z, (np.float32(width - 1), np.float32(height - 1), k[2], np.float32(1) / k[0])
+
+
+def _numbers(builder: Any, row: Any) -> list[Any]:
+    """The numbers of a tuple, each in all lanes."""
+    return [Lanes.repeated(builder, number, LANES) for number in cgutils.unpack_tuple(builder, row)]
+
+
+def _other_pixels(here: Any, u: Any, rows: list[list[Any]]) -> tuple[Any, ...]:
+    """Pixel x, y, depth z (by that here) of 16 pixels from u on in another image, and whether they lie in it.
+
+    `here` are their inverse depths, `rows` is what `_row` returns. Outside, x and y are 0.
+    """
+    (x0, x1, bx), (y0, y1, by), (z0, z1, bz), (right, bottom, cx, per_fx) = rows
+    columns: Any = Lanes.repeated(here.builder, here.builder.trunc(u, INT), LANES).as_floats()
+    ray = (columns + Lanes.constant(here.builder, range(LANES)) - cx) * per_fx
+    z = z0 * ray + z1 + bz * here
+    ahead = z > 0.0
+    z = ahead.choose(z, 1.0)
+    x, y = (x0 * ray + x1 + bx * here) / z, (y0 * ray + y1 + by * here) / z
+    inside = ahead & (here > 0.0) & (x >= 0.0) & (y >= 0.0) & (x < right) & (y < bottom)
+    return inside.choose(x, 0.0), inside.choose(y, 0.0), z, inside
+
+
+def _between_pixels(image: Any, width: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Inverse depth between pixels, where all four are known, or else the nearest's; and whether that one sees."""
+    left, top = x.as_ints(), y.as_ints()
+    first = top * width + left
+    (p, q), (r, s) = (at.gathered(image, LANES).as_pairs() for at in (first, first + width))
+    fx, fy = x - left.as_floats(), y - top.as_floats()
+    nearest = (fy >= 0.5).choose((fx >= 0.5).choose(s, r), (fx >= 0.5).choose(q, p))
+    sees = nearest > 0.0
+    p, q, r, s = abs(p), abs(q), abs(r), abs(s)
+    whole = (p > 0.0) & (q > 0.0) & (r > 0.0) & (s > 0.0)
+    upper, lower = p + fx * (q - p), r + fx * (s - r)
+    return whole.choose(upper + fy * (lower - upper), abs(nearest)), sees
+
+
+@intrinsic
+@no_type_check
+def _compare_depths(typing, sums, compared, place, rays, rest):
+    """Add to the maps of `agreement` what image j shows at the depths of 16 pixels; `place` is (i, j, v, u)."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        out, maps = (context.make_array(signature.args[n])(context, builder, given[n]) for n in range(2))
+        _, height, width = cgutils.unpack_tuple(builder, maps.shape)
+        i, j, v, u = cgutils.unpack_tuple(builder, given[2])
+        size, own = builder.mul(height, width), builder.add(builder.mul(v, width), u)
+        here: Any = abs(Lanes.read(builder, maps.data, builder.add(builder.mul(i, size), own), LANES))
+        rows = [_numbers(builder, row) for row in cgutils.unpack_tuple(builder, given[3])]
+        x, y, z, inside = _other_pixels(here, u, rows)
+        row = Lanes.repeated(builder, builder.trunc(width, INT), LANES)
+        depth, sees = _between_pixels(builder.gep(maps.data, [builder.mul(j, size)]), row, x, y)
+        centre, tolerance = _numbers(builder, given[4])
+        there = z * depth
+        agrees = inside & (depth > 0.0) & (abs(there - here) < tolerance * here)
+        # The point moves along the other's ray until it has the other's depth; its z here follows.
+        moved = there / (centre * there - centre * here + 1.0)
+        through = inside & sees & (there < here * (1.0 - SEEN_THROUGH))
+        dx, dy = ((rows[n][2] - at * rows[2][2]) / z for n, at in enumerate((x, y)))
+        found = (agrees, moved), (agrees, 1.0), (through, 1.0), (agrees, dx * dx + dy * dy)
+        for n, (where, value) in enumerate(found):
+            where.choose(value, 0.0).add_to(out.data, builder.add(builder.mul(size, LONG(n)), own))
+        return context.get_dummy_value()
+
+    return signature(types.none, sums, compared, place, rays, rest), generate
+
+
+@intrinsic
+@no_type_check
+def _compare_colours(typing, sums, depth, surfaces, place, rays, most):
+    """Add to the maps of `colours_agree` what image j shows at the depths of 16 pixels; `place` is (i, j, v, u)."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        out, asked, maps = (
+            context.make_array(signature.args[n])(context, builder, given[n]) for n in range(3)
+        )
+        _, height, width, _ = cgutils.unpack_tuple(builder, maps.shape)
+        i, j, v, u = cgutils.unpack_tuple(builder, given[3])
+        size, own = builder.mul(height, width), builder.add(builder.mul(v, width), u)
+        here: Any = Lanes.read(builder, asked.data, own, LANES)
+        rows = [_numbers(builder, row) for row in cgutils.unpack_tuple(builder, given[4])]
+        x, y, z, inside = _other_pixels(here, u, rows)
+        row, first = (Lanes.repeated(builder, builder.trunc(n, INT), LANES) for n in (width, own))
+        nearest = (y + 0.5).as_ints() * row + (x + 0.5).as_ints()
+        surface = []
+        for image, pixel in ((i, first + Lanes.constant(builder, range(LANES), INT)), (j, nearest)):
+            start = builder.gep(maps.data, [builder.mul(image, builder.mul(size, LONG(4)))])
+            halves = ((pixel * 4 + k).gathered(start, LANES).as_pairs() for k in (0, 2))
+            surface.append([lanes for half in halves for lanes in half])
+        depth = surface[1][0]
+        there = (depth > 0.0).choose(z * depth, here)
+        through = inside & (there < here * (1.0 - SEEN_THROUGH))
+        shown = inside & (there >= here * (1.0 - SEEN_THROUGH)) & (here * (1.0 + SEEN_THROUGH) >= there)
+        r, g, b = (one - other for one, other in zip(surface[0][1:], surface[1][1:], strict=True))
+        difference, limit = r * r + g * g + b * b, Lanes.repeated(builder, given[5], LANES)
+        for n, where in enumerate((shown & (difference < limit), shown & (difference >= limit), through)):
+            where.choose(1.0, 0.0).add_to(out.data, builder.add(builder.mul(size, LONG(n)), own))
+        return context.get_dummy_value()
+
+    return signature(types.none, sums, depth, surfaces, place, rays, most), generate

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -12,20 +11,7 @@ from jcr.camera import rays
 from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD
 from jcr.memory import ALLOWANCE, GB, relieve, resident
 from jcr.progress import Progress
-from jcr.records import Intrinsics
-
-
-@dataclass(frozen=True)
-class DenseDepth:
-    """Depth of every pixel of undistorted images, and what it rests on."""
-
-    points_in_recon: Float[ndarray, "m h w 3"]
-    confidence: Float[ndarray, "m h w"]
-    """Correlation times the number of images that agree; 0 for no estimate."""
-    reason: UInt8[ndarray, "m h w"]
-    """NO_DEPTH, MATCHED, PRIOR or BOTH of `jcr.records`."""
-    depth_std: Float[ndarray, "m h w"]
-    """One sigma of the depth (z), in recon units."""
+from jcr.records import Intrinsics, Pointmaps
 
 
 def dense_pointmaps(
@@ -33,14 +19,16 @@ def dense_pointmaps(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
     neighbours: Sequence[Int[ndarray, " _"]],
-    planes: Float[ndarray, "m d 3"],
+    planes: Float[ndarray, "m 2 3"],
     report: Progress,
     *,
     changing: bool = False,
     priors: bool = True,
     memory_gb: float = 8.0,
-) -> DenseDepth:
+) -> Pointmaps:
     """Points in the recon frame, per pixel of undistorted images, with confidence, reason and sigma.
+
+    The confidence is the correlation times the number of images that agree, 0 for no estimate.
 
     `neighbours` and `planes` are what `views` chooses; `changing`: the images are of different times, one that sees
     through a point of another may show what was there before, and nothing is filled by `priors`.
@@ -49,15 +37,15 @@ def dense_pointmaps(
     from jcr.depth.matched import match_depth
 
     pixels = pinhole.width * pinhole.height
-    room = memory_gb * GB - resident() - ALLOWANCE - len(colors) * pixels * BYTES_OF_RESULT
-    threads = max(1, min(os.cpu_count() or 1, int(room // (pixels * BYTES_OF_THREAD))))
+    available = memory_gb * GB - resident() - ALLOWANCE - len(colors) * pixels * BYTES_OF_RESULT
+    threads = max(1, min(os.cpu_count() or 1, int(available // (pixels * BYTES_OF_THREAD))))
 
     def progress(start: float, share: float) -> Callable[[float], None]:
-        def told(fraction: float) -> None:
+        def relieve_and_report(fraction: float) -> None:
             relieve(memory_gb * GB)
             report("dense depth", start + share * fraction)
 
-        return told
+        return relieve_and_report
 
     inverse_depth, score = match_depth(
         colors, recon_from_camera, pinhole, neighbours, planes, threads, progress(0.0, 0.7)
@@ -79,6 +67,11 @@ def dense_pointmaps(
     direction = rays(pinhole)
     for k, pose in enumerate(recon_from_camera):
         points[k] = (depth[k, ..., None] * direction) @ pose[:3, :3].T + pose[:3, 3]
-    return DenseDepth(
-        points, found.confidence.astype(np.float64), found.reason, (found.std * depth).astype(np.float32)
+    return Pointmaps(
+        intrinsics=pinhole,
+        points_in_recon=points,
+        confidence=found.confidence.astype(np.float64),
+        colors=colors,
+        reason=found.reason,
+        depth_std=(found.std * depth).astype(np.float32),
     )

@@ -15,12 +15,10 @@ from jcr.depth.options import DepthOptions
 from jcr.depth.views import BYTES_OF_RESULT, BYTES_OF_THREAD, choose_neighbours, sweep_planes
 from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.records import Capture, Intrinsics, Pointmaps, Reconstruction, Tracks
+from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 RISE = 0.4
 """Share of a camera's distance to a board that things beside it may rise towards the camera."""
-BOARD_PLANES = 96
-"""Of a sweep through that space."""
 
 
 def densify(
@@ -47,7 +45,7 @@ def densify(
     pinhole, colors = undistorted(
         capture.folder, names[order].tolist(), reconstruction.intrinsics, options.pointmap_size_px
     )
-    found = dense_pointmaps(
+    pointmaps = dense_pointmaps(
         colors,
         cameras,
         pinhole,
@@ -56,14 +54,6 @@ def densify(
         progress or silent,
         priors=options.priors,
         memory_gb=memory_gb,
-    )
-    pointmaps = Pointmaps(
-        intrinsics=pinhole,
-        points_in_recon=found.points_in_recon,
-        confidence=found.confidence,
-        colors=colors,
-        reason=found.reason,
-        depth_std=found.depth_std,
     )
     return replace(reconstruction, pointmaps=pointmaps.of_rows(place))
 
@@ -95,11 +85,11 @@ def undistorted(
     return pinhole, np.stack([undistort(read_image(folder / name)) for name in names])
 
 
-def _planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m d 3"]:
-    """For each image the planes that span where its surfaces may lie."""
-    if not tracks.from_board:
-        return sweep_planes(tracks, recon_from_camera)
-    return sweep_planes(_raised(tracks, recon_from_camera), recon_from_camera, count=BOARD_PLANES)
+def _planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
+    """For each image the two planes that span where its surfaces may lie."""
+    return sweep_planes(
+        _raised(tracks, recon_from_camera) if tracks.from_board else tracks, recon_from_camera
+    )
 
 
 def _raised(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Tracks:

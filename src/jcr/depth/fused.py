@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.depth.consistency import agreement
+from jcr.depth.consistency import agreement, evidence, padded
 from jcr.depth.matched import Relative, grid, relative
 from jcr.depth.priors import ON_PLANE, Prior, evened, planar_prior, support_plane
 from jcr.geometry import apply
@@ -88,12 +88,14 @@ def fused_depth(
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
         even = evened(colors, inverse_depth, matched, views, pinhole)
-        even = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in even])
+        even = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
+        depths = np.where(matched, inverse_depth, 0)[..., None]
+        surfaces = padded(np.concatenate([depths, even], -1))
         report(0.4)
 
         def prior(i: int) -> Prior:
             return planar_prior(
-                i, even, inverse_depth, matched, views[i], support, recon_from_camera[i], pinhole
+                i, surfaces, inverse_depth[i], matched[i], views[i], support, recon_from_camera[i], pinhole
             )
 
         found = _stacked(list(pool.map(prior, range(len(colors)))))
@@ -119,13 +121,15 @@ def _check(
     trusted: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
-    """`agreement` of all images, (m,h,w) each."""
+    """`agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
+    compared, width = evidence(inverse_depth, known, trusted), inverse_depth.shape[2]
 
-    def one(i: int) -> tuple[ndarray, ...]:
+    def one(i: int) -> Float[ndarray, "4 h w"]:
         v = views[i]
-        return agreement(i, inverse_depth, known, trusted, v.others, v.a, v.b, v.centre, k, tolerance)
+        return agreement(i, compared, v.others, v.a, v.b, v.centre, k, width, tolerance)
 
-    return [np.stack(maps) for maps in zip(*pool.map(one, range(len(views))), strict=True)]
+    mean, *others = np.stack(list(pool.map(one, range(len(views)))), 1)
+    return [np.where(known, mean, inverse_depth), *others]
 
 
 def _where(there: Bool[ndarray, "m h w"], values: Float[ndarray, "m h w"]) -> Float[ndarray, "m h w"]:

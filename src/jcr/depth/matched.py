@@ -10,15 +10,7 @@ from jaxtyping import Float, Int, UInt8, UInt16, UInt64
 from numpy import ndarray
 
 from jcr.camera import rays, resized
-from jcr.depth.patch_match import (
-    PAD,
-    best_neighbours,
-    inverse_depths,
-    random_planes,
-    score_all,
-    spread_planes,
-    to_the_peak,
-)
+from jcr.depth.patch_match import PAD, random_planes, scores, spread_planes
 from jcr.depth.window import ALIKE, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
@@ -100,8 +92,9 @@ class _Level:
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
         """A map of the level below, each number for the pixels that it covers here."""
-        size = (self.pinhole.width, self.pinhole.height)
-        return cv2.resize(map_of_half, size, interpolation=cv2.INTER_NEAREST)
+        h, w = self.pinhole.height, self.pinhole.width
+        row, column = (np.arange(n) * half // n for n, half in zip((h, w), map_of_half.shape, strict=False))
+        return map_of_half[row[:, None], column]
 
 
 def match_depth(
@@ -109,14 +102,14 @@ def match_depth(
     recon_from_camera: Float[ndarray, "m 4 4"],
     pinhole: Intrinsics,
     neighbours: Sequence[Int[ndarray, " _"]],
-    planes: Float[ndarray, "m d 3"],
+    planes: Float[ndarray, "m 2 3"],
     threads: int,
     report: Callable[[float], None],
 ) -> tuple[Float[ndarray, "m h w"], Float[ndarray, "m h w"]]:
-    """Inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane; no image asks another here.
+    """Inverse depth (per recon unit) and correlation (-1 to 1) of every pixel's best plane; images are independent here.
 
-    `planes`, evenly spaced as `views.sweep_planes` does, span what is searched, and half of the first guesses are
-    parallel to them. The same whatever the number of threads.
+    `planes` of `views.sweep_planes` span what is searched, and half of the first guesses are parallel to them. The
+    result is the same whatever the number of threads.
     """
     half = _Level.of(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level.of(colors, pinhole)
@@ -124,30 +117,52 @@ def match_depth(
 
     def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
         others, seed = neighbours[i][:COMPARED], 100 * i
-        family = np.ascontiguousarray(planes[i][[0, -1]])
+        family = np.ascontiguousarray(planes[i])
         reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
         views = half.views(i, others, recon_from_camera)
         found = random_planes(family, span, views[-1], h, w, i)
-        asked = np.full((h, w), 255, np.uint8)
-        score_all(found, asked, *views)
+        everyone = np.tile(np.arange(len(others), dtype=np.uint8), (h, w, 1))
+        found[..., 3] = scores(found, everyone, *views)
         for n, size in enumerate(_COARSE):
-            spread_planes(found, asked, *views, (*span, size, _COARSE_TRIES), seed + n)
-        asked = full.enlarged(best_neighbours(found, ASKED, *views))
-        found = full.enlarged(found)
+            spread_planes(found, everyone, *views, (*span, size, _COARSE_TRIES), seed + n)
+        each = [
+            scores(found, np.ascontiguousarray(everyone[..., n : n + 1]), *views) for n in range(len(others))
+        ]
+        asked = np.argsort(-np.stack(each, -1), axis=-1, kind="stable")[..., :ASKED].astype(np.uint8)
+        found, asked = full.enlarged(found), full.enlarged(asked)
 
         views = full.views(i, others, recon_from_camera)
-        score_all(found, asked, *views)
+        found[..., 3] = scores(found, asked, *views)
         for n, size in enumerate(_FINE):
             spread_planes(found, asked, *views, (*span, size, _FINE_TRIES), seed + n)
-        to_the_peak(found, asked, *views, _PEAK)
-        return np.maximum(inverse_depths(found, views[-1]), np.float32(0.5 * span[0])), found[..., 3]
+        peak = _inverse_depth_of_peak(found, asked, views, rays(pinhole))
+        return np.maximum(peak, np.float32(0.5 * span[0])), found[..., 3]
 
-    depths, scores = [], []
+    depths, correlations = [], []
     with ThreadPoolExecutor(threads) as pool:
         for n, (depth, score) in enumerate(pool.map(one, range(len(colors)))):
             depths.append(depth)
-            scores.append(score)
+            correlations.append(score)
             report((n + 1) / len(colors))
-    return np.stack(depths), np.stack(scores)
+    return np.stack(depths), np.stack(correlations)
+
+
+def _inverse_depth_of_peak(
+    found: Float[ndarray, "h w 4"],
+    asked: UInt8[ndarray, "h w a"],
+    views: tuple,
+    direction: Float[ndarray, "h w 3"],
+) -> Float[ndarray, "h w"]:
+    """Inverse depth at the peak of the parabola through each plane's score and those `_PEAK` (relative) off."""
+    inverse_depth = np.einsum("hwi,hwi->hw", found[..., :3], direction.astype(np.float32))
+    step, beside = _PEAK * inverse_depth, []
+    for side in (-step, step):
+        plane = found.copy()
+        plane[..., 2] += side
+        beside.append(scores(plane, asked, *views))
+    low, high = beside
+    curvature = low - 2 * found[..., 3] + high
+    shift = np.where(curvature < -1e-6, (low - high) / np.minimum(2 * curvature, -1e-6), 0)
+    return inverse_depth + np.clip(shift, -1, 1) * step

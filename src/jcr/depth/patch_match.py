@@ -74,53 +74,20 @@ def _correlation(pixel, p, n, packed, motions, windows, k):
 
 @inlined
 @no_type_check
-def _score(pixel, p, packed, motions, windows, k, asked, least):
-    """Mean of the best correlations of the window at a pixel on plane p with the neighbours that it asks.
+def _score(pixel, p, packed, motions, windows, k, asked):
+    """Mean of the best correlations of the window at a pixel on plane p with the neighbours `asked` (h,w,a) there.
 
-    Bit n of `asked` says whether it asks the n-th. -1 where the last neighbour could not lift it above `least`.
+    No neighbour is left out where it could change nothing: the branch, which chance would take, takes longer.
     """
+    v, u = pixel
     first = np.float32(-1)
     second = np.float32(-1)
-    count = len(packed)
-    left = 0
-    for n in range(count):
-        left += (asked >> n) & 1
-    for n in range(count):
-        if not (asked >> n) & 1:
-            continue
-        if left == 1 and count >= BEST and first + 1 <= 2 * least:
-            return np.float32(-1)
-        left -= 1
-        score = _correlation(pixel, p, n, packed, motions, windows, k)
-        first, second = (
-            max(first, score),
-            max(second, min(first, score)),
-        )  # no branch, which chance would take
-    if count < BEST:
+    for n in range(asked.shape[2]):
+        score = _correlation(pixel, p, asked[v, u, n], packed, motions, windows, k)
+        first, second = max(first, score), max(second, min(first, score))
+    if asked.shape[2] < BEST:
         return first
     return np.float32(0.5) * (first + second)
-
-
-@compiled
-@no_type_check
-def best_neighbours(found, count, packed, motions, windows, k):
-    """Bits (h,w) of the `count` neighbours with which each pixel's plane correlates best."""
-    h, w = found.shape[:2]
-    asked = np.zeros((h, w), np.uint8)
-    scores = np.empty(len(packed), np.float32)
-    for v in range(h):
-        for u in range(w):
-            p = found[v, u, 0], found[v, u, 1], found[v, u, 2]
-            for n in range(len(scores)):
-                scores[n] = _correlation((v, u), p, n, packed, motions, windows, k)
-            for _ in range(min(count, len(scores))):
-                best = 0
-                for n in range(1, len(scores)):
-                    if scores[n] > scores[best]:
-                        best = n
-                asked[v, u] |= 1 << best
-                scores[best] = -2
-    return asked
 
 
 @inlined
@@ -164,14 +131,15 @@ def random_planes(family, span, k, h, w, seed):
 
 @compiled
 @no_type_check
-def score_all(found, asked, packed, motions, windows, k):
-    """Write the score of every pixel's plane."""
-    h, w = asked.shape
-    least = np.float32(-2)
+def scores(found, asked, packed, motions, windows, k):
+    """The score (h,w) of every pixel's plane."""
+    h, w = asked.shape[:2]
+    out = np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
             p = found[v, u, 0], found[v, u, 1], found[v, u, 2]
-            found[v, u, 3] = _score((v, u), p, packed, motions, windows, k, asked[v, u], least)
+            out[v, u] = _score((v, u), p, packed, motions, windows, k, asked)
+    return out
 
 
 @compiled
@@ -184,7 +152,7 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
     halves from try to try.
     """
     state = random_state(seed)
-    h, w = asked.shape
+    h, w = asked.shape[:2]
     tries = search[3]
     backward = seed % 2 == 1
     towards = 1 if backward else -1
@@ -206,7 +174,7 @@ def spread_planes(found, asked, packed, motions, windows, k, search, seed):
                     q = _changed(here, rx, ry, search, option - 2, state)
                 if not _faces(q, rx, ry):
                     continue
-                new = _score((v, u), q, packed, motions, windows, k, asked[v, u], here[3])
+                new = _score((v, u), q, packed, motions, windows, k, asked)
                 if new > here[3]:
                     here = q[0], q[1], q[2], new
             found[v, u, 0], found[v, u, 1], found[v, u, 2], found[v, u, 3] = here
@@ -225,38 +193,3 @@ def _changed(p, rx, ry, search, halvings, state):
     q0 = p[0] + tilt * (2 * uniform(state) - 1)
     q1 = p[1] + tilt * (2 * uniform(state) - 1)
     return np.float32(q0), np.float32(q1), np.float32(moved - q0 * rx - q1 * ry)
-
-
-@compiled
-@no_type_check
-def to_the_peak(found, asked, packed, motions, windows, k, step):
-    """Move each plane to the peak of the parabola through its score and those `step` (relative) off."""
-    h, w = asked.shape
-    least = np.float32(-2)
-    for v in range(h):
-        for u in range(w):
-            p0, p1, p2, score = found[v, u, 0], found[v, u, 1], found[v, u, 2], found[v, u, 3]
-            rx, ry = _ray(v, u, k)
-            delta = np.float32(step * (p0 * rx + p1 * ry + p2))
-            left = right = np.float32(0)
-            for side in (-1, 1):  # in a loop, for the compiler puts the score in wherever it stands
-                q = p0, p1, p2 + np.float32(side) * delta
-                left, right = right, _score((v, u), q, packed, motions, windows, k, asked[v, u], least)
-            curvature = left - 2 * score + right
-            if curvature < -1e-6:
-                shift = (left - right) / (2 * curvature)
-                found[v, u, 2] += min(max(shift, np.float32(-1)), np.float32(1)) * delta
-
-
-@compiled
-@no_type_check
-def inverse_depths(found, k):
-    """Inverse depth (h,w) of each pixel's plane at the pixel."""
-    h, w = found.shape[:2]
-    out = np.empty((h, w), np.float32)
-    for v in range(h):
-        for u in range(w):
-            out[v, u] = (
-                found[v, u, 0] * (u - k[2]) / k[0] + found[v, u, 1] * (v - k[3]) / k[1] + found[v, u, 2]
-            )
-    return out

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from jcr.camera import rays
-from jcr.depth.consistency import colours_agree
+from jcr.depth.consistency import colours_agree, padded
 from jcr.depth.matched import Relative, grid
 from jcr.depth.regions import FEWEST, colour_regions, region_planes
 from jcr.records import Intrinsics
@@ -137,22 +137,25 @@ def evened(
 
 def planar_prior(
     i: int,
-    colors: Float[ndarray, "m h w 3"],
-    inverse_depth: Float[ndarray, "m h w"],
-    matched: Bool[ndarray, "m h w"],
+    surfaces: Float[ndarray, "m h _ 4"],
+    inverse_depth: Float[ndarray, "h w"],
+    matched: Bool[ndarray, "h w"],
     view: Relative,
     support: Float[ndarray, "4"],
     recon_from_camera: Float[ndarray, "4 4"],
     pinhole: Intrinsics,
 ) -> Prior:
-    """The planes of image i's regions; `colors` are gain-compensated and a little smooth, `support` is in the
-    recon frame."""
-    label, count = colour_regions(colors[i])
+    """The planes of image i's regions; `support` is in the recon frame.
+
+    `surfaces` hold the matched inverse depths of all images and their colours, gain-compensated and a little smooth, as
+    `colours_agree` takes them.
+    """
+    label, count = colour_regions(np.ascontiguousarray(surfaces[i, :, : pinhole.width, 1:]))
     in_camera = recon_from_camera[:3, :3].T @ support[:3]
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -in_camera / offset if offset else np.zeros(3)
     planes, on_support, inliers, held, rest, middle, shape = region_planes(
-        label, count, inverse_depth[i], matched[i], plane, grid(pinhole).astype(float), ON_PLANE, i
+        label, count, inverse_depth, matched, plane, grid(pinhole).astype(float), ON_PLANE, i
     )
     pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
     du, dv = np.moveaxis(pixel - middle[label], -1, 0)
@@ -168,15 +171,13 @@ def planar_prior(
     asked = (carried | lonely)[label] & (predicted > 0) & near
     same, unlike, through = colours_agree(
         i,
-        predicted,
-        asked,
-        inverse_depth,
-        matched,
-        colors,
+        padded(np.where(asked, predicted, 0)[None])[0],
+        surfaces,
         view.others,
         view.a,
         view.b,
         grid(pinhole),
+        pinhole.width,
         SAME_COLOUR,
     )
     holds = asked & (same >= FEWEST_VIEWS) & (same >= 2 * unlike) & (through == 0)
@@ -186,14 +187,14 @@ def planar_prior(
     # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
     held_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
     holds &= ~(lonely & (held_share < WHOLE))[label]
-    off = np.abs(predicted / inverse_depth[i] - 1) > OFF_PLANE
+    off = np.abs(predicted / inverse_depth - 1) > OFF_PLANE
     strong = asked & (inliers >= STRONG * held)[label]
     return Prior(
         inverse_depth=predicted,
         holds=holds,
         confirms=holds | alone,
         agreeing=np.where(on_support[label], np.minimum(same, 1), same).astype(np.uint8),
-        contradicts=strong & matched[i] & off,
+        contradicts=strong & matched & off,
         std=(rest[label] * np.where((on_support | lonely)[label], 1.0, np.maximum(away, 1.0))).astype(
             np.float32
         ),

@@ -7,8 +7,6 @@ from numpy import ndarray
 from jcr.geometry import apply, inverse
 from jcr.records import Tracks
 
-PLANES = 48
-"""Of a sweep; PatchMatch takes the first and the last."""
 BYTES_OF_THREAD, BYTES_OF_RESULT = 400, 150
 """Per pixel: of the image that a thread works on; of every image."""
 
@@ -35,16 +33,14 @@ def choose_neighbours(
     return chosen
 
 
-def sweep_planes(
-    tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"], count: int = PLANES
-) -> Float[ndarray, "m d 3"]:
-    """For each image `count` planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
+def sweep_planes(tracks: Tracks, recon_from_camera: Float[ndarray, "m 4 4"]) -> Float[ndarray, "m 2 3"]:
+    """For each image two planes p·x_in_camera = 1, so that p·(x/z, y/z, 1) is a pixel's inverse depth.
 
     All have the slope of the plane that the image's points lie on best, mostly the table (least absolute
-    deviations of inverse depth); their offsets, evenly spaced, span the points' percentiles and some slack.
+    deviations of inverse depth); between them lie the points from percentile 1 to 99, with some slack.
     With fronto-parallel planes 6 % fewer pixels got a depth, and its median error was 1.6 times as large.
     """
-    planes = np.empty((len(recon_from_camera), count, 3))
+    planes = np.empty((len(recon_from_camera), 2, 3))
     for i, camera_from_recon in enumerate(inverse(recon_from_camera)):
         x = apply(camera_from_recon, tracks.points_in_recon[tracks.point[tracks.image == i]])
         ray, inverse_depth = x / x[:, 2:], 1 / x[:, 2]
@@ -56,5 +52,5 @@ def sweep_planes(
         low, high = np.percentile(residual, [1, 99])
         slack = 0.15 * (high - low) + 0.02 * np.median(inverse_depth)
         planes[i] = slope
-        planes[i, :, 2] += np.linspace(low - slack, high + slack, count)
+        planes[i, :, 2] += low - slack, high + slack
     return planes

@@ -9,7 +9,6 @@ from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import UInt16, UInt64
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import signature
@@ -17,6 +16,7 @@ from numba.extending import intrinsic
 from numpy import ndarray
 
 from jcr.compiled import compiled
+from jcr.depth.lanes import INT, LONG, Lanes
 
 REACH, STRIDE = 2, 2
 """The window has (2·reach + 1)² pixels, every `stride`-th in a row and column."""
@@ -32,9 +32,6 @@ COLOR_SIGMA = 25.5
 _STEP = 4
 ALIKE = np.exp(-0.5 * _STEP / COLOR_SIGMA**2 * np.arange(4096)).astype(np.float32)
 """Weight of a pixel by its squared distance of colours, in steps of `_STEP`."""
-
-_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-_FLOATS, _INTS, _LONGS = (ir.VectorType(kind, LANES) for kind in (_FLOAT, _INT, _LONG))
 
 
 def quads(grey: UInt16[ndarray, "h w"]) -> UInt64[ndarray, "h w"]:
@@ -104,78 +101,31 @@ def window_sums(typing, packed, n, windows, pixel, x, y, xu, yu, xv, yv):
         images, rows = (context.make_array(sums.args[k])(context, builder, given[k]) for k in (0, 2))
         _, height, width = cgutils.unpack_tuple(builder, images.shape, 3)
         image = builder.gep(images.data, [builder.mul(given[1], builder.mul(height, width))])
-        grey = _interpolated(builder, image, builder.trunc(width, _INT), given[4:])
+        grey = _interpolated(builder, image, builder.trunc(width, INT), given[4:])
         v, u = cgutils.unpack_tuple(builder, given[3], 2)
         of_row = cgutils.unpack_tuple(builder, rows.shape, 4)[1]
-        first = builder.mul(builder.add(builder.mul(v, of_row), u), _LONG(2 * LANES))
-        weight, counts = (_read(builder, rows.data, builder.add(first, _LONG(k))) for k in (0, LANES))
-        weighted = builder.fmul(weight, grey)
-        terms = (weighted, builder.fmul(weighted, grey), builder.fmul(counts, grey))
-        return context.make_tuple(builder, sums.return_type, [_sum(builder, lanes) for lanes in terms])
+        first = builder.mul(builder.add(builder.mul(v, of_row), u), LONG(2 * LANES))
+        weight, counts = (
+            Lanes.read(builder, rows.data, builder.add(first, LONG(k)), LANES) for k in (0, LANES)
+        )
+        weighted = weight * grey
+        terms = (weighted, weighted * grey, counts * grey)
+        return context.make_tuple(builder, sums.return_type, [lanes.sum() for lanes in terms])
 
     return sums, generate
 
 
-def _interpolated(builder: Any, image: Any, width: Any, window: Any) -> Any:
+def _interpolated(builder: Any, image: Any, width: Any, window: Any) -> Lanes:
     """The grey at every tap."""
-    x, y, xu, yu, xv, yv = (_everywhere(builder, number, _FLOAT) for number in window)
-    steps = range(-REACH, REACH + 1)
-    column, row = _floats([j for _ in steps for j in steps]), _floats([i for i in steps for _ in steps])
-    px = builder.fadd(builder.fadd(x, builder.fmul(column, xu)), builder.fmul(row, xv))
-    py = builder.fadd(builder.fadd(y, builder.fmul(column, yu)), builder.fmul(row, yv))
-    left, top = builder.fptosi(px, _INTS), builder.fptosi(py, _INTS)
-    at = builder.add(builder.mul(top, _everywhere(builder, width, _INT)), left)
-    packed = ir.Constant(_LONGS, [_LONG(0)] * LANES)
-    for lane in range(TAPS):
-        place = builder.zext(builder.extract_element(at, _INT(lane)), _LONG)
-        packed = builder.insert_element(packed, builder.load(builder.gep(image, [place])), _INT(lane))
-    here, right, below, both = (_grey(builder, packed, 16 * place) for place in range(4))
-    fx = builder.fsub(px, builder.sitofp(left, _FLOATS))
-    fy = builder.fsub(py, builder.sitofp(top, _FLOATS))
-    upper, lower = _between(builder, here, right, fx), _between(builder, below, both, fx)
-    return _between(builder, upper, lower, fy)
-
-
-def _grey(builder: Any, packed: Any, bit: int) -> Any:
-    """The greys that begin at a bit of `quads`."""
-    shifted = builder.lshr(packed, ir.Constant(_LONGS, [_LONG(bit)] * LANES))
-    return builder.sitofp(builder.and_(builder.trunc(shifted, _INTS), _ints(65535)), _FLOATS)
-
-
-def _between(builder: Any, one: Any, other: Any, share: Any) -> Any:
-    return builder.fadd(one, builder.fmul(share, builder.fsub(other, one)))
-
-
-def _sum(builder: Any, lanes: Any) -> Any:
-    """The sum of the lanes, by halves."""
-    left = LANES
-    while left > 1:
-        left //= 2
-        halves = (
-            builder.shuffle_vector(
-                lanes, lanes, ir.Constant(ir.VectorType(_INT, left), [_INT(k) for k in half])
-            )
-            for half in (range(left), range(left, 2 * left))
-        )
-        lanes = builder.fadd(*halves)
-    return builder.extract_element(lanes, _INT(0))
-
-
-def _read(builder: Any, start: Any, tap: Any) -> Any:
-    lanes = builder.bitcast(builder.gep(start, [tap]), _FLOATS.as_pointer())
-    return builder.load(lanes, align=4)
-
-
-def _everywhere(builder: Any, number: Any, kind: Any) -> Any:
-    """A number in all lanes."""
-    lanes = builder.insert_element(ir.Constant(ir.VectorType(kind, LANES), ir.Undefined), number, _INT(0))
-    return builder.shuffle_vector(lanes, lanes, _ints(0))
-
-
-def _floats(numbers: list[int]) -> Any:
-    """One number a tap, and 0 in the lanes that are left."""
-    return ir.Constant(_FLOATS, [_FLOAT(float(n)) for n in numbers + [0] * (LANES - TAPS)])
-
-
-def _ints(number: int) -> Any:
-    return ir.Constant(_INTS, [_INT(number)] * LANES)
+    x, y, xu, yu, xv, yv = (Lanes.repeated(builder, number, LANES) for number in window)
+    steps, unused = range(-REACH, REACH + 1), [0.0] * (LANES - TAPS)
+    column = Lanes.constant(builder, [j for _ in steps for j in steps] + unused)
+    row = Lanes.constant(builder, [i for i in steps for _ in steps] + unused)
+    px, py = x + column * xu + row * xv, y + column * yu + row * yv
+    left, top = px.as_ints(), py.as_ints()
+    packed = (top * Lanes.repeated(builder, width, LANES) + left).gathered(image, TAPS)
+    here, right, below, both = ((packed >> 16 * k).as_ints() & 65535 for k in range(4))
+    here, right, below, both = (grey.as_floats() for grey in (here, right, below, both))
+    fx, fy = px - left.as_floats(), py - top.as_floats()
+    upper, lower = here + fx * (right - here), below + fx * (both - below)
+    return upper + fy * (lower - upper)

@@ -1,10 +1,11 @@
 """The table of formats: a run's calibration and map as other tools read them."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,16 +39,24 @@ class Format:
 
 
 def export_run(
-    out: str | Path, format: FormatName, path: str | Path | None = None, **options: object
+    out: str | Path,
+    format: FormatName,
+    path: str | Path | None = None,
+    options: ExportOptions | Mapping[str, Any] | None = None,
+    **named: Any,
 ) -> Path:
     """Export the run folder `out` in a format of `jcr export` and return the path of the new file or folder.
 
-    `options` are those of the command line (parent_frame, voxel_size, …). Raises InputError as the command does, and
-    NotTrustedError if the calibration is rejected; with force=True it is exported, with the reason in the file.
+    `options` are those of the command line; `named` are single ones of them, as 0.1.0 took them, and are removed in
+    0.2.0. Raises InputError as the command does, and RejectedError if the calibration is rejected; with `force` it is
+    exported, and the file contains the reason.
     """
-    named = None if path is None else Path(path)
-    made = checked_options(options, ExportOptions)
-    return written(Path(out), format, named, made)[2]
+    if named:
+        warnings.warn("export_run: give jcr.ExportOptions(...)", DeprecationWarning, stacklevel=2)
+        given = options if isinstance(options, Mapping) else vars(options or ExportOptions())
+        options = {**given, **named}
+    file = None if path is None else Path(path)
+    return written(Path(out), format, file, checked_options(options, ExportOptions))[2]
 
 
 def written(

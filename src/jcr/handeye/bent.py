@@ -16,8 +16,9 @@ from numpy import ndarray
 
 from jcr.distributions import f as f_distribution
 from jcr.geometry import skew
-from jcr.handeye.components import POSES, Equations, most_likely, over_sizes, solve
-from jcr.handeye.equation import SCALE, Poses
+from jcr.handeye.components import most_likely, over_sizes
+from jcr.handeye.equation import SCALE, UNKNOWNS, Poses
+from jcr.handeye.mixed_model import Equations, solve
 from jcr.handeye.systematic import Region
 from jcr.records import Kind
 
@@ -118,7 +119,7 @@ def tested(equations: Equations, base_from_gripper: Poses, kind: Kind) -> Bent:
         prior_gradient=np.r_[equations.prior_gradient, np.zeros(p)],
     )
     likeliest, information = most_likely(free)
-    found, freedom = solve(free, likeliest), max(len(equations.residual) - POSES - p, 1)
+    found, freedom = solve(free, likeliest), max(len(equations.residual) - UNKNOWNS - p, 1)
     chance = 0.0
     # Of few poses the sizes of the other errors are hardly known, and larger ones leave more to chance.
     for weight, _, each in over_sizes(free, likeliest, information):
@@ -141,5 +142,5 @@ def to_straight(
 
 def by_scale(equations: Equations) -> Float[ndarray, "7"]:
     """How far X moves with the logarithm of the scale, where another metre than the robot's decides that."""
-    region = Region.of_poses(equations.jacobian[:, :POSES])
+    region = Region.of_poses(equations.jacobian[:, :UNKNOWNS])
     return np.r_[-(region.fit @ equations.jacobian[:, SCALE])[:6, 0], 1.0]

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import Rotations, inverse, nearest_rotation, transform
+from jcr.geometry import Rotations, Transform, inverse, nearest_rotation, transform
 
 Poses = Float[ndarray, "*#batch n 4 4"]
 Weights = Float[ndarray, "*#batch n"]
 ROUNDS = 5
 """Of polishing the rotations; a likelihood fit finishes the work."""
 NEAR_HALF_TURN = -0.73
-"""Trace of a rotation by 150°, beyond which the sine of the angle says little of the axis."""
+"""Trace of a rotation by 150°, beyond which the sine of the angle shows little of the axis."""
 RELATIVE_CUT = 1e-10
 """Of the largest singular value: what is smaller is rounding, and of a direction unseen."""
 
@@ -45,14 +45,14 @@ def initial_estimate(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
     weights: Float[ndarray, " n"] | None = None,
-) -> tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]:
+) -> tuple[Transform, float, Transform]:
     """`closed_form` with a scale that a reconstruction can have: where motions do not show it, that of their extents."""
     x, scale, z = closed_form(base_from_gripper, recon_from_camera, weights)
     if scale <= 0:
         w = np.ones(len(base_from_gripper)) if weights is None else weights
         way, center = base_from_gripper[:, :3, 3], recon_from_camera[:, :3, 3]
         extent, seen = (np.linalg.norm(_centred(of, w)) for of in (way, center))
-        # Of a camera that only turns every scale is as good.
+        # Of a camera that only rotates every scale is as good.
         scale = extent / seen if seen > RELATIVE_CUT * np.linalg.norm(center) else 1.0
     return x, float(scale) or 1.0, z
 
@@ -143,21 +143,18 @@ def _translations(
     t_Z is eliminated: it makes the weighted means equal. The paper prints t_c^e for the camera's translation in its
     d_i(λ); t_C is meant.
     """
-    center, turns = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
-    turned = center @ np.swapaxes(base_rotation, -1, -2)
+    center, rotation = recon_from_camera[..., :3, 3], base_from_gripper[..., :3, :3]
+    in_base = center @ np.swapaxes(base_rotation, -1, -2)
     position = base_from_gripper[..., :3, 3]
-    rows = np.concatenate([turns, -turned[..., None], -position[..., None]], axis=-1)
-    rows = _centred(rows.reshape(*turned.shape[:-1], 15), weights).reshape(rows.shape)
+    rows = np.concatenate([rotation, -in_base[..., None], -position[..., None]], axis=-1)
+    rows = _centred(rows.reshape(*in_base.shape[:-1], 15), weights).reshape(rows.shape)
     # A column of unit size: what is cut as unseen must not depend on the reconstruction's unit. Centres that differ by
     # rounding alone are one.
     size, whole = np.sqrt((rows[..., 3] ** 2).mean((-1, -2))), np.sqrt((center**2).mean((-1, -2)))
     unit = np.where(size > RELATIVE_CUT * whole, size, np.inf)
     rows[..., 3] /= unit[..., None, None]
     rows = (rows * np.sqrt(weights)[..., None, None]).reshape(*weights.shape[:-1], -1, 5)
-    u, values, vt = np.linalg.svd(rows[..., :4], full_matrices=False)
-    seen = values > RELATIVE_CUT * values[..., :1]
-    inverted = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    solution = np.swapaxes(vt, -1, -2) @ (inverted[..., None] * (np.swapaxes(u, -1, -2) @ rows[..., 4:]))
+    solution = np.linalg.pinv(rows[..., :4], rcond=RELATIVE_CUT) @ rows[..., 4:]
     translation, scale = solution[..., :3, 0], solution[..., 3, 0] / unit
-    gap = (turns @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * turned
+    gap = (rotation @ translation[..., None, :, None])[..., 0] + position - scale[..., None, None] * in_base
     return translation, scale, np.einsum("...n,...ni->...i", weights, gap) / weights.sum(-1)[..., None]

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from jcr.geometry import fit_similarity, inverse, retract, rotation_exp, skew, transform
+from jcr.geometry import Transform, fit_similarity, inverse, retract, rotation_exp, skew, transform
 from jcr.handeye.closed_form import closed_form
 from jcr.handeye.fit import Poses
 from jcr.handeye.robust import least_trimmed
@@ -33,7 +33,9 @@ CONGRUENT = np.radians(1.5)
 BETTER = 3.0
 """A reading is named when it fits this many times better than the poses as given."""
 ROUGHLY = 2.0
-"""A closed form tells how well a reading fits to this factor."""
+"""A closed form shows how well a reading fits to this factor."""
+TURN, ON_MULTIPLE = 2 * np.pi, 1.5
+"""Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
 MIN_SHARE = 0.8
 """of the images must agree under it."""
 INVERSES = "their inverses (gripper_from_base was given)"
@@ -104,13 +106,10 @@ def better_reading(
     camera_angle = _angles(recon_from_camera)
     gaps = [_incongruence(candidate, camera_angle) for candidate in others]
     if min(gaps) > CONGRUENT:
-        # Lost turns take seconds to find again: only where no cheaper reading has the cameras' angles.
-        unwrapped = [
-            _vectors_taken_as_radians(base_from_gripper, camera_angle),
-            *_angles_taken_as_radians(base_from_gripper, recon_from_camera),
-        ]
-        others += unwrapped
-        gaps += [_incongruence(candidate, camera_angle) for candidate in unwrapped]
+        # Lost rotations take seconds to find again: only where no cheaper reading has the cameras' angles.
+        unwound = list(_degrees_taken_as_radians(base_from_gripper, recon_from_camera))
+        others += unwound
+        gaps += [_incongruence(candidate, camera_angle) for candidate in unwound]
     gaps = np.array(gaps)
     order = np.argsort(np.round(gaps / SAME_ANGLE), kind="stable")[:SOLVED]
     worth = [others[k] for k in order if gaps[k] < 2 * gaps.min() + SAME_ANGLE]
@@ -148,12 +147,7 @@ def convention_finding(found: tuple[Reading, Reading], severity: Severity = "rej
 def _solved(candidate: _Candidate, recon_from_camera: Poses) -> Reading:
     solved = solve_hand_eye(candidate.base_from_gripper, recon_from_camera[candidate.image])
     metres, radians = solved.robot_noise.together
-    return Reading(
-        candidate.name,
-        1e3 * metres,
-        float(np.degrees(radians)),
-        int(solved.inliers.sum()),
-    )
+    return Reading(candidate.name, 1e3 * metres, float(np.degrees(radians)), int(solved.inliers.sum()))
 
 
 def _roughly(candidate: _Candidate, recon_from_camera: Poses) -> float:
@@ -204,68 +198,32 @@ def _candidates(base_from_gripper: Poses) -> Iterator[_Candidate]:
             )
     rotation = Rotation.from_matrix(base_from_gripper[:, :3, :3])
 
-    def turned(name: str, read: Rotation) -> _Candidate:
+    def with_rotation(name: str, read: Rotation) -> _Candidate:
         return _Candidate(name, transform(read.as_matrix(), base_from_gripper[:, :3, 3]), every)
 
     x, y, z, w = rotation.as_quat().T
-    yield turned(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
-    yield turned(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
-    yield turned(
+    yield with_rotation(WXYZ, Rotation.from_quat(np.stack([y, z, w, x], 1)))
+    yield with_rotation(XYZW, Rotation.from_quat(np.stack([w, x, y, z], 1)))
+    yield with_rotation(
         "rotation vectors in radians that were taken as degrees",
         Rotation.from_rotvec(np.degrees(rotation.as_rotvec())),
     )
-    yield turned(TRANSPOSED, rotation.inv())
+    yield with_rotation(TRANSPOSED, rotation.inv())
     angles = {order: _euler(rotation, order) for order in EULER_ORDERS}
     for order in EULER_ORDERS:
-        yield turned(
+        yield with_rotation(
             f"Euler angles ({order}) in radians that were taken as degrees",
             Rotation.from_euler(order, np.degrees(angles[order])),
         )
     k = {order: rank for rank, order in enumerate(EULER_ORDERS)}
     for taken, meant in sorted(permutations(EULER_ORDERS, 2), key=lambda pair: k[pair[0]] + k[pair[1]]):
-        yield turned(
+        yield with_rotation(
             f"Euler angles {meant} that were taken as {taken}", Rotation.from_euler(meant, angles[taken])
         )
 
 
-def _vectors_taken_as_radians(base_from_gripper: Poses, camera_angle: Float[ndarray, "n n"]) -> _Candidate:
-    """Rotation vectors in degrees that were taken as radians: whole rotations were lost, and are found again.
-
-    Each image leaves some sixty angles; those of two images that are congruent decide the others.
-    """
-    vector = Rotation.from_matrix(base_from_gripper[:, :3, :3]).as_rotvec()
-    length = np.linalg.norm(vector, axis=1, keepdims=True)
-    axis = vector / np.maximum(length, 1e-12)
-    turns = np.arange(-29, 30)
-    value = np.radians(length + 2 * np.pi * turns)  # what was degrees, (n, 59)
-    options = rotation_exp(axis[:, None] * value[..., None])
-    options[np.abs(value) > np.pi] = np.nan  # no rotation vector is longer than half a turn
-
-    def gap(i: int, j: int) -> Float[ndarray, "59 59"]:
-        trace = np.einsum("aij,bij->ab", options[i], options[j])
-        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-        return np.nan_to_num(np.abs(angle - camera_angle[i, j]), nan=np.inf)
-
-    pairs = np.argsort(gap(0, 1), axis=None)[:150]
-    first, second = np.unravel_index(pairs, (len(turns), len(turns)))
-    choice = np.stack([first, second], axis=1)
-    total = np.zeros(len(pairs))
-    for k in range(2, len(value)):
-        # The option of image k that suits both images of each pair.
-        fits = np.maximum(gap(0, k)[first], gap(1, k)[second])
-        choice = np.column_stack([choice, fits.argmin(1)])
-        total += fits.min(1)
-    chosen = options[np.arange(len(value)), choice[int(total.argmin())]]
-    rotation = np.where(np.isfinite(chosen), chosen, np.eye(3))
-    return _Candidate(
-        "rotation vectors in degrees that were taken as radians",
-        transform(rotation, base_from_gripper[:, :3, 3]),
-        np.arange(len(value)),
-    )
-
-
-def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:
-    """Euler angles in degrees that were taken as radians: each is known up to a multiple of 2π degrees.
+def _degrees_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses) -> Iterator[_Candidate]:
+    """Rotation vectors or Euler angles in degrees that were taken as radians: known up to multiples of 2π degrees.
 
     The positions alone give the cameras' orientations in the base, hence all grippers' from any one of them.
     Every possibility for the first image is tried, and must put the others on their multiples.
@@ -275,35 +233,63 @@ def _angles_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses)
     if base_rotation is None:
         return
     camera = base_rotation @ recon_from_camera[:, :3, :3]
-    step = 2 * np.pi
-    turns = np.arange(-29, 30)
-    for order in EULER_ORDERS[:4]:
-        read = _euler(Rotation.from_matrix(base_from_gripper[:, :3, :3]), order)
-        # The same rotation has two triples, and the one that was meant is not known.
-        read = np.stack([read, read * [1, -1, 1] + np.pi], axis=1)
-        angles = np.stack(np.meshgrid(turns, turns[14:45], turns, indexing="ij"), -1).reshape(-1, 3) * step
-        angles = (angles[:, None] + read[0]).reshape(-1, 3)
-        angles = angles[(np.abs(angles) <= [180, 90, 180]).all(1)]
-        first = Rotation.from_euler(order, angles, degrees=True).as_matrix()
-        gripper_from_camera = np.swapaxes(first, 1, 2) @ camera[0]
+    read = Rotation.from_matrix(base_from_gripper[:, :3, :3])
+    for order in (None, *EULER_ORDERS[:4]):
+        numbers, along = _written(read, order)
+        multiples = np.meshgrid(*[np.arange(-29, 30)] * along.shape[1], indexing="ij")
+        first = TURN * np.stack(multiples, -1).reshape(-1, 1, along.shape[1]) @ along[0] + numbers[0]
+        first = first[(np.abs(first) <= [180, 90 if order else 180, 180]).all(2)]
+        gripper_from_camera = np.swapaxes(_rotations(first, order), 1, 2) @ camera[0]
         for k in range(1, len(position)):
-            meant = camera[k] @ np.swapaxes(gripper_from_camera, 1, 2)
-            expected = np.degrees(_euler(Rotation.from_matrix(meant), order))
-            off = np.abs((expected[:, None] - read[k] + step / 2) % step - step / 2).max(2).min(1)
-            gripper_from_camera = gripper_from_camera[off < 1.5]
+            off = _nearest(camera[k] @ np.swapaxes(gripper_from_camera, 1, 2), order, numbers[k], along[k])[1]
+            gripper_from_camera = gripper_from_camera[off < ON_MULTIPLE]
             if len(gripper_from_camera) == 0:  # an empty stack of rotations is no rotation for SciPy
                 break
-        if len(gripper_from_camera):
-            x = gripper_from_camera[0]
-            expected = np.degrees(_euler(Rotation.from_matrix(camera @ x.T), order))
-            nearest = read + step * np.round((expected[:, None] - read) / step)
-            chosen = np.abs(nearest - expected[:, None]).max(2).argmin(1)
-            rotation = Rotation.from_euler(order, nearest[np.arange(len(chosen)), chosen], degrees=True)
+        else:
+            meant = [
+                _nearest((one @ gripper_from_camera[0].T)[None], order, numbers[k], along[k])[0]
+                for k, one in enumerate(camera)
+            ]
+            what = "rotation vectors" if order is None else f"Euler angles ({order})"
             yield _Candidate(
-                f"Euler angles ({order}) in degrees that were taken as radians",
-                transform(rotation.as_matrix(), position),
+                f"{what} in degrees that were taken as radians",
+                transform(_rotations(np.concatenate(meant), order), position),
                 np.arange(len(position)),
             )
+
+
+def _written(
+    rotation: Rotation, order: str | None
+) -> tuple[Float[ndarray, "n v 3"], Float[ndarray, "n d 3"]]:
+    """Numbers that write rotations as vectors (None) or Euler angles, in each of v ways, and along what they are known
+    up to multiples."""
+    if order is None:
+        vector = rotation.as_rotvec()
+        return vector[:, None], (vector / np.linalg.norm(vector, axis=1, keepdims=True).clip(1e-12))[:, None]
+    angles = _euler(rotation, order)
+    # The same rotation has two triples, and the one that was meant is not known.
+    both = np.stack([angles, angles * [1, -1, 1] + np.pi], axis=1)
+    return both, np.tile(np.eye(3), (len(angles), 1, 1))
+
+
+def _nearest(
+    expected: Float[ndarray, "m 3 3"],
+    order: str | None,
+    numbers: Float[ndarray, "v 3"],
+    along: Float[ndarray, "d 3"],
+) -> tuple[Float[ndarray, "m 3"], Float[ndarray, " m"]]:
+    """What an image's numbers may have been (degrees), nearest to those of expected rotations, and how far off."""
+    read = Rotation.from_matrix(expected)
+    degrees = np.degrees(read.as_rotvec() if order is None else _euler(read, order))[:, None]
+    possible = numbers + TURN * np.round((degrees - numbers) @ along.T / TURN) @ along
+    off = np.abs(possible - degrees).max(2)
+    return possible[np.arange(len(off)), off.argmin(1)], off.min(1)
+
+
+def _rotations(degrees: Float[ndarray, "m 3"], order: str | None) -> Float[ndarray, "m 3 3"]:
+    if order is None:
+        return rotation_exp(np.radians(degrees))
+    return Rotation.from_euler(order, degrees, degrees=True).as_matrix()
 
 
 def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
@@ -313,7 +299,7 @@ def _euler(rotation: Rotation, order: str) -> Float[ndarray, "*batch 3"]:
         return rotation.as_euler(order)
 
 
-Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "3"]]
+Unknowns = tuple[Transform, float, Float[ndarray, "3"]]
 """base_from_recon, the scale, and the gripper's place in the camera in recon units times the scale."""
 
 

@@ -17,30 +17,30 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.linalg import cho_solve
 
-from jcr.geometry import retract
-from jcr.handeye.components import (
-    Equations,
-    Solution,
-    expected_covariance_at,
-    expected_posterior,
-    log_evidence,
-    most_likely,
-    posterior,
-    solve,
+from jcr.geometry import Transform, retract
+from jcr.handeye.components import log_evidence, most_likely
+from jcr.handeye.equation import (
+    SCALE,
+    TRANSLATION,
+    UNKNOWNS,
+    Poses,
+    pose_by_pose,
+    residuals,
+    residuals_by_camera,
+    share_within_limits,
+    weak_prior,
 )
-from jcr.handeye.equation import PRIOR_STD, SCALE, TRANSLATION, Poses, residuals, residuals_by_camera
-from jcr.handeye.systematic import Region, smooth_errors
+from jcr.handeye.mixed_model import Equations, LogSizes, Solution, left_out, solve
+from jcr.handeye.posterior import expected_covariance_at, expected_posterior, posterior
+from jcr.handeye.systematic import Region
 from jcr.records import Budget, RobotNoise
 
 SHOWN = 1.1
 """Times the noise that was given: so much more is the residuals' doing."""
-LARGEST_TURN = 0.5
-"""rad, and of the logarithm of scale: a poor start on nearly unobservable motions must not throw rotations around the
-circle."""
+ITERATIONS = 50
 
-Unknowns = tuple[Float[ndarray, "4 4"], float, Float[ndarray, "4 4"]]
+Unknowns = tuple[Transform, float, Transform]
 """gripper_from_camera, scale, base_from_recon."""
 
 
@@ -54,96 +54,88 @@ class Cues:
     """Axis in the gripper frame, camera centre along it (m), standard deviation (m)."""
 
 
-@dataclass(frozen=True)
-class PoseFit:
-    """The fit and what its residuals say."""
+@dataclass(frozen=True, kw_only=True)
+class PoseProblem:
+    """Poses of n images, and what is known beside; r = 6n."""
 
-    gripper_from_camera: Float[ndarray, "4 4"]
+    base_from_gripper: Poses
+    recon_from_camera: Poses
+    used: Bool[ndarray, " n"]
+    """Which of them the fit rests on."""
+    systematic: Float[ndarray, "r r"]
+    """Covariance of the systematic errors at 1 rad (systematic.py)."""
+    noise: tuple[float, float] | None = None
+    """The robot's (m, rad), at least; the residuals may show more."""
+    cues: Cues = Cues()
+    camera_covariance: Float[ndarray, "r r"] | None = None
+    """Of steps of the cameras (geometry.retract, recon axes); None where they are exact beside the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseFit:
+    """The fit, and what its residuals show."""
+
+    gripper_from_camera: Transform
     scale: float
-    base_from_recon: Float[ndarray, "4 4"]
-    translation_residual: Float[ndarray, "n 3"]
-    """Predicted minus reported gripper position (m), base axes; of every pose, used or not."""
-    rotation_residual: Float[ndarray, "n 3"]
-    """Rotation vector from reported to predicted gripper (rad), base axes."""
-    noise: tuple[float, float]
-    """σ_t (m) and σ_r (rad) per axis of the random errors, given or estimated."""
-    noise_estimated: bool
-    given_noise: tuple[float, float] | None
-    systematic: float
-    """σ_s (rad) of the systematic errors."""
-    systematic_left: tuple[float, float]
-    """m, rad per axis: what of them is left in the used poses."""
+    base_from_recon: Transform
+    residual: Float[ndarray, "n 6"]
+    """Steps from the reported to the predicted gripper (m, rad; base axes), of every pose, used or not."""
+    noise: RobotNoise
     log_evidence: float
     """Log density of the used poses' residuals, averaged over unknowns and sizes of errors, times (2π)^(3m)."""
     covariance: Float[ndarray, "7 7"]
     """In records.COVARIANCE_ORDER."""
     budget: Budget | None
     """Its parts; None of a fit that is not averaged."""
-    missed: Float[ndarray, "n 6"]
-    """By how much a fit without it misses each pose: translation (m), rotation (rad), both in base axes."""
-    missed_covariance: Float[ndarray, "n 6 6"]
+    leave_one_out: Float[ndarray, "n 6"]
+    """Each pose's residual (m, rad; base axes) from a fit without it."""
+    leave_one_out_covariance: Float[ndarray, "n 6 6"]
     """What to expect of that, the pose's own noise included."""
 
 
-def fit_poses(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses,
-    start: Unknowns,
-    used: Bool[ndarray, " n"],
-    noise: tuple[float, float] | None = None,
-    cues: Cues | None = None,
-    camera_covariance: Float[ndarray, "r r"] | None = None,
-    systematic: Float[ndarray, "r r"] | None = None,
-    averaged: bool = True,
-    iterations: int = 50,
-) -> PoseFit:
-    """Gauss-Newton from `start` on the `used` poses; the answer is the effective hand-eye transform.
+def fit_poses(problem: PoseProblem, start: Unknowns, averaged: bool = True) -> PoseFit:
+    """Gauss-Newton from `start` on the used poses; the answer is the effective hand-eye transform.
 
     Between two steps the sizes of the errors are estimated, and with them the residuals' covariance: what falls is no
-    sum of squares that least_squares.py could watch.
-
-    `noise` is the robot's in (m, rad), at least; the residuals may say more. `camera_covariance` is that of the steps
-    of the cameras (geometry.retract, recon axes); None where the cameras are exact beside the robot. `systematic` is
-    the covariance of the systematic errors at 1 rad; None: that of errors smooth over the poses. Without `averaged`
-    the sizes of the errors are taken at their most likely values, which is faster and claims too much.
+    sum of squares that least_squares.py could watch. Without `averaged` the sizes of the errors are taken at their most
+    likely values, which is faster and claims too much.
     """
-    cues = cues or Cues()
-    if systematic is None:
-        systematic = smooth_errors(base_from_gripper)
-    problem = _Problem(base_from_gripper, recon_from_camera, used, noise, cues, camera_covariance, systematic)
-    unknowns, log_sizes = _stepped(problem, start, 1e-14 if averaged else 1e-6, iterations)
-    linear = _linearised(problem, unknowns)
-    log_sizes, information = most_likely(linear.equations, log_sizes)
-    solution = solve(linear.equations, log_sizes)
+    unknowns, log_sizes = _most_likely_unknowns(problem, start, 1e-14 if averaged else 1e-6)
+    linear = linearised(problem, unknowns)
+    equations = linear.equations
+    log_sizes, information = most_likely(equations, log_sizes)
+    solution = solve(equations, log_sizes)
+    covariance, budget = solution.covariance, None
     if averaged:
-        found = posterior(linear.equations, log_sizes, information, linear.region)
-        unknowns, covariance, budget = _moved(*unknowns, found.step), found.covariance, found.budget
-    else:
-        covariance = solution.covariance
-        budget = None
-    sigma_t, sigma_r, sigma_s = (float(x) for x in np.sqrt(linear.equations.variances(log_sizes)))
-    missed, missed_covariance = _missed(problem, linear, solution, (sigma_t, sigma_r), sigma_s)
-    residual = residuals(*unknowns, base_from_gripper, recon_from_camera)[0]
+        found = posterior(equations, log_sizes, information, linear.region)
+        unknowns, covariance, budget = after(unknowns, found.step), found.covariance, found.budget
+    metres, radians, systematic = np.sqrt(equations.variances(log_sizes)).tolist()
+    noise = RobotNoise(
+        metres,
+        radians,
+        exceeds((metres, radians), problem.noise),
+        problem.noise,
+        systematic,
+        equations.systematic_left(log_sizes),
+    )
+    leave_one_out, leave_one_out_covariance = _leave_one_out(problem, linear, solution, noise)
     return PoseFit(
-        *unknowns,
-        residual[:, :3],
-        residual[:, 3:],
-        (sigma_t, sigma_r),
-        exceeds((sigma_t, sigma_r), noise),
-        noise,
-        sigma_s,
-        linear.equations.systematic_left(log_sizes),
-        log_evidence(linear.equations, solution, information),
-        covariance[:7, :7],
-        budget,
-        missed,
-        missed_covariance,
+        gripper_from_camera=unknowns[0],
+        scale=unknowns[1],
+        base_from_recon=unknowns[2],
+        residual=residuals(*unknowns, problem.base_from_gripper, problem.recon_from_camera)[0],
+        noise=noise,
+        log_evidence=log_evidence(equations, solution, information),
+        covariance=covariance[:7, :7],
+        budget=budget,
+        leave_one_out=leave_one_out,
+        leave_one_out_covariance=leave_one_out_covariance,
     )
 
 
 def expected_fit(
     base_from_gripper: Poses,
-    gripper_from_camera: Float[ndarray, "4 4"],
+    gripper_from_camera: Transform,
     noise: RobotNoise,
     systematic: Float[ndarray, "r r"],
     cues: Cues | None = None,
@@ -151,39 +143,42 @@ def expected_fit(
 ) -> Float[ndarray, "7 7"]:
     """Covariance that a fit to exact camera poses is expected to report, of a robot with this noise; the scale being 1.
 
-    `systematic`, `cues` and `averaged` are as `fit_poses` takes them.
+    `systematic` and `cues` are those of a PoseProblem, `averaged` that of `fit_poses`.
     """
-    problem = _Problem(
-        base_from_gripper,
-        base_from_gripper @ gripper_from_camera,
-        np.ones(len(base_from_gripper), bool),
-        noise.given,
-        cues or Cues(),
-        None,
-        systematic,
+    problem = PoseProblem(
+        base_from_gripper=base_from_gripper,
+        recon_from_camera=base_from_gripper @ gripper_from_camera,
+        used=np.ones(len(base_from_gripper), bool),
+        systematic=systematic,
+        noise=noise.given,
+        cues=cues or Cues(),
     )
-    linear = _linearised(problem, (gripper_from_camera, 1.0, np.eye(4)))
+    linear = linearised(problem, (gripper_from_camera, 1.0, np.eye(4)))
     if averaged:
         return expected_posterior(linear.equations, noise, linear.region).covariance[:7, :7]
     return expected_covariance_at(linear.equations, noise, linear.region)[:7, :7]
 
 
-def _stepped(
-    problem: "_Problem", unknowns: Unknowns, settled: float, iterations: int
-) -> tuple[Unknowns, Float[ndarray, " c"] | None]:
-    """Gauss-Newton until a step of less than `settled` squared standard deviations; the sizes of errors before it."""
+def _most_likely_unknowns(
+    problem: PoseProblem, unknowns: Unknowns, settled: float
+) -> tuple[Unknowns, LogSizes | None]:
+    """The unknowns after steps until one of less than `settled` squared standard deviations; the sizes before it."""
     log_sizes = None
-    for _ in range(iterations):
-        linear = _linearised(problem, unknowns)
-        log_sizes, _ = most_likely(linear.equations, log_sizes)
-        solution = solve(linear.equations, log_sizes)
-        step = solution.step * min(
-            1.0, LARGEST_TURN / max(np.abs(solution.step[[3, 4, 5, 6, 10, 11, 12]]).max(), 1e-300)
-        )
-        unknowns = _moved(*unknowns, step)
+    for _ in range(ITERATIONS):
+        equations = linearised(problem, unknowns).equations
+        log_sizes, _ = most_likely(equations, log_sizes)
+        solution = solve(equations, log_sizes)
+        step = share_within_limits(solution.step) * solution.step
+        unknowns = after(unknowns, step)
         if float(((solution.information_root.T @ step) ** 2).sum()) < settled:
             break
     return unknowns, log_sizes
+
+
+def after(unknowns: Unknowns, step: Float[ndarray, "13"]) -> Unknowns:
+    """The unknowns after a step in the order of equation.py."""
+    x, scale, z = unknowns
+    return retract(x, step[:6]), float(scale * np.exp(step[6])), retract(z, step[7:])
 
 
 def exceeds(noise: tuple[float, float], given: tuple[float, float] | None) -> bool:
@@ -191,21 +186,8 @@ def exceeds(noise: tuple[float, float], given: tuple[float, float] | None) -> bo
     return given is None or any(size > SHOWN * known for size, known in zip(noise, given, strict=True))
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """What stays while the unknowns move; r = 6n."""
-
-    base_from_gripper: Poses
-    recon_from_camera: Poses
-    used: Bool[ndarray, " n"]
-    noise: tuple[float, float] | None
-    cues: Cues
-    camera_covariance: Float[ndarray, "r r"] | None
-    systematic: Float[ndarray, "r r"]
-
-
-@dataclass(frozen=True)
-class _Linearised:
+@dataclass(frozen=True, kw_only=True)
+class Linearised:
     """The equations at one value of the unknowns, of all poses and of the used ones."""
 
     residual: Float[ndarray, "n 6"]
@@ -218,11 +200,11 @@ class _Linearised:
     equations: Equations
 
 
-def _linearised(problem: _Problem, unknowns: Unknowns) -> _Linearised:
-    used, n = problem.used, len(problem.used)
-    rows = np.repeat(used, 6)
+def linearised(problem: PoseProblem, unknowns: Unknowns) -> Linearised:
+    """The equations of poses at one value of the unknowns."""
+    rows, n = np.repeat(problem.used, 6), len(problem.used)
     residual, jacobian = residuals(*unknowns, problem.base_from_gripper, problem.recon_from_camera)
-    stacked = jacobian.reshape(6 * n, 13)
+    stacked = jacobian.reshape(6 * n, UNKNOWNS)
     region = Region.of_poses(stacked[rows])
     fit = np.zeros((12, 6 * n))
     fit[:, rows] = region.fit
@@ -230,79 +212,58 @@ def _linearised(problem: _Problem, unknowns: Unknowns) -> _Linearised:
     shared = np.zeros((6 * n, 6 * n))
     if problem.camera_covariance is not None:
         by_camera = residuals_by_camera(*unknowns, problem.recon_from_camera)
-        blocks = problem.camera_covariance.reshape(n, 6, n, 6).swapaxes(1, 2)
-        shared = (
-            (by_camera[:, None] @ blocks @ np.swapaxes(by_camera, 1, 2)).swapaxes(1, 2).reshape(6 * n, 6 * n)
-        )
+        shared = pose_by_pose(by_camera, pose_by_pose(by_camera, problem.camera_covariance).T)
     among = np.ix_(rows, rows)
+    prior_information, prior_gradient = _prior(unknowns, problem.cues)
     equations = Equations(
-        residual[used].ravel(),
-        stacked[rows],
-        *_prior(*unknowns[:2], problem.cues),
-        None if problem.camera_covariance is None else shared[among],
-        systematic[among],
-        problem.noise,
+        residual=residual[problem.used].ravel(),
+        jacobian=stacked[rows],
+        prior_information=prior_information,
+        prior_gradient=prior_gradient,
+        known=None if problem.camera_covariance is None else shared[among],
+        systematic=systematic[among],
+        given=problem.noise,
     )
-    return _Linearised(residual, jacobian, shared, systematic, region, equations)
+    return Linearised(
+        residual=residual,
+        jacobian=jacobian,
+        shared=shared,
+        systematic=systematic,
+        region=region,
+        equations=equations,
+    )
 
 
-def _missed(
-    problem: _Problem, linear: _Linearised, solution: Solution, noise: tuple[float, float], systematic: float
+def _leave_one_out(
+    problem: PoseProblem, linear: Linearised, solution: Solution, noise: RobotNoise
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 6"]]:
     """Each pose's residual from a fit without it, and its covariance."""
     equations, used = linear.equations, problem.used
-    missed, covariance = np.empty_like(linear.residual), np.empty((len(used), 6, 6))
-    missed[used], covariance[used] = left_out(equations, solution, noise)
-    weight = cho_solve((solution.root, True), np.eye(len(equations.residual)))
-    # What the other poses' errors tell of an unused one's (best linear unbiased prediction).
-    alike = linear.shared + systematic**2 * linear.systematic
+    found, covariance = np.empty_like(linear.residual), np.empty((len(used), 6, 6))
+    random = noise.translation, noise.rotation
+    found[used], covariance[used] = left_out(solution, random)
+    # What the other poses' errors show of an unused one's (best linear unbiased prediction).
+    alike = linear.shared + noise.systematic**2 * linear.systematic
     rows = np.repeat(used, 6)
     for i in np.flatnonzero(~used):
         mine = slice(6 * i, 6 * i + 6)
-        gain = alike[mine, rows] @ weight
+        gain = alike[mine, rows] @ solution.weight
         jacobian = linear.jacobian[i] - gain @ equations.jacobian
-        missed[i] = linear.residual[i] - gain @ equations.residual
-        own_spread = alike[mine, mine] - gain @ alike[mine, rows].T
-        own_noise = np.diag(np.repeat(np.square(noise), 3))
-        covariance[i] = own_spread + own_noise + jacobian @ solution.covariance @ jacobian.T
-    return missed, covariance
+        found[i] = linear.residual[i] - gain @ equations.residual
+        own = alike[mine, mine] - gain @ alike[mine, rows].T + np.diag(np.repeat(np.square(random), 3))
+        covariance[i] = own + jacobian @ solution.covariance @ jacobian.T
+    return found, covariance
 
 
-def left_out(
-    equations: Equations, solution: Solution, noise: tuple[float, float]
-) -> tuple[Float[ndarray, "m 6"], Float[ndarray, "m 6 6"]]:
-    """Each used pose's residual from a fit without it, P_ii⁻¹ (P r)_i with P = V⁻¹ − V⁻¹J C JᵀV⁻¹, and its covariance
-    P_ii⁻¹.
-
-    `noise` (m, rad) sets the units in which the matrices are inverted.
-    """
-    sigma, m = np.repeat(noise, 3), len(equations.residual) // 6
-    weight = cho_solve((solution.root, True), np.eye(6 * m))
-    left = weight @ (equations.residual + equations.jacobian @ solution.step)
-    projection = weight - solution.weighed @ solution.gain
-    own = projection.reshape(m, 6, m, 6)[range(m), :, range(m)]
-    without = np.linalg.inv(sigma[:, None] * own * sigma + 1e-9 * np.eye(6))
-    missed = sigma * np.einsum("mij,mj->mi", without, sigma * left.reshape(m, 6))
-    return missed, sigma[:, None] * without * sigma
-
-
-def _prior(
-    x: Float[ndarray, "4 4"], scale: float, cues: Cues
-) -> tuple[Float[ndarray, "13 13"], Float[ndarray, "13"]]:
-    hessian, gradient = np.zeros((13, 13)), np.zeros(13)
-    hessian[range(7), range(7)] = PRIOR_STD**-2.0
+def _prior(unknowns: Unknowns, cues: Cues) -> tuple[Float[ndarray, "13 13"], Float[ndarray, "13"]]:
+    """Information of what is known beforehand, and its gradient."""
+    (x, scale, _), information, gradient = unknowns, weak_prior(), np.zeros(UNKNOWNS)
     if cues.scale is not None:
         known, std = cues.scale
-        hessian[6, 6] += std**-2
-        gradient[6] += np.log(scale / known) * std**-2
+        information[SCALE, SCALE] += std**-2
+        gradient[SCALE] += np.log(scale / known) * std**-2
     if cues.offset is not None:
         axis, known, std = cues.offset
-        hessian[TRANSLATION, TRANSLATION] += np.outer(axis, axis) * std**-2
+        information[TRANSLATION, TRANSLATION] += np.outer(axis, axis) * std**-2
         gradient[TRANSLATION] += axis * (axis @ x[:3, 3] - known) * std**-2
-    return hessian, gradient
-
-
-def _moved(
-    x: Float[ndarray, "4 4"], scale: float, z: Float[ndarray, "4 4"], step: Float[ndarray, "13"]
-) -> Unknowns:
-    return retract(x, step[:6]), float(scale * np.exp(step[6])), retract(z, step[7:])
+    return information, gradient

@@ -1,6 +1,6 @@
 """Joint angles from gripper poses: damped least squares from many starts, and one branch for a whole capture.
 
-Limits of what poses can tell: an arm with six joints reaches a pose in up to eight ways; the branch with the least
+Limits of what poses can show: an arm with six joints reaches a pose in up to eight ways; the branch with the least
 change from image to image and nearest the arm's rest posture is chosen. The angles of a seventh joint are those
 nearest the rest posture. An unknown tool frame changes the angles, and poses of any tool within reach fit an arm
 with six joints or more: a wrong robot is recognised only where its reach or its limits exclude a pose.
@@ -13,7 +13,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import ARM, inverse, retract, rotation_angle, rotation_exp, rotation_log, skew, transform
+from jcr.geometry import (
+    ARM,
+    Transform,
+    inverse,
+    retract,
+    rotation_angle,
+    rotation_exp,
+    rotation_log,
+    skew,
+    transform,
+)
 from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian, unwrapped
 
 STARTS = 12
@@ -27,7 +37,7 @@ REFUSED = (0.01, np.radians(1.0))
 widened explain less."""
 TO_REST = 0.5
 """Share of the way to its rest posture that a redundant arm goes in a step."""
-MISSED_WEIGHT, REST_WEIGHT = 1e10, 0.05
+MISFIT_WEIGHT, REST_WEIGHT = 1e10, 0.05
 """Of the squared misfit (m²) and the squared distance from rest (rad²), beside squared change between poses."""
 TOOL_STD = (0.15, 1.0)
 """m, rad: weak prior on an unknown tool."""
@@ -44,21 +54,21 @@ class Posture:
     """Joint angles of gripper poses, and the misfit."""
 
     joints: Float[ndarray, "n dof"]
-    flange_from_tool: Float[ndarray, "4 4"]
+    flange_from_tool: Transform
     """Given, the identity, or estimated."""
-    missed_m: Float[ndarray, " n"]
-    missed_rad: Float[ndarray, " n"]
+    misfit_m: Float[ndarray, " n"]
+    misfit_rad: Float[ndarray, " n"]
 
     @property
     def fits(self) -> bool:
         """Whether the arm reaches every pose."""
-        return bool((self.missed_m < FITS[0]).all() and (self.missed_rad < FITS[1]).all())
+        return bool((self.misfit_m < FITS[0]).all() and (self.misfit_rad < FITS[1]).all())
 
 
 def inverse_kinematics(
     arm: Arm,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"] | None = None,
+    flange_from_tool: Transform | None = None,
     seed: int = 0,
 ) -> Posture:
     """Joint angles (n,dof) within the limits, continuous over the poses, and the misfit of each pose.
@@ -72,26 +82,24 @@ def inverse_kinematics(
     if posture.fits or flange_from_tool is not None:
         return posture
     tried = [posture]
-    for start in (np.eye(4), *(transform(rotation_exp(turn), shift) for shift, turn in TOOLS)):
+    for start in (np.eye(4), *(transform(rotation_exp(vector), shift) for shift, vector in TOOLS)):
         first = _posture(arm, base_from_gripper, start, rng)
         joints, found = _with_tool(arm, base_from_gripper, first.joints, start)
         tried.append(_posture(arm, base_from_gripper, found, rng, joints))
         if tried[-1].fits:
             break
-    return min(tried, key=lambda one: float((one.missed_m**2 + (ARM * one.missed_rad) ** 2).sum()))
+    return min(tried, key=lambda one: float((one.misfit_m**2 + (ARM * one.misfit_rad) ** 2).sum()))
 
 
 def required_posture(
-    arm: Arm,
-    base_from_gripper: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"] | None = None,
+    arm: Arm, base_from_gripper: Float[ndarray, "n 4 4"], flange_from_tool: Transform | None = None
 ) -> Posture:
     """`inverse_kinematics`; InputError with the misfit where the poses do not fit the arm."""
     posture = inverse_kinematics(arm, base_from_gripper, flange_from_tool)
-    if posture.missed_m.max() > REFUSED[0] * arm.reach or posture.missed_rad.max() > REFUSED[1]:
+    if posture.misfit_m.max() > REFUSED[0] * arm.reach or posture.misfit_rad.max() > REFUSED[1]:
         raise InputError(
-            f"poses do not fit a {arm.name}: {1e3 * posture.missed_m.max():.0f} mm, "
-            f"{np.degrees(posture.missed_rad.max()):.1f}° off; name another robot, or leave it out"
+            f"poses do not fit a {arm.name}: {1e3 * posture.misfit_m.max():.0f} mm, "
+            f"{np.degrees(posture.misfit_rad.max()):.1f}° off; name another robot, or leave it out"
         )
     return posture
 
@@ -141,15 +149,15 @@ def _error(
 ) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n 6 dof"]]:
     """Difference to the pose in base axes, rotations times geometry.ARM (m), and the Jacobian of the gripper."""
     now, jacobian = kinematic_jacobian(arm, joints)
-    turn = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
+    rotation = rotation_log(base_from_gripper[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
     jacobian[:, 3:] *= ARM
-    return np.concatenate([base_from_gripper[:, :3, 3] - now[:, :3, 3], ARM * turn], axis=1), jacobian
+    return np.concatenate([base_from_gripper[:, :3, 3] - now[:, :3, 3], ARM * rotation], axis=1), jacobian
 
 
 def _posture(
     arm: Arm,
     base_from_tool: Float[ndarray, "n 4 4"],
-    flange_from_tool: Float[ndarray, "4 4"],
+    flange_from_tool: Transform,
     rng: np.random.Generator,
     known: Joints | None = None,
 ) -> Posture:
@@ -160,13 +168,13 @@ def _posture(
         starts = np.concatenate([known[:, None], starts], axis=1)
     n, s, dof = starts.shape
     found = reach_toward(arm, np.repeat(base_from_gripper, s, 0), starts.reshape(-1, dof)).reshape(n, s, dof)
-    missed = _missed(arm, found.reshape(-1, dof), np.repeat(base_from_tool, s, 0), flange_from_tool)
-    joints = _path(arm, found, ((missed / (1.0, 1 / ARM)) ** 2).sum(1).reshape(n, s))
-    return Posture(joints, flange_from_tool, *_missed(arm, joints, base_from_tool, flange_from_tool).T)
+    misfit = _misfit(arm, found.reshape(-1, dof), np.repeat(base_from_tool, s, 0), flange_from_tool)
+    joints = _path(arm, found, ((misfit / (1.0, 1 / ARM)) ** 2).sum(1).reshape(n, s))
+    return Posture(joints, flange_from_tool, *_misfit(arm, joints, base_from_tool, flange_from_tool).T)
 
 
-def _missed(
-    arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Float[ndarray, "4 4"]
+def _misfit(
+    arm: Arm, joints: Joints, base_from_tool: Float[ndarray, "n 4 4"], flange_from_tool: Transform
 ) -> Float[ndarray, "n 2"]:
     """Distance (m) and angle (rad) from each pose."""
     off = inverse(forward_kinematics(arm, joints) @ flange_from_tool) @ base_from_tool
@@ -182,9 +190,9 @@ def _starts(arm: Arm, n: int, rng: np.random.Generator) -> Float[ndarray, "n s d
     return starts
 
 
-def _path(arm: Arm, found: Float[ndarray, "n s dof"], missed: Float[ndarray, "n s"]) -> Joints:
+def _path(arm: Arm, found: Float[ndarray, "n s dof"], misfit: Float[ndarray, "n s"]) -> Joints:
     """One solution a pose, with the least change between poses (Viterbi), near the rest posture."""
-    own = MISSED_WEIGHT * missed + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
+    own = MISFIT_WEIGHT * misfit + REST_WEIGHT * (_change(arm, arm.rest, found) ** 2).sum(-1)
     cost, back = own[0], []
     for k in range(1, len(found)):
         total = cost[:, None] + (_change(arm, found[k - 1][:, None], found[k][None]) ** 2).sum(-1)
@@ -210,18 +218,18 @@ def _change(
 
 
 def _with_tool(
-    arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Float[ndarray, "4 4"]
-) -> tuple[Joints, Float[ndarray, "4 4"]]:
+    arm: Arm, base_from_tool: Float[ndarray, "n 4 4"], joints: Joints, flange_from_tool: Transform
+) -> tuple[Joints, Transform]:
     """Joint angles and one tool together: Gauss-Newton, the angles of each pose eliminated."""
     weight = 1e-6 / np.repeat(np.square(TOOL_STD), 3)
     for _ in range(STEPS):
         error, jacobian = _error(arm, joints, base_from_tool @ inverse(flange_from_tool))
-        turn = base_from_tool[:, :3, :3] @ flange_from_tool[:3, :3].T
+        rotation = base_from_tool[:, :3, :3] @ flange_from_tool[:3, :3].T
         by_tool = np.zeros((len(joints), 6, 6))
         # A twist of the tool, in flange axes, moves the required gripper pose back by this.
-        by_tool[:, :3, :3] = turn
-        by_tool[:, :3, 3:] = turn @ skew(flange_from_tool[:3, 3])
-        by_tool[:, 3:, 3:] = ARM * turn
+        by_tool[:, :3, :3] = rotation
+        by_tool[:, :3, 3:] = rotation @ skew(flange_from_tool[:3, 3])
+        by_tool[:, 3:, 3:] = ARM * rotation
         transposed = np.swapaxes(jacobian, 1, 2)
         damping = 0.5 * (error**2).sum(1) + 1e-9
         own = np.linalg.inv(jacobian @ transposed + damping[:, None, None] * np.eye(6))

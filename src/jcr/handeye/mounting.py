@@ -31,7 +31,7 @@ class LengthError(InputError):
     """Gripper positions are by one factor longer or shorter than the arm's; no image would show it."""
 
 
-def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Float[ndarray, "n 4 4"]) -> Arm:
+def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """The arm with the base and tool with which its forward kinematics gives the reported poses best.
 
     Where the motions do not determine them, those nearest the arm's own. InputError where angles and poses disagree,

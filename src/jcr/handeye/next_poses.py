@@ -1,4 +1,4 @@
-"""Which gripper poses to add: those that tell most of a seen point, the rotation and the scale, before any image.
+"""Which gripper poses to add: those that show most of a seen point, the rotation and the scale, before any image.
 
 The information of a pose depends on where it is, not on what it shows, so candidates in reach that look at
 the scene are added one by one, each time the one that leaves the least uncertainty (A-optimal design). That is of random
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.geometry import inverse, motion_length, nearest_to_lines, rotation_exp, transform
+from jcr.geometry import Transform, inverse, motion_length, nearest_to_lines, rotation_exp, transform
 from jcr.handeye.equation import ASSUMED_NOISE, Poses, most_informative, point_ahead, pose_information
 
 CANDIDATES = 600
@@ -20,7 +20,7 @@ SCENE_AHEAD = (0.1, 2.0)
 def next_poses(
     base_from_gripper: Poses,
     count: int,
-    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    gripper_from_camera: Transform | None = None,
     noise: tuple[float, float] = ASSUMED_NOISE,
     reach: Float[ndarray, "2 3"] | None = None,
     seed: int = 0,
@@ -47,10 +47,7 @@ def nearest(poses: Float[ndarray, "c 4 4"], existing: Poses) -> Int[ndarray, " c
 
 
 def candidates(
-    base_from_gripper: Poses,
-    x: Float[ndarray, "4 4"],
-    reach: Float[ndarray, "2 3"] | None,
-    rng: np.random.Generator,
+    base_from_gripper: Poses, x: Transform, reach: Float[ndarray, "2 3"] | None, rng: np.random.Generator
 ) -> Float[ndarray, "k 4 4"]:
     """Gripper poses in reach whose cameras look at the scene from about as far as the capture did."""
     camera = base_from_gripper @ x
@@ -93,7 +90,7 @@ def looked_at(camera: Poses) -> tuple[Float[ndarray, "3"], Float[ndarray, " n"]]
     return scene, distance
 
 
-def assumed_camera(base_from_gripper: Poses) -> Float[ndarray, "4 4"]:
+def assumed_camera(base_from_gripper: Poses) -> Transform:
     """gripper_from_camera before anything is known of it: a camera at the gripper that looks along one of its axes.
 
     Along the one whose lines pass nearest to one point ahead, by their distance from it over the way to it: views of a
@@ -119,5 +116,5 @@ def _facing(rotation: Float[ndarray, "n 3 3"], toward: Float[ndarray, "n 3"]) ->
     z, goal = rotation[:, :, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True)
     cross = np.cross(z, goal)
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
-    turn = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
-    return rotation_exp(cross / np.maximum(sine, 1e-12) * turn) @ rotation
+    angle = np.arctan2(sine, (z * goal).sum(1, keepdims=True))
+    return rotation_exp(cross / np.maximum(sine, 1e-12) * angle) @ rotation

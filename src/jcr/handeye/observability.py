@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import ARM, transform
-from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, residuals
-from jcr.handeye.fit import Cues, Poses
+from jcr.geometry import ARM, Transform, transform
+from jcr.handeye.equation import BASE_ROTATION, ROTATION, SCALE, Poses, residuals
+from jcr.handeye.fit import Cues
 from jcr.records import Excitation, Finding, Kind, Observability
 
 MIN_SPREAD = 0.1
-"""Metres; camera centres closer together than this say little of scale."""
+"""Metres; camera centres closer together than this show little of scale."""
 WEAK = 0.06
 """Excitation below which a direction counts as unseen: 3 degrees of deviation give 0.03 to 0.05."""
 EXACT = 0.005
@@ -26,7 +26,7 @@ EXACT = 0.005
 
 
 def excitation(
-    base_from_gripper: Poses, gripper_from_camera: Float[ndarray, "4 4"] | None, cues: Cues | None = None
+    base_from_gripper: Poses, gripper_from_camera: Transform | None, cues: Cues | None = None
 ) -> Excitation:
     """What gripper poses (n,4,4) can see of X and λ; without an X the camera is put at the gripper."""
     n = len(base_from_gripper)
@@ -54,11 +54,11 @@ def excitation(
 
 def observability(
     base_from_gripper: Poses,
-    gripper_from_camera: Float[ndarray, "4 4"] | None = None,
+    gripper_from_camera: Transform | None = None,
     recon_from_camera: Poses | None = None,
     cues: Cues | None = None,
 ) -> Observability:
-    """A finding for each unseen direction; camera poses, if given, tell an orbit from a fixed tool."""
+    """A finding for each unseen direction; camera poses, if given, distinguish an orbit from a fixed tool."""
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
@@ -83,12 +83,9 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 
 
 def _explained(
-    base_from_gripper: Poses,
-    recon_from_camera: Poses | None,
-    found: Excitation,
-    unseen: Bool[ndarray, "7"],
+    base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
 ) -> list[Finding]:
-    # The mean rotation shrinks every direction that turns; one it keeps long is a common axis.
+    # The mean rotation shrinks every direction that rotates; one it keeps long is a common axis.
     u, length, _ = np.linalg.svd(base_from_gripper[:, :3, :3].mean(0))
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():

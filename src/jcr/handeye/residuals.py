@@ -4,13 +4,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from jcr.geometry import inverse, rotation_angle, scale_translation
+from jcr.geometry import Transform, inverse, rotation_angle, scale_translation
 
 
 def paper_residuals(
     base_from_gripper: Float[ndarray, "n 4 4"],
     recon_from_camera: Float[ndarray, "n 4 4"],
-    gripper_from_camera: Float[ndarray, "4 4"],
+    gripper_from_camera: Transform,
     scale: float,
     used: Bool[ndarray, " n"],
 ) -> tuple[float, float]:

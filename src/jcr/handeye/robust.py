@@ -18,9 +18,11 @@ from numpy import ndarray
 
 from jcr.geometry import ARM, rotation_angle, transform
 from jcr.handeye.closed_form import closed_form, initial_estimate, motions, sine_axis
-from jcr.handeye.equation import predict
-from jcr.handeye.fit import Cues, PoseFit, Poses, fit_poses
+from jcr.handeye.equation import Poses, predict
+from jcr.handeye.fit import Cues, PoseFit, PoseProblem, fit_poses
 from jcr.handeye.systematic import smooth_errors
+
+Images = Bool[ndarray, " n"]
 
 SHARE_RIGHT = 0.65
 """Share of images that the trimmed fit relies on; up to the rest may be wrong."""
@@ -43,118 +45,113 @@ def robust_fit(
     cues: Cues | None = None,
     camera_covariance: Float[ndarray, "r r"] | None = None,
     systematic: Float[ndarray, "r r"] | None = None,
-) -> tuple[PoseFit, Bool[ndarray, " n"]]:
+) -> tuple[PoseFit, Images]:
     """The fit to the images that agree with each other, and which those are.
 
     With fewer than five images there is nothing to vote with, and all are kept. The arguments are those of fit_poses.
     Solved in a frame at the middle of the cameras and in their extent as unit: a frame far away makes a rotation about
     its origin look like a translation.
     """
-    n, centers = len(base_from_gripper), recon_from_camera[:, :3, 3]
+    n, centers, cues = len(base_from_gripper), recon_from_camera[:, :3, 3], cues or Cues()
     middle = centers.mean(0)
     unit = float(np.sqrt(((centers - middle) ** 2).sum(1).mean()))
     unit = unit if unit > 1e-12 * np.abs(centers).max() else 1.0
     recon_from_camera = transform(recon_from_camera[:, :3, :3], (centers - middle) / unit)
-    if cues is not None and cues.scale is not None:
+    if cues.scale is not None:
         cues = replace(cues, scale=(unit * cues.scale[0], cues.scale[1]))
     if camera_covariance is not None:
         per_unit = np.tile(np.repeat([1 / unit, 1.0], 3), n)
         camera_covariance = per_unit[:, None] * camera_covariance * per_unit
-    given = (
-        noise,
-        cues,
-        camera_covariance,
-        smooth_errors(base_from_gripper) if systematic is None else systematic,
+    every = PoseProblem(
+        base_from_gripper=base_from_gripper,
+        recon_from_camera=recon_from_camera,
+        used=np.ones(n, dtype=bool),
+        systematic=smooth_errors(base_from_gripper) if systematic is None else systematic,
+        noise=noise,
+        cues=cues,
+        camera_covariance=camera_covariance,
     )
+    fits: dict[bytes, PoseFit] = {}
 
-    fits: dict[tuple[bytes, bool], PoseFit] = {}
+    def fit_to(used: Images, averaged: bool = False) -> PoseFit:
+        start = initial_estimate(base_from_gripper, recon_from_camera, used.astype(float))
+        return fit_poses(replace(every, used=used), start, averaged)
 
-    def fitted(trusted: Bool[ndarray, " n"], averaged: bool = False) -> PoseFit:
-        key = trusted.tobytes(), averaged
-        if key not in fits:
-            start = initial_estimate(base_from_gripper, recon_from_camera, trusted.astype(float))
-            fits[key] = fit_poses(
-                base_from_gripper, recon_from_camera, start, trusted, *given, averaged=averaged
-            )
-        return fits[key]
+    def fitted(used: Images) -> PoseFit:
+        if used.tobytes() not in fits:
+            fits[used.tobytes()] = fit_to(used)
+        return fits[used.tobytes()]
 
-    trusted = np.ones(n, dtype=bool)
+    used = every.used
     if n >= 5:
-        searches = (
-            _left(fitted, trusted),
-            _joined(fitted, least_trimmed(base_from_gripper, recon_from_camera)[0]),
-        )
-        trusted = max(searches, key=lambda found: found[1])[0]
-    fit = fitted(trusted, averaged=True)
+        fewest = least_trimmed(base_from_gripper, recon_from_camera)[0]
+        used = max(_left(fitted, used), _joined(fitted, fewest), key=lambda found: found[1])[0]
+    fit = fit_to(used, averaged=True)
     scale, z = fit.scale / unit, fit.base_from_recon
     z = transform(z[:3, :3], z[:3, 3] - z[:3, :3] @ (scale * middle))
-    return replace(fit, scale=scale, base_from_recon=z), trusted
+    return replace(fit, scale=scale, base_from_recon=z), used
 
 
-def _joined(
-    fitted: Callable[[Bool[ndarray, " n"]], PoseFit], trusted: Bool[ndarray, " n"]
-) -> tuple[Bool[ndarray, " n"], float]:
-    """The images to trust, and the log evidence of that: those join `trusted` that are likelier sound than wrong, or the
+def _joined(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, float]:
+    """The images to use, and the log evidence of that: those join `used` that are likelier sound than wrong, or the
     likeliest of all, as long as the evidence grows.
     """
-    fit = fitted(trusted)
-    best = _evidence(fit, trusted)
-    while not trusted.all():
-        _, spread = np.linalg.slogdet(fit.missed_covariance)
-        likelier = np.where(trusted, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
+    fit = fitted(used)
+    best = _evidence(fit, used)
+    while not used.all():
+        _, spread = np.linalg.slogdet(fit.leave_one_out_covariance)
+        likelier = np.where(used, -np.inf, -(_distance(fit) + spread) / 2 - _log_wrong(fit))
         for joining in (likelier > 0, likelier == likelier.max()):
             if not joining.any():
                 continue
-            changed = trusted | joining
+            changed = used | joining
             fit = fitted(changed)
             evidence = _evidence(fit, changed)
             if evidence > best:
                 break
         else:
             break
-        trusted, best = changed, evidence
-    return trusted, best
+        used, best = changed, evidence
+    return used, best
 
 
-def _left(
-    fitted: Callable[[Bool[ndarray, " n"]], PoseFit], trusted: Bool[ndarray, " n"]
-) -> tuple[Bool[ndarray, " n"], float]:
+def _left(fitted: Callable[[Images], PoseFit], used: Images) -> tuple[Images, float]:
     """The same from the other side: the farthest leaves, as long as the evidence grows and more than four are left."""
-    fit = fitted(trusted)
-    best = _evidence(fit, trusted)
-    while trusted.sum() > 4:
-        changed = trusted.copy()
-        changed[np.where(trusted, _distance(fit), -np.inf).argmax()] = False
+    fit = fitted(used)
+    best = _evidence(fit, used)
+    while used.sum() > 4:
+        changed = used.copy()
+        changed[np.where(used, _distance(fit), -np.inf).argmax()] = False
         fit = fitted(changed)
         evidence = _evidence(fit, changed)
         if evidence <= best:
             break
-        trusted, best = changed, evidence
-    return trusted, best
+        used, best = changed, evidence
+    return used, best
 
 
-def _evidence(fit: PoseFit, trusted: Bool[ndarray, " n"]) -> float:
-    return fit.log_evidence + float(_log_wrong(fit)[~trusted].sum())
+def _evidence(fit: PoseFit, used: Images) -> float:
+    return fit.log_evidence + float(_log_wrong(fit)[~used].sum())
 
 
 def _distance(fit: PoseFit) -> Float[ndarray, " n"]:
     """Squared, of each pose from a fit without it, in what noise lets expect."""
-    gap = np.linalg.solve(fit.missed_covariance, fit.missed[..., None])[..., 0]
-    return np.einsum("ni,ni->n", fit.missed, gap)
+    gap = np.linalg.solve(fit.leave_one_out_covariance, fit.leave_one_out[..., None])[..., 0]
+    return np.einsum("ni,ni->n", fit.leave_one_out, gap)
 
 
 def _log_wrong(fit: PoseFit) -> Float[ndarray, " n"]:
     """Of each pose, the log density of how far it is off if it is wrong, times (2π)^3: of any size alike, in any
     direction; and the odds that it is.
     """
-    off = np.linalg.norm(fit.missed.reshape(-1, 2, 3), axis=2)
+    off = np.linalg.norm(fit.leave_one_out.reshape(-1, 2, 3), axis=2)
     least, most = np.array(LEAST_WRONG), np.array(MOST_WRONG)
     density = -np.log(4 * np.pi * np.log(most / least)) - 3 * np.log(np.maximum(off, least))
     odds = np.log(WRONG / (1 - WRONG)) + 3 * np.log(2 * np.pi)
     return np.where((off < least).all(1), -np.inf, density.sum(1) + odds)
 
 
-def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Bool[ndarray, " n"], float]:
+def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[Images, float]:
     """The subset of images with the least trimmed squared error over all candidate triples, and its root mean (m)."""
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
@@ -203,7 +200,7 @@ def _congruent_triples(a: Float[ndarray, "n n 4 4"], b: Float[ndarray, "n n 4 4"
     gap = np.abs(rotation_angle(a[..., :3, :3]) - rotation_angle(b[..., :3, :3]))
     i, j, k = np.array(list(combinations(range(n), 3))).T
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
-    # Two motions about one axis fix nothing: prefer triples that turn about two.
+    # Two motions about one axis fix nothing: prefer triples that rotate about two.
     axes_ij, axes_ik = sine_axis(a[i, j, :3, :3]), sine_axis(a[i, k, :3, :3])
     spread = np.linalg.norm(np.cross(axes_ij, axes_ik), axis=1)
     # The 0.3 quantile of all gaps comes from pairs of sound images even when 30 % of the images are wrong.

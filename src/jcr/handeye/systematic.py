@@ -20,7 +20,7 @@ from jcr.geometry import rotation_angle
 from jcr.handeye.equation import SCALE, Poses
 from jcr.handeye.inverse_kinematics import required_posture
 from jcr.handeye.mounting import mounted_arm
-from jcr.handeye.robots import Arm, ErrorSizes, Joints, error_jacobian, error_std, with_tool
+from jcr.handeye.robots import Arm, Joints, error_jacobian, error_std, with_tool
 
 REACH = 0.45
 """m. A joint's error shows in the gripper's position as in its rotation (rad) times the reach behind it."""
@@ -79,7 +79,7 @@ def arm_errors(arm: Arm, joints: Joints) -> Float[ndarray, "s s"]:
 
     Joint offsets and link errors of size one, at joint angles (n,dof) in rad.
     """
-    columns = error_jacobian(arm, joints) * error_std(arm, ErrorSizes(1.0, LINK_PER_JOINT))
+    columns = error_jacobian(arm, joints) * error_std(arm, 1.0, LINK_PER_JOINT)
     stacked = columns.reshape(-1, columns.shape[2])
     return stacked @ stacked.T
 
@@ -117,7 +117,7 @@ class Region:
         """Covariance (p,p) of the unknowns for other poses of the same region, from E[e'e'ᵀ] of each of m used poses.
 
         The poses of the capture are a sample of the region: a regression on them differs from one on the region by
-        what their residuals tell, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
+        what their residuals show, corrected for each pose's own leverage (MacKinnon and White, J. Econometrics 29,
         1985, "HC3").
         """
         own, m = self._corrected, second_moment.shape[-3]

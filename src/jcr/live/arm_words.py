@@ -84,5 +84,5 @@ def joints_at(arm: Arm, path: Path, goal: Float[ndarray, "4 4"]) -> Float[ndarra
             return found[0]
         return None
     posture = inverse_kinematics(arm, np.concatenate([path.base_from_gripper, goal[None]]))
-    reached = posture.missed_m[-1] < FITS[0] and posture.missed_rad[-1] < FITS[1]
+    reached = posture.misfit_m[-1] < FITS[0] and posture.misfit_rad[-1] < FITS[1]
     return posture.joints[-1] if reached else None

@@ -115,6 +115,7 @@ class LiveFolder:
             files = [name, self.thumbnail(name), *filter(None, [self.depths[row]])]
             for of_images in (self.names, self.poses, self.joints, self.depths, self.times_s):
                 del of_images[row]
+            self._stamped_before = tuple(one for one in self._stamped_before if one != name)
             self._write()
         for file in files:
             contained(self.folder, file, str(self.folder)).unlink(missing_ok=True)

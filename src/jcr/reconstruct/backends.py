@@ -1,7 +1,7 @@
 """The back ends: each makes the same Reconstruction of a capture. A new one is a file and a row of this table."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,7 +13,7 @@ from numpy import ndarray
 from jcr.errors import InputError
 from jcr.extras import extra, install, is_installed
 from jcr.progress import Progress
-from jcr.reconstruct.hub import HUB_FILES, cached_files
+from jcr.reconstruct.hub import HUB_FILES, HUB_ID, Weights, cached_files
 from jcr.records import CameraEvidence, Capture, Reconstruction
 
 CC_BY_NC_SA = "CC BY-NC-SA 4.0, non-commercial use only (https://creativecommons.org/licenses/by-nc-sa/4.0/)"
@@ -32,21 +32,22 @@ def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress 
 
 
 def _direct(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.direct.direct import reconstruct
+    from jcr.reconstruct.direct.direct import reconstruct_direct
 
-    return reconstruct(capture, progress, memory_gb=options.memory_gb)
+    return reconstruct_direct(capture, progress, memory_gb=options.memory_gb)
 
 
 def _dust3r(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     """MASt3R, too: its files bring one more head, which is left out, and points in metres."""
     extra("torch", "networks", f"--backend {options.backend}")
-    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct
+    from jcr.reconstruct.dust3r.dust3r import Dust3rOptions, reconstruct_dust3r
     from jcr.reconstruct.dust3r.pair_graph import PairOptions
 
-    weights, licence = weights_of(options)
     pairs = PairOptions(pair_graph=options.pair_graph, memory_gb=options.memory_gb)
-    made = Dust3rOptions(weights, licence, device_of(options), pairs, backend=options.backend)
-    return reconstruct(capture, made, progress)
+    made = Dust3rOptions(
+        weights=weights_of(options), device=device_of(options), pairs=pairs, backend=options.backend
+    )
+    return reconstruct_dust3r(capture, made, progress)
 
 
 def _views_at_once(
@@ -55,64 +56,63 @@ def _views_at_once(
     """All models that see every view at once: their rows name the adapter."""
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import da3, mapanything
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions, reconstruct_views_at_once
 
     row = BACKENDS[options.backend]
     made = ViewsOptions(
-        row.name,
-        mapanything.load if row.name == "mapanything" else da3.load,
-        weights_folder(options),
-        weights_of(options)[1],
-        Cost(*row.cost),
-        row.takes_poses,
-        device_of(options),
-        options.memory_gb,
+        backend=row.name,
+        load=mapanything.load if row.name == "mapanything" else da3.load,
+        weights=weights_of(options),
+        cost=Cost(*row.cost),
+        takes_poses=row.takes_poses,
+        device=device_of(options),
+        memory_gb=options.memory_gb,
     )
-    return reconstruct(capture, made, progress)
+    return reconstruct_views_at_once(capture, made, progress)
 
 
 def _moge(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     extra("torch", "networks", f"--backend {options.backend}")
     from jcr.reconstruct.views_at_once import moge
-    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct_single_views
 
     def cameras(capture: Capture, progress: Progress | None) -> Reconstruction:
         return _colmap(capture, replace(options, backend="colmap"), progress)
 
-    weights, licence = weights_folder(options), weights_of(options)[1]
-    made = SingleViewsOptions("moge", moge.load, weights, licence, cameras, device_of(options))
-    return reconstruct(capture, made, progress)
+    made = SingleViewsOptions(
+        load=moge.load, weights=weights_of(options), cameras=cameras, device=device_of(options)
+    )
+    return reconstruct_single_views(capture, made, progress)
 
 
 def _marker(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.marker import reconstruct
+    from jcr.reconstruct.marker import reconstruct_marker
 
     if options.board is None:
         raise InputError("--backend marker: name the board with --board, such as chessboard:9x6:0.025")
-    return reconstruct(capture, options.board, progress, memory_gb=options.memory_gb)
+    return reconstruct_marker(capture, options.board, progress, memory_gb=options.memory_gb)
 
 
 def _predictions(
     capture: Capture, options: "ReconstructOptions", progress: Progress | None
 ) -> Reconstruction:
-    from jcr.reconstruct.predictions import PredictionsOptions, reconstruct
+    from jcr.reconstruct.predictions import reconstruct_predictions
 
     if options.predictions is None:
         raise InputError(
             "--backend predictions: name the file with --predictions FILE.npz (jcr docs predictions)"
         )
-    return reconstruct(capture, PredictionsOptions(options.predictions, options.memory_gb), progress)
+    return reconstruct_predictions(capture, options.predictions, progress, memory_gb=options.memory_gb)
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
     from jcr.reconstruct.colmap import ColmapOptions
-    from jcr.reconstruct.given import reconstruct
+    from jcr.reconstruct.given import reconstruct_given
 
     if options.cameras is None:
         raise InputError("--backend given: name the COLMAP model or transforms.json with --cameras PATH")
     made = ColmapOptions(seed=options.seed, memory_gb=options.memory_gb)
-    return reconstruct(capture, options.cameras, made, progress)
+    return reconstruct_given(capture, options.cameras, made, progress)
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,9 @@ class Backend:
     reconstruct: Callable[..., Reconstruction]
     """A function of capture, ReconstructOptions and progress; its heavy imports happen inside."""
     licence: str
+    _: KW_ONLY
     metric: bool | None = False
-    """Whether its scale is metres already; None: its input says."""
+    """Whether its scale is metres already; None: its input has a flag for it."""
     auto: bool = False
     """Whether `auto` may take it, where its package and its weights are on this machine."""
     tests_camera: bool = True
@@ -144,6 +145,8 @@ class Backend:
     """Whether its input counts images in the capture's own order."""
     accuracy: str = ""
     """As measured, and where that stands; empty: not measured here."""
+    revision: str = ""
+    """The commit of its weights that `jcr models get` downloads."""
     files: tuple[str, ...] = HUB_FILES
     """Of its weights on the hub."""
     parameters: int = 0
@@ -154,7 +157,7 @@ class Backend:
     takes_poses: bool = False
     """Whether it can be shown camera poses."""
     cost: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of an any-view model: views_at_once.cost.Cost."""
+    """Of an any-view model: views_at_once.Cost, its fields in their order."""
 
     @property
     def sees_all_views(self) -> bool:
@@ -172,7 +175,7 @@ class Backend:
 
     def has_weights(self) -> bool:
         """Whether its published weights are on this machine, or none are needed; nothing is downloaded."""
-        return not self.hub_id or bool(cached_files(self.hub_id, self.files))
+        return not self.hub_id or bool(cached_files(self.hub_id, self.files, self.revision))
 
 
 BACKENDS: dict[str, Backend] = {
@@ -187,6 +190,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights", "pair_graph"),
             hub_id="naver/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric",
+            revision="06e7259f34c3060f322df5cb0c7b9094f57e41fc",
             package="torch",
             install=install("networks"),
             parameters=689,
@@ -202,6 +206,7 @@ BACKENDS: dict[str, Backend] = {
             options=("weights", "pair_graph"),
             selected_by="weights",
             hub_id="naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+            revision="61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3",
             package="torch",
             install=install("networks"),
             parameters=571,
@@ -225,6 +230,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-BASE",
+            revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
             package="depth_anything_3",
             install=INSTALL_DA3,
             parameters=135,
@@ -240,6 +246,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="depth-anything/DA3-SMALL",
+            revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
             package="depth_anything_3",
             install=INSTALL_DA3,
             parameters=34,
@@ -256,6 +263,7 @@ BACKENDS: dict[str, Backend] = {
             tests_camera=False,
             options=("weights",),
             hub_id="facebook/map-anything-apache",
+            revision="00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a",
             package="mapanything",
             install="pip install git+https://github.com/facebookresearch/map-anything",
             takes_poses=True,
@@ -277,6 +285,7 @@ BACKENDS: dict[str, Backend] = {
             metric=True,
             options=("weights",),
             hub_id="Ruicheng/moge-2-vitl",
+            revision="39c4d5e957afe587e04eec59dc2bcc3be5ecd968",
             package="moge",
             install="pip install --no-deps dlr-moge dlr-utils3d",
             files=("model.pt",),
@@ -332,6 +341,7 @@ class ReconstructOptions:
     backend: BackendName = "auto"
     """auto tries the back ends of this list that need no extra input and whose package and weights are on this machine
     (jcr models), in this order, and the next only if the result is rejected."""
+    _: KW_ONLY
     board: Annotated[str | None, tyro.conf.arg(metavar="KIND:SIZE")] = None
     """The board or tags to look for, in metres; selects the back end marker: charuco:7x5:0.030:0.022:DICT_4X4_50,
     chessboard:9x6:0.025 (inner corners), circles:4x11:0.020, aruco:0.050:DICT_4X4_50, apriltag:0.050:36h11."""
@@ -495,34 +505,29 @@ def with_cameras_of(capture: Capture, options: ReconstructOptions) -> Reconstruc
     return replace(options, cameras=capture.cameras.resolve()) if free else options
 
 
-def weights_of(options: ReconstructOptions) -> tuple[str, str]:
-    """The weights of the network that `options` names, a path or hub id, and their licence."""
-    row = BACKENDS[options.backend]
-    weights = options.weights or row.hub_id
-    for published in BACKENDS.values():
-        if published.hub_id == weights:
-            return weights, published.licence
-    if "pair_graph" not in row.options:
-        return weights, f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
-    return weights, f"unknown, ask who made the file; the weights published by naver are {CC_BY_NC_SA}"
-
-
-def weights_folder(options: ReconstructOptions) -> Path:
-    """The folder of an any-view model's weights: the one that was named, or where `jcr models get` put them.
+def weights_of(options: ReconstructOptions) -> Weights:
+    """The weights of the network that `options` names: a path that was given, or what `jcr models get` downloaded.
 
     Nothing is downloaded. Raises InputError, with the command that gets them, where they are not on this machine.
     """
     row = BACKENDS[options.backend]
-    if options.weights is not None and Path(options.weights).is_dir():
-        return Path(options.weights)
-    named = options.weights or row.hub_id
-    if cached := cached_files(named, row.files):
-        return cached[0].parent
-    if named == row.hub_id:
-        raise InputError(f"--backend {row.name}: its weights are not on this machine; {weights_command(row)}")
-    raise InputError(
-        f"--weights {named}: no such folder, nor such weights in the cache; {weights_command(row)}"
+    name = options.weights or row.hub_id
+    published = next((other for other in BACKENDS.values() if other.hub_id == name), None)
+    licence = (
+        published.licence
+        if published
+        else f"unknown, ask who made the file; that of {row.hub_id} is {row.licence}"
     )
+    if options.weights is not None and Path(name).exists():
+        return Weights(Path(name), name, licence)
+    if cached := cached_files(name, (published or row).files, published and published.revision):
+        return Weights(cached[0].parent, name, licence)
+    if published:
+        raise InputError(f"{name}: not on this machine; {weights_command(published)}")
+    remedy = "give a file, a folder or a hub id (jcr models)"
+    if HUB_ID.fullmatch(name) and Path(name).suffix not in (".pth", ".pt", ".safetensors"):
+        remedy = f"jcr models get {name} downloads them"
+    raise InputError(f"--weights {name}: no such weights on this machine; {remedy}")
 
 
 def weights_command(row: Backend) -> str:

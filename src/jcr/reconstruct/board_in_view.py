@@ -1,4 +1,4 @@
-"""Whether images show a calibration board or tags, and the --board that would use it: for those who did not say so."""
+"""Whether images show a calibration board or tags, and the --board that would use it, where none was given."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -26,7 +26,7 @@ LONG_SIDE_PX = 800
 
 
 def board_in_view(images: Sequence[UInt8[ndarray, "h w 3"]]) -> str | None:
-    """A --board for what the images show, with SIDE (and MARKER) for the lengths that nobody can see; None: nothing."""
+    """A --board for what the images show, with SIDE (and MARKER) for the lengths; None without a board."""
     chosen = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).astype(int))]
     grey = [_smaller(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in chosen]
     return _tags(grey) or _chessboard(grey)

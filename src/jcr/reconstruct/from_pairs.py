@@ -7,9 +7,9 @@ from numpy import ndarray
 
 from jcr.memory import MAP
 from jcr.progress import Progress, silent
+from jcr.reconstruct.global_alignment.align import align_with_robot
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.reconstruct.pointmap_matches import tracks_from_pairs
 from jcr.reconstruct.preprocess import PreparedImages
 from jcr.records import Intrinsics, Pointmaps, Reconstruction
@@ -52,7 +52,7 @@ def reconstruction_from_pairs(
     return Reconstruction(
         image_index=image_index,
         recon_from_camera=alignment.recon_from_camera,
-        intrinsics=images.lens or images.grid.original_intrinsics(pinhole),
+        intrinsics=images.intrinsics_of_capture or images.grid.original_intrinsics(pinhole),
         pointmaps=Pointmaps(
             intrinsics=pinhole,
             points_in_recon=points_in_recon,

@@ -1,7 +1,7 @@
 """The `given` back end: camera poses that somebody else found, a COLMAP model or a transforms.json.
 
 The model's own points are its tracks; where it has none (transforms.json), features are matched and triangulated
-with the cameras held.
+with the cameras fixed.
 """
 
 import tempfile
@@ -27,10 +27,10 @@ from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 MIN_POINTS = 50
 
 
-def reconstruct(
+def reconstruct_given(
     capture: Capture, cameras: Path, options: ColmapOptions, progress: Progress | None = None
 ) -> Reconstruction:
-    """The capture's images that the model at `cameras` knows, with its poses held.
+    """The capture's images that the model at `cameras` knows, with its poses fixed.
 
     Raises InputError when the model knows fewer than three, NotTrustedError when nothing can be triangulated.
     """
@@ -45,12 +45,12 @@ def reconstruct(
         )
     rows = [row for k in known if (row := row_of(capture.images[k])) is not None]
     recon_from_camera = recon_from_camera[rows]
-    lens = capture.intrinsics or reader.read_intrinsics(cameras, capture.image_size)
+    intrinsics = capture.intrinsics or reader.read_intrinsics(cameras, capture.image_size)
     plan(len(known), capture.image_size, options.memory_gb)
     tracks = _own_tracks(cameras, [names[row] for row in rows], capture.image_size)
     if len(tracks.points_in_recon) < MIN_POINTS:
         images = [read_image(capture.folder / capture.images[k]) for k in known]
-        tracks = _triangulated(images, lens, recon_from_camera, options, report)
+        tracks = _triangulated(images, intrinsics, recon_from_camera, options, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
         raise NotTrustedError(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
@@ -61,7 +61,7 @@ def reconstruct(
     return Reconstruction(
         image_index=np.array(known),
         recon_from_camera=recon_from_camera,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=tracks,
         backend="given",
         notes=notes,
@@ -92,15 +92,17 @@ def _own_tracks(cameras: Path, names: Sequence[str], size: tuple[int, int]) -> T
 
 def _triangulated(
     images: Sequence[UInt8[ndarray, "h w 3"]],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     recon_from_camera: Float[ndarray, "m 4 4"],
     options: ColmapOptions,
     report: Progress,
 ) -> Tracks:
-    """Points of matched features, with intrinsics and cameras held."""
+    """Points of matched features, with intrinsics and cameras fixed."""
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = extract(database, images, [lens], True, options.working_size_px, report, options.memory_gb)
+        cameras = extract(
+            database, images, [intrinsics], True, options.working_size_px, report, options.memory_gb
+        )
         report("matching", 0.0)
         match(database, options.seed)
         model = pycolmap.Reconstruction()
@@ -114,4 +116,4 @@ def _triangulated(
                 )
                 model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera_from_recon[:3]))
         model = pycolmap.triangulate_points(model, database, folder, Path(folder))
-        return tracks_of(model, range(1, len(images) + 1), (lens.width, lens.height))
+        return tracks_of(model, range(1, len(images) + 1), (intrinsics.width, intrinsics.height))

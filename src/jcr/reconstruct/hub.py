@@ -1,15 +1,43 @@
-"""Weights on the Hugging Face hub: which files they are, and whether they are on this machine."""
+"""Weights on the Hugging Face hub: whether they are on this machine, and the one place that downloads them.
 
+Cache, mirror, proxy, token and offline mode are those of huggingface_hub (HF_HOME, HF_ENDPOINT, HTTPS_PROXY, HF_TOKEN,
+HF_HUB_OFFLINE). Only `jcr models get` calls `download`; a run looks into the cache.
+"""
+
+import hashlib
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from jcr.extras import is_installed
+from jcr.errors import InputError
+from jcr.extras import extra, is_installed
 
 HUB_FILES = ("config.json", "model.safetensors")
+HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 
-def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES) -> list[Path]:
-    """Files of a hub id in the cache of this machine, without asking the network; empty unless all are there."""
+@dataclass(frozen=True)
+class Weights:
+    """Weights of a network on this machine."""
+
+    path: Path
+    """Their file, or the folder of their files."""
+    name: str
+    """The path or hub id that was asked for."""
+    licence: str
+
+    @property
+    def note(self) -> str:
+        """For the notes of what they were used for."""
+        return f"weights {self.name}: licence {self.licence}"
+
+
+def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES, revision: str | None = None) -> list[Path]:
+    """Files of a hub id in the cache of this machine: of `revision`, else of the newest one that was downloaded.
+
+    The network is not asked. Empty unless all are there.
+    """
     if not is_installed("huggingface_hub"):
         return []
     from huggingface_hub import constants
@@ -19,7 +47,65 @@ def cached_files(hub_id: str, names: Sequence[str] = HUB_FILES) -> list[Path]:
         return []
     from huggingface_hub import try_to_load_from_cache
 
-    # Not a path where a file is missing, or known to be missing on the hub.
-    found = [try_to_load_from_cache(hub_id, name) for name in names]
-    paths = [Path(path) for path in found if isinstance(path, str)]
-    return paths if len(paths) == len(names) else []
+    for commit in {revision: None, None: None}:
+        # Not a path where a file is missing, or known to be missing on the hub.
+        found = [
+            try_to_load_from_cache(hub_id, name, constants.HF_HUB_CACHE, revision=commit) for name in names
+        ]
+        if all(isinstance(path, str) for path in found):
+            return [Path(str(path)) for path in found]
+    return []
+
+
+def download(hub_id: str, names: Sequence[str], revision: str | None = None, quiet: bool = False) -> Path:
+    """The folder in the cache that holds the files of a hub id, of a commit or of the newest one.
+
+    What is in the cache is not downloaded again; every file is compared with its published checksum. Raises InputError
+    where the hub cannot be reached, has no such files, or sent other bytes than it publishes; these are deleted.
+    """
+    extra("huggingface_hub", "networks", "jcr models get")
+    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub.utils import disable_progress_bars
+
+    if constants.HF_HUB_OFFLINE:
+        raise InputError(f"{hub_id}: HF_HUB_OFFLINE is set, so nothing is downloaded; unset it")
+    if quiet:
+        disable_progress_bars()
+    try:
+        folder = Path(snapshot_download(hub_id, revision=revision, allow_patterns=list(names)))
+    except Exception as error:  # those of its transport (requests, httpx) differ by its version
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise InputError(
+            f"{hub_id}: not downloaded ({reason}); try again, check the network, HTTPS_PROXY, or set HF_ENDPOINT to a "
+            "mirror"
+        ) from None
+    for name in names:
+        path = folder / name
+        if not path.is_file():
+            raise InputError(f"{hub_id}: the hub has no {name} of it; ask for another --revision")
+        if not _is_as_published(path):
+            path.resolve().unlink()
+            path.unlink()
+            raise InputError(
+                f"{hub_id}: {name} has not the checksum that the hub publishes for it; it was deleted: try again, and "
+                "ask who runs the mirror or proxy in between"
+            )
+    return folder
+
+
+def _is_as_published(path: Path) -> bool:
+    """Whether a file has the checksum by which the hub's cache names it: SHA-256, or git's SHA-1 of a small file.
+
+    True where a system without symbolic links keeps no such name.
+    """
+    published = path.resolve().name
+    if re.fullmatch("[0-9a-f]{64}", published):
+        digest = hashlib.sha256()
+    elif re.fullmatch("[0-9a-f]{40}", published):
+        digest = hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False)
+    else:
+        return True
+    with path.open("rb") as content:
+        while block := content.read(1 << 22):
+            digest.update(block)
+    return digest.hexdigest() == published

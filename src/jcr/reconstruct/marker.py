@@ -28,7 +28,7 @@ WORST_PX = 3.0
 """A board whose points miss by more (rms) is bent, or no such board."""
 AMBIGUOUS = 1.5
 """A small or distant plane may be tilted either way: two poses whose errors differ by less than this factor."""
-LENS_IMAGES = 4
+FEWEST_FOR_INTRINSICS = 4
 """Fewest images of a board that determine intrinsics."""
 
 
@@ -40,7 +40,7 @@ class Pose:
     rms_px: float
 
 
-def reconstruct(
+def reconstruct_marker(
     capture: Capture, look_for: str, progress: Progress | None = None, *, memory_gb: float = 8.0
 ) -> Reconstruction:
     """Cameras in metres; the recon frame is the board's, or that of the tag seen most often.
@@ -57,13 +57,13 @@ def reconstruct(
     report("board", 1.0)
     seen = [[s for s in sightings if len(s.index) >= FEWEST_POINTS] for sightings in seen]
     notes = [] if board is readings[0] else [f"the board is read as {board.name}"]
-    lens, lens_notes = _lens(capture, board, seen)
-    notes += lens_notes
-    if (fold_px := fold_distance_px(lens)) is not None:
-        seen = [_within(sightings, lens, fold_px) for sightings in seen]
+    intrinsics, intrinsics_notes = _intrinsics(capture, board, seen)
+    notes += intrinsics_notes
+    if (fold_px := fold_distance_px(intrinsics)) is not None:
+        seen = [_within(sightings, intrinsics, fold_px) for sightings in seen]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
-    poses = [{s.body: pose for s in sightings if (pose := _pose(s, lens))} for sightings in seen]
-    recon_from_camera, recon_from_body = _placed(poses)
+    poses = [{s.body: pose for s in sightings if (pose := _pose(s, intrinsics))} for sightings in seen]
+    recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
         raise NotTrustedError(
@@ -75,12 +75,12 @@ def reconstruct(
     sightings = [[s for s in seen[row] if s.body in recon_from_body and s.body in poses[row]] for row in rows]
     cameras = np.stack([recon_from_camera[row] for row in rows])
     if len(recon_from_body) > 1:
-        cameras, recon_from_body = _refined(cameras, recon_from_body, sightings, lens)
+        cameras, recon_from_body = adjust_bodies(cameras, recon_from_body, sightings, intrinsics)
     tracks = _tracks(sightings, recon_from_body)
     return Reconstruction(
         image_index=rows,
         recon_from_camera=cameras,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=tracks,
         backend="marker",
         is_metric=True,
@@ -89,16 +89,18 @@ def reconstruct(
     )
 
 
-def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) -> tuple[Intrinsics, list[str]]:
+def _intrinsics(
+    capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]
+) -> tuple[Intrinsics, list[str]]:
     """The given intrinsics, or a focal length, centre and two radial coefficients from the board's points."""
     if capture.intrinsics is not None:
         return capture.intrinsics, []
     shown = [s for sightings in seen for s in sightings]
     images = sum(map(bool, seen))
-    if images < LENS_IMAGES:
+    if images < FEWEST_FOR_INTRINSICS:
         raise NotTrustedError(
-            f"{images} of {len(capture)} images show {board.name}, {LENS_IMAGES} are needed to find the unknown "
-            "intrinsics from it",
+            f"{images} of {len(capture)} images show {board.name}, {FEWEST_FOR_INTRINSICS} are needed to find the "
+            "unknown intrinsics from it",
             "check the board's kind and size, or give the intrinsics",
         )
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
@@ -112,29 +114,29 @@ def _lens(capture: Capture, board: Board, seen: Sequence[Sequence[Sighting]]) ->
     )
     (fx, _, cx), (_, fy, cy) = matrix[0], matrix[1]
     k1, k2 = (float(k) for k in distortion.ravel()[:2])
-    lens = Intrinsics(
+    intrinsics = Intrinsics(
         float(fx), float(fy), float(cx), float(cy), *capture.image_size, (k1, k2, 0.0, 0.0, 0.0)
     )
-    return lens, [
+    return intrinsics, [
         f"the intrinsics come from the board: f = {fx:.1f} ± {std[0, 0]:.1f} px, {rms_px:.2f} px rms"
     ]
 
 
-def _within(sightings: Sequence[Sighting], lens: Intrinsics, fold_px: float) -> list[Sighting]:
+def _within(sightings: Sequence[Sighting], intrinsics: Intrinsics, fold_px: float) -> list[Sighting]:
     """The sightings whose points all lie where the distortion has an inverse."""
-    centre, limit_px = np.array([lens.cx, lens.cy]), WITHIN_FOLD * fold_px
+    centre, limit_px = np.array([intrinsics.cx, intrinsics.cy]), WITHIN_FOLD * fold_px
     return [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
 
 
-def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
+def _pose(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
     x, x_px = sighting.x_in_body, sighting.x_px
-    seen, camera = x_px, (lens.matrix, np.array(lens.distortion))
-    if lens.model == "fisheye":
+    seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))
+    if intrinsics.model == "fisheye":
         # OpenCV's solvers know the other two: they get a pinhole's image of the same rays.
-        straight = without_distortion(lens)
+        straight = without_distortion(intrinsics)
         seen, camera = (
-            project(straight, unproject(lens, x_px)),
+            project(straight, unproject(intrinsics, x_px)),
             (straight.matrix, np.array(straight.distortion)),
         )
     if np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < 1e-6:
@@ -142,10 +144,10 @@ def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
     count, rotations, translations, _ = cv2.solvePnPGeneric(x, seen, *camera, flags=cv2.SOLVEPNP_IPPE)
     found = []
     for k in range(count):
-        turn, shift = cv2.solvePnPRefineLM(x, seen, *camera, rotations[k], translations[k])
-        pose = transform(rotation_exp(turn.ravel()), shift.ravel())
-        missed = project(lens, apply(pose, x)) - x_px
-        found.append(Pose(pose, float(np.sqrt((missed**2).sum(1).mean()))))
+        rotation, shift = cv2.solvePnPRefineLM(x, seen, *camera, rotations[k], translations[k])
+        pose = transform(rotation_exp(rotation.ravel()), shift.ravel())
+        residual_px = project(intrinsics, apply(pose, x)) - x_px
+        found.append(Pose(pose, float(np.sqrt((residual_px**2).sum(1).mean()))))
     found.sort(key=lambda pose: pose.rms_px)
     if not found or found[0].rms_px > WORST_PX:
         return None
@@ -158,7 +160,7 @@ def _pose(sighting: Sighting, lens: Intrinsics) -> Pose | None:
     return found[0]
 
 
-def _placed(
+def locate_cameras_and_bodies(
     poses: Sequence[dict[int, Pose]],
 ) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
     """Cameras by row and bodies by number in one frame, chained from the body seen most often.
@@ -189,11 +191,11 @@ def _placed(
                 placed[body] = cameras[row] @ poses[row][body].camera_from_body
 
 
-def _refined(
+def adjust_bodies(
     cameras: Float[ndarray, "m 4 4"],
     bodies: dict[int, Float[ndarray, "4 4"]],
     sightings: Sequence[Sequence[Sighting]],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
 ) -> tuple[Float[ndarray, "m 4 4"], dict[int, Float[ndarray, "4 4"]]]:
     """All cameras and bodies adjusted to all points at once; the first body stays."""
     numbers = list(bodies)
@@ -208,21 +210,23 @@ def _refined(
             in_recon = arm + poses[place, :3, 3]
             from_camera = in_recon - poses[row, :3, 3]
             x_in_camera = from_camera @ poses[row, :3, :3]
-            turned = by_point(lens, x_in_camera) @ poses[row, :3, :3].T
+            in_image = by_point(intrinsics, x_in_camera) @ poses[row, :3, :3].T
             jacobian = np.zeros((len(arm), 2, 6 * len(poses)))
             jacobian[:, :, 6 * row : 6 * row + 6] = np.concatenate(
-                [-turned, turned @ skew(from_camera)], axis=2
+                [-in_image, in_image @ skew(from_camera)], axis=2
             )
-            jacobian[:, :, 6 * place : 6 * place + 6] = np.concatenate([turned, -turned @ skew(arm)], axis=2)
-            residuals.append((project(lens, x_in_camera) - s.x_px).reshape(-1, 1))
+            jacobian[:, :, 6 * place : 6 * place + 6] = np.concatenate(
+                [in_image, -in_image @ skew(arm)], axis=2
+            )
+            residuals.append((project(intrinsics, x_in_camera) - s.x_px).reshape(-1, 1))
             jacobians.append(jacobian.reshape(-1, 1, 6 * len(poses)))
-        held = slice(6 * count, 6 * count + 6)
-        return np.concatenate(residuals), np.delete(np.concatenate(jacobians), held, axis=2)
+        first_body = slice(6 * count, 6 * count + 6)
+        return np.concatenate(residuals), np.delete(np.concatenate(jacobians), first_body, axis=2)
 
-    def moved(poses: Float[ndarray, "p 4 4"], step: Float[ndarray, " u"]) -> Float[ndarray, "p 4 4"]:
+    def retracted(poses: Float[ndarray, "p 4 4"], step: Float[ndarray, " u"]) -> Float[ndarray, "p 4 4"]:
         return retract(poses, np.insert(step, 6 * count, np.zeros(6)).reshape(-1, 6))
 
-    poses = minimise(linearised, start, moved, "soft_l1").unknowns
+    poses = minimise(linearised, start, retracted, "soft_l1").unknowns
     return poses[:count], dict(zip(numbers, poses[count:], strict=True))
 
 

@@ -18,8 +18,8 @@ from jcr.geometry import inverse, nearest_rotation, rotation_angle, transform
 from jcr.handeye.robust import robust_fit
 
 LEAST_MAPPED = 4
-"""Cameras that can say where another one is."""
-LARGEST_TURN = np.radians(4)
+"""Cameras from which another one can be predicted."""
+LARGEST_ROTATION = np.radians(4)
 """Between a resectioned camera and its prediction."""
 LARGEST_MOVE = 0.15
 """The same of its position, as a share of the distance to the scene."""
@@ -64,19 +64,16 @@ def joined(
     scale = float((from_mean * to_mean).sum()) / spread if spread > 0 else 0.0
     if scale <= 0:
         return {}
-    moved = transform(rotation @ own[:, :3, :3], scale * from_mean + target.mean(0))
-    turn = rotation_angle(np.swapaxes(moved[:, :3, :3], 1, 2) @ want[:, :3, :3])
-    away = np.linalg.norm(moved[:, :3, 3] - target, axis=1) / np.sqrt((to_mean**2).sum(1).mean())
-    if np.median(turn) > LARGEST_TURN or np.median(away) > 2 * LARGEST_MOVE:
+    in_map = transform(rotation @ own[:, :3, :3], scale * from_mean + target.mean(0))
+    rotated_by = rotation_angle(np.swapaxes(in_map[:, :3, :3], 1, 2) @ want[:, :3, :3])
+    away = np.linalg.norm(in_map[:, :3, 3] - target, axis=1) / np.sqrt((to_mean**2).sum(1).mean())
+    if np.median(rotated_by) > LARGEST_ROTATION or np.median(away) > 2 * LARGEST_MOVE:
         return {}
-    return dict(zip(rows, moved, strict=True))
+    return dict(zip(rows, in_map, strict=True))
 
 
 def resectioned(
-    database: Path,
-    model: pycolmap.Reconstruction,
-    row: int,
-    predicted: Float[ndarray, "4 4"],
+    database: Path, model: pycolmap.Reconstruction, row: int, predicted: Float[ndarray, "4 4"]
 ) -> Float[ndarray, "4 4"] | None:
     """recon_from_camera of an image from verified matches with mapped points, near its prediction; None without."""
     camera = model.camera(1)
@@ -105,9 +102,9 @@ def resectioned(
     motion = found["cam_from_world"]
     pose = inverse(transform(motion.rotation.matrix(), motion.translation))
     depth = float(np.median(np.linalg.norm(xyz - predicted[:3, 3], axis=1)))
-    turn = float(rotation_angle(pose[:3, :3].T @ predicted[:3, :3]))
+    rotated_by = float(rotation_angle(pose[:3, :3].T @ predicted[:3, :3]))
     away = float(np.linalg.norm(pose[:3, 3] - predicted[:3, 3])) / depth
-    return pose if turn < LARGEST_TURN and away < LARGEST_MOVE else None
+    return pose if rotated_by < LARGEST_ROTATION and away < LARGEST_MOVE else None
 
 
 def retriangulated(

@@ -30,6 +30,15 @@ distance is still needed to tell surfaces apart that lie behind one another.
 LARGEST_MISFIT = 0.02
 """RMS distance of a patch's points from their quadratic, in the same unit: more is an occlusion boundary."""
 
+KEYPOINTS = 6000
+"""Of all images together, spread evenly, each the most confident pixel of its cell."""
+LEAST_CONFIDENCE = 0.1
+"""Quantile of a pointmap's confidence below which its pixels are not matched."""
+LARGEST_GAP = 0.05
+"""By how much the distances of matched points from the camera may differ, as a share."""
+LARGEST_DISAGREEMENT = 0.01
+"""Distance between there and back, and between the two orders of a pair, over the image's width."""
+
 Pixels = Int[ndarray, "k 2"]
 """x, y."""
 Pointmap = tuple[Float[ndarray, "h w 3"], Float[ndarray, "h w"]]
@@ -37,25 +46,8 @@ Pointmap = tuple[Float[ndarray, "h w 3"], Float[ndarray, "h w"]]
 OriginalPx = Callable[[Float[ndarray, "k 2"]], Float[ndarray, "k 2"]]
 
 
-@dataclass(frozen=True)
-class MatchOptions:
-    """Which correspondences bundle adjustment is given."""
-
-    keypoints: int = 6000
-    """Of all images together, spread evenly, each the most confident pixel of its cell."""
-    least_confidence: float = 0.1
-    """Quantile of a pointmap's confidence below which its pixels are not matched."""
-    largest_gap: float = 0.05
-    """By how much the distances of matched points from the camera may differ, as a share."""
-    largest_disagreement: float = 0.01
-    """Distance between there and back, and between the two orders of a pair, over the image's width."""
-
-
 def tracks_from_pairs(
-    predictions: PairPredictions,
-    points_in_recon: Float[ndarray, "n h w 3"],
-    original_px: OriginalPx,
-    options: MatchOptions | None = None,
+    predictions: PairPredictions, points_in_recon: Float[ndarray, "n h w 3"], original_px: OriginalPx
 ) -> Tracks:
     """One track per keypoint that another image sees, in pairs that each have a frame of their own.
 
@@ -77,7 +69,7 @@ def tracks_from_pairs(
             yield n, m, (p.pts3d[e], p.conf[e]), (p.pts3d_in_other_view[e], p.conf2[e])
             p.release()
 
-    return _tracks(pairs(), confidence, points_in_recon, original_px, options or MatchOptions())
+    return _tracks(pairs(), confidence, points_in_recon, original_px)
 
 
 def tracks_from_pointmaps(
@@ -85,7 +77,6 @@ def tracks_from_pointmaps(
     points_in_recon: Float[ndarray, "n h w 3"],
     confidence: Float[ndarray, "n h w"],
     original_px: OriginalPx,
-    options: MatchOptions | None = None,
 ) -> Tracks:
     """One track per keypoint that another image sees, where all pointmaps are in one frame already."""
     confidence = confidence.astype(np.float32)
@@ -95,7 +86,7 @@ def tracks_from_pointmaps(
         return x_in_camera.astype(np.float32), confidence[image]
 
     pairs = ((n, m, seen_from(n, n), seen_from(n, m)) for n in range(len(confidence)) for m in range(n))
-    return _tracks(pairs, confidence, points_in_recon, original_px, options or MatchOptions())
+    return _tracks(pairs, confidence, points_in_recon, original_px)
 
 
 def _tracks(
@@ -103,22 +94,21 @@ def _tracks(
     confidence: Float[ndarray, "n h w"],
     points_in_recon: Float[ndarray, "n h w 3"],
     original_px: OriginalPx,
-    options: MatchOptions,
 ) -> Tracks:
     count, _, width = confidence.shape
-    keypoints = [_keypoints(image, options.keypoints / count) for image in confidence]
-    # By image, other image, and order of the pair that says so.
+    keypoints = [_keypoints(image, KEYPOINTS / count) for image in confidence]
+    # By image, other image, and order of the pair.
     pixels = np.full((count, count, 2, len(keypoints[0]), 2), np.nan)
     good = np.ones(pixels.shape[:-1], bool)
     for n, m, *maps in pairs:
-        first, second = (_surface(*pointmap, options) for pointmap in maps)
-        pixels[n, m, 0], good[n, m, 0] = _match(first, second, keypoints[n], options)
-        pixels[m, n, 1], good[m, n, 1] = _match(second, first, keypoints[m], options)
+        first, second = (_surface(*pointmap) for pointmap in maps)
+        pixels[n, m, 0], good[n, m, 0] = _match(first, second, keypoints[n])
+        pixels[m, n, 1], good[m, n, 1] = _match(second, first, keypoints[m])
     predicted = ~np.isnan(pixels[..., 0])
     seen = predicted.any(2) & good.all(2)
     matched = np.where(predicted[..., None], pixels, 0).sum(2) / np.maximum(predicted.sum(2), 1)[..., None]
     apart = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
-    seen &= ~(apart > options.largest_disagreement * width)
+    seen &= ~(apart > LARGEST_DISAGREEMENT * width)
 
     image, other, which = np.argwhere(seen).T
     start_image, start_which = np.argwhere(seen.any(1)).T
@@ -149,7 +139,7 @@ def _keypoints(confidence: Float[ndarray, "h w"], number: float) -> Pixels:
     return np.stack([left + column * size + x, top + row * size + y], -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Surface:
     """A pointmap as seen from its origin, made ready for searching."""
 
@@ -164,9 +154,7 @@ class _Surface:
     """Of every `stride`-th pixel of `smooth`."""
 
 
-def _surface(
-    points: Float[ndarray, "h w 3"], confidence: Float[ndarray, "h w"], options: MatchOptions
-) -> _Surface:
+def _surface(points: Float[ndarray, "h w 3"], confidence: Float[ndarray, "h w"]) -> _Surface:
     distance = np.maximum(np.sqrt(np.einsum("hwc,hwc->hw", points, points)), 1e-9)[..., None]
     seen = np.concatenate([points / distance, DEPTH_WEIGHT * np.log(distance)], axis=2)
     size = (2 * PATCH_RADIUS + 1,) * 2
@@ -175,14 +163,16 @@ def _surface(
     stride = max(1, int(np.sqrt(confidence.size / COARSE_POINTS)))
     tree = KDTree(smooth[::stride, ::stride].reshape(-1, 4), balanced_tree=False)
     # Every seventh pixel gives the quantile closely enough in a tenth of the time.
-    least = float(np.quantile(confidence.ravel()[::7], options.least_confidence))
-    return _Surface(seen, confidence, least, smooth, stride, tree)
+    least = float(np.quantile(confidence.ravel()[::7], LEAST_CONFIDENCE))
+    return _Surface(
+        seen=seen, confidence=confidence, least_confidence=least, smooth=smooth, stride=stride, tree=tree
+    )
 
 
 def _match(
-    start: _Surface, end: _Surface, keypoints: Pixels, options: MatchOptions
+    start: _Surface, end: _Surface, keypoints: Pixels
 ) -> tuple[Float[ndarray, "k 2"], Bool[ndarray, " k"]]:
-    """Pixels of `end` that match keypoints of `start`, and which of them are to be believed."""
+    """Pixels of `end` that match keypoints of `start`, and which of them are good."""
     height, width = end.confidence.shape
     point, _, smooth = _local_shape(start, keypoints)
     nearest = _nearest_pixels(end, point)
@@ -195,8 +185,8 @@ def _match(
     gap = np.abs(point - center - np.einsum("kci,ki->kc", slope, step))[:, 3] / DEPTH_WEIGHT
     back = np.linalg.norm(_nearest_pixels(start, center) - keypoints, axis=-1)
     good = smooth & smooth_there & (np.linalg.norm(step, axis=-1) <= PATCH_RADIUS)
-    good &= gap <= options.largest_gap
-    good &= back <= max(2.0, options.largest_disagreement * width)
+    good &= gap <= LARGEST_GAP
+    good &= back <= max(2.0, LARGEST_DISAGREEMENT * width)
     good &= start.confidence[keypoints[:, 1], keypoints[:, 0]] >= start.least_confidence
     good &= end.confidence[nearest[:, 1], nearest[:, 0]] >= end.least_confidence
     return pixels, good & (pixels >= 0).all(-1) & (pixels <= [width - 1, height - 1]).all(-1)

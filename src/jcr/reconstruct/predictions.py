@@ -3,7 +3,7 @@
 Either pairwise pointmaps, which are aligned here, or pointmaps that share one frame, with camera poses.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,33 +18,22 @@ from jcr.progress import Progress
 from jcr.reconstruct.from_pairs import memory_after, reconstruction_from_pairs
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import camera_of_arrays, pairs_from_arrays, read_arrays
-from jcr.reconstruct.pointmaps import reconstruction_from_pointmaps
+from jcr.reconstruct.pointmaps import PosedPointmaps, reconstruction_from_pointmaps
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, image_grid, read_colors
 from jcr.records import Capture, Reconstruction
 
 
-@dataclass(frozen=True)
-class PredictionsOptions:
-    """Predictions made elsewhere."""
-
-    path: Path
-    """The npz file."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process; a large file of pairs is not read into memory but page by page."""
-    align: AlignOptions = field(default_factory=AlignOptions)
-
-
-def reconstruct(
-    capture: Capture, options: PredictionsOptions, progress: Progress | None = None
+def reconstruct_predictions(
+    capture: Capture, path: Path, progress: Progress | None = None, *, memory_gb: float = 8.0
 ) -> Reconstruction:
-    """Camera poses, pointmaps and tracks from predictions in a file.
+    """Camera poses, pointmaps and tracks from predictions in an npz file.
 
-    Raises InputError for a file that is missing, damaged, or does not fit the capture.
+    `memory_gb` is the peak resident set of the process: a large file of pairs is mapped, page by page. Raises
+    InputError for a file that is missing, damaged, or does not fit the capture.
     """
-    budget, program = options.memory_gb * GB, resident() + ALLOWANCE
-    room = max(budget - program - MAP, 0) / 2
-    arrays = read_arrays(options.path, room)
-    source = str(options.path)
+    budget, program = memory_gb * GB, resident() + ALLOWANCE
+    in_memory = max(budget - program - MAP, 0) / 2
+    arrays, source = read_arrays(path, in_memory), str(path)
     if "edges" in arrays:
         predictions = pairs_from_arrays(arrays, source)
         rows = _rows(predictions.images, predictions.image_count, capture, source)
@@ -52,15 +41,15 @@ def reconstruct(
         # Rows of a reconstruction ascend; the file's images are renumbered to that order.
         predictions = replace(predictions, edges=rank[predictions.edges], images=())
         count, height, width = predictions.conf.shape
-        size = options.path.stat().st_size
-        needed = program + memory_after(len(rows), count, height * width) + (size if size <= room else 0)
+        size = path.stat().st_size
+        needed = program + memory_after(len(rows), count, height * width) + (size if size <= in_memory else 0)
         require(needed, budget, f"aligning {count} pairs, with the program itself,")
-        announce(needed, budget, "" if size <= room else f", and {size / GB:.2g} GB left in {source}")
+        announce(needed, budget, "" if size <= in_memory else f", and {size / GB:.2g} GB left in {source}")
         images = _images(capture, rows, arrays, (width, height), source)
         rows = np.sort(rows)
         poses = capture.base_from_gripper[rows]
         return reconstruction_from_pairs(
-            images, rows, predictions, poses, options.align, backend="predictions", progress=progress
+            images, rows, predictions, poses, AlignOptions(), backend="predictions", progress=progress
         )
     if "recon_from_camera" in arrays:
         return _from_pointmaps(capture, arrays, source)
@@ -88,20 +77,15 @@ def _from_pointmaps(capture: Capture, arrays: dict[str, ndarray], source: str) -
     if arrays["confidence"].min() < 0:
         raise InputError(f"{source}: confidence is negative somewhere; 0 is for no estimate")
     rows = _rows(tuple(str(name) for name in arrays.get("images", ())), count, capture, source)
-    order = np.argsort(rows)
+    order, poses = np.argsort(rows), arrays["recon_from_camera"].astype(np.float64)
     return reconstruction_from_pointmaps(
         _images(capture, rows, arrays, (width, height), source),
-        rows[order],
-        np.stack(
-            [
-                require_rigid(
-                    arrays["recon_from_camera"][k].astype(np.float64), f"{source}: recon_from_camera[{k}]"
-                )
-                for k in order
-            ]
+        PosedPointmaps(
+            rows[order],
+            np.stack([require_rigid(poses[k], f"{source}: recon_from_camera[{k}]") for k in order]),
+            arrays["points_in_recon"][order].astype(np.float32, copy=False),
+            arrays["confidence"][order].astype(np.float32, copy=False),
         ),
-        arrays["points_in_recon"][order].astype(np.float32, copy=False),
-        arrays["confidence"][order].astype(np.float32, copy=False),
         source=source,
         backend="predictions",
         is_metric=bool(arrays.get("is_metric", False)),
@@ -135,20 +119,20 @@ def _images(
     them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
-    lens, warnings = usable_lens(capture.intrinsics)
+    intrinsics, warnings = usable_lens(capture.intrinsics)
     grid = grid or _plain_grid(capture.image_size, size, source)
     if seen is not None:
         pinhole = grid.original_intrinsics(seen)
-        lens = lens or pinhole
-    elif lens is not None and is_distorted(lens):
-        lens = pinhole = None
+        intrinsics = intrinsics or pinhole
+    elif intrinsics is not None and is_distorted(intrinsics):
+        intrinsics = pinhole = None
         warnings += (
             f"{source} has no intrinsics, so its pointmaps are taken to be of the distorted images and their "
             "intrinsics are estimated as a pinhole",
         )
     else:
-        pinhole = lens
-    if grid.original_size != capture.image_size and (lens is None or not is_distorted(lens)):
+        pinhole = intrinsics
+    if grid.original_size != capture.image_size and (intrinsics is None or not is_distorted(intrinsics)):
         raise InputError(
             f"{source}: made from images of {'x'.join(map(str, grid.original_size))}, the capture's are "
             f"{'x'.join(map(str, capture.image_size))}; predict from this capture's images"
@@ -165,8 +149,8 @@ def _images(
             images=tuple(capture.images[row] for row in ordered),
             base_from_gripper=capture.base_from_gripper[ordered],
         )
-        colors = read_colors(part, grid, lens, pinhole)
-    return PreparedImages(colors, grid, lens, pinhole, warnings)
+        colors = read_colors(part, grid, intrinsics, pinhole)
+    return PreparedImages(colors, grid, intrinsics, pinhole, warnings)
 
 
 def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -> ImageGrid:
@@ -178,5 +162,5 @@ def _plain_grid(original: tuple[int, int], size: tuple[int, int], source: str) -
         return ImageGrid(original, size, (0, 0), size)
     raise InputError(
         f"{source}: pointmaps of {size[0]}x{size[1]} are no plain resize of {original[0]}x{original[1]} "
-        "images; say how they were cropped with array 'grid'"
+        "images; give their crop as array 'grid'"
     )

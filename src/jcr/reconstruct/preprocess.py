@@ -98,8 +98,8 @@ class PreparedImages:
 
     colors: UInt8[ndarray, "n h w 3"]
     grid: ImageGrid
-    lens: Intrinsics | None
-    """Of the capture's images; None: unknown."""
+    intrinsics_of_capture: Intrinsics | None
+    """Of the capture's own images, with distortion; None: unknown."""
     pinhole: Intrinsics | None
     """Of the undistorted images that `grid` resizes; None: unknown."""
     warnings: tuple[str, ...] = ()
@@ -112,9 +112,13 @@ class PreparedImages:
     def original_px(self, x_px: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n 2"]:
         """Pixels (...,2) of the network's grid in the capture's images, distorted as the camera made them."""
         undistorted_px = self.grid.original_from_grid(x_px)
-        if self.pinhole is None or self.lens is None or not is_distorted(self.lens):
+        if (
+            self.pinhole is None
+            or self.intrinsics_of_capture is None
+            or not is_distorted(self.intrinsics_of_capture)
+        ):
             return undistorted_px
-        return project(self.lens, unproject(self.pinhole, undistorted_px))
+        return project(self.intrinsics_of_capture, unproject(self.pinhole, undistorted_px))
 
 
 def prepare_images(
@@ -122,18 +126,20 @@ def prepare_images(
 ) -> PreparedImages:
     """Read, undistort where the intrinsics are known, resize and crop the images of a capture.
 
-    `grid_of` says how, from the size of an image. Raises InputError for an image that cannot be read.
+    `grid_of` gives the resize and crop for the size of an image. Raises InputError for an image that cannot be read.
     """
-    lens, warnings = usable_lens(capture.intrinsics)
-    pinhole = lens
-    if lens is not None and is_distorted(lens):
-        pinhole = pinhole_inside(lens, max(lens.width, lens.height))
+    intrinsics, warnings = usable_lens(capture.intrinsics)
+    pinhole = intrinsics
+    if intrinsics is not None and is_distorted(intrinsics):
+        pinhole = pinhole_inside(intrinsics, max(intrinsics.width, intrinsics.height))
     grid = grid_of(capture.image_size if pinhole is None else (pinhole.width, pinhole.height))
-    return PreparedImages(read_colors(capture, grid, lens, pinhole), grid, lens, pinhole, warnings)
+    return PreparedImages(
+        read_colors(capture, grid, intrinsics, pinhole), grid, intrinsics, pinhole, warnings
+    )
 
 
 def read_colors(
-    capture: Capture, grid: ImageGrid, lens: Intrinsics | None, pinhole: Intrinsics | None
+    capture: Capture, grid: ImageGrid, intrinsics: Intrinsics | None, pinhole: Intrinsics | None
 ) -> UInt8[ndarray, "n h w 3"]:
     """The images of a capture on a grid, made images of `pinhole` first where the camera has distortion.
 
@@ -143,8 +149,8 @@ def read_colors(
     colors = np.empty((len(capture), height, width, 3), np.uint8)
     for row, name in enumerate(capture.images):
         image = read_image(capture.folder / name)
-        if lens is not None and pinhole is not None and is_distorted(lens):
-            image = undistort_image(image, lens, pinhole)
+        if intrinsics is not None and pinhole is not None and is_distorted(intrinsics):
+            image = undistort_image(image, intrinsics, pinhole)
         colors[row] = resize_and_crop(image, grid)
     return colors
 

@@ -19,13 +19,9 @@ from jcr.records import CameraEvidence, Pointmaps, Reconstruction, Tracks
 
 FORMAT = "jcr.reconstruction/7"
 """Changes with what the file holds."""
-WITHOUT_STD = "jcr.reconstruction/6"
-"""Read as well: it says nothing of how sure the observations are."""
 WITH_DEPTH = "jcr.reconstruction/5"
-"""The last in which the pointmaps were in the file whoever made them, without confidence where nobody had."""
-OLD = ("jcr.reconstruction/3", "jcr.reconstruction/4", WITH_DEPTH)
-"""Up to 4 without warnings, which were among the notes; 3 without reasons and sigmas of depths, which were all matched,
-too."""
+"""Read as well: it holds estimated depth as pointmaps without confidence, and no standard deviations of observations."""
+OF_TRACKS = ("image", "x_px", "point", "points_in_recon", "std_px")
 OF_POINTMAPS = ("points_in_recon", "confidence", "colors", "reason", "depth_std")
 
 
@@ -38,14 +34,14 @@ class About(BaseModel):
     is_metric: bool
     metric_std: Positive | None
     notes: list[str]
-    warnings: list[str] = []
+    warnings: list[str]
     intrinsics: IntrinsicsJson
     pointmap_intrinsics: IntrinsicsJson | None = None
 
 
 def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
     """Write the record whole or not at all."""
-    pointmaps = reconstruction.pointmaps
+    pointmaps, tracks, evidence = reconstruction.pointmaps, reconstruction.tracks, reconstruction.evidence
     about = {
         "format": FORMAT,
         "backend": reconstruction.backend,
@@ -59,16 +55,11 @@ def write_reconstruction(path: Path, reconstruction: Reconstruction) -> None:
     arrays = {
         "image_index": reconstruction.image_index,
         "recon_from_camera": reconstruction.recon_from_camera,
-        "track_image": reconstruction.tracks.image,
-        "track_x_px": reconstruction.tracks.x_px,
-        "track_point": reconstruction.tracks.point,
-        "track_points_in_recon": reconstruction.tracks.points_in_recon,
-        "tracks_from_pointmaps": np.array(reconstruction.tracks.from_pointmaps),
-        "tracks_from_board": np.array(reconstruction.tracks.from_board),
+        "tracks_from_pointmaps": np.array(tracks.from_pointmaps),
+        "tracks_from_board": np.array(tracks.from_board),
     }
-    if (std_px := reconstruction.tracks.std_px) is not None:
-        arrays["track_std_px"] = std_px
-    if (evidence := reconstruction.evidence) is not None:
+    arrays |= {f"track_{name}": array for name in OF_TRACKS if (array := getattr(tracks, name)) is not None}
+    if evidence is not None:
         arrays |= {
             "evidence_recon_from_camera": evidence.recon_from_camera,
             "evidence_covariance": evidence.covariance,
@@ -135,20 +126,19 @@ def read_npz(path: Path, formats: Sequence[str]) -> Iterator[tuple[str, Mapping[
 
 def read_reconstruction(path: Path) -> Reconstruction:
     """The record in a reconstruction.npz; InputError when it is damaged or of a newer format."""
-    with read_npz(path, (FORMAT, WITHOUT_STD, *OLD)) as (text, file):
+    with read_npz(path, (FORMAT, WITH_DEPTH)) as (text, file):
         about = About.model_validate_json(text, strict=True)
         found = Reconstruction(
             image_index=file["image_index"],
             recon_from_camera=file["recon_from_camera"],
             intrinsics=about.intrinsics.record(),
             tracks=Tracks(
-                file["track_image"],
-                file["track_x_px"],
-                file["track_point"],
-                file["track_points_in_recon"],
-                bool(file["tracks_from_pointmaps"]),
-                about.backend == "marker" if about.format in OLD else bool(file["tracks_from_board"]),
-                file.get("track_std_px"),
+                *(file[f"track_{name}"] for name in OF_TRACKS if name != "std_px"),
+                from_pointmaps=bool(file["tracks_from_pointmaps"]),
+                from_board=bool(file["tracks_from_board"])
+                if about.format == FORMAT
+                else about.backend == "marker",
+                std_px=file.get("track_std_px"),
             ),
             backend=about.backend,
             pointmaps=_pointmaps(file, about),
@@ -163,10 +153,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
 
 
 def _pointmaps(file: Mapping[str, np.ndarray], about: About) -> Pointmaps | None:
-    if about.pointmap_intrinsics is None:
-        return None
-    estimated = about.format in OLD and "reason" in file
-    if estimated and not file["confidence"].any():
+    if about.pointmap_intrinsics is None or (about.format == WITH_DEPTH and not file["confidence"].any()):
         return None
     return pointmaps_in(file, about.pointmap_intrinsics, len(file["image_index"]))
 

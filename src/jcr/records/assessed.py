@@ -1,4 +1,4 @@
-"""What findings are held against: the verdict on it, and the reasons in words, follow from them alone."""
+"""What findings are about: its verdict and the reasons in words follow from the findings alone."""
 
 from dataclasses import dataclass, replace
 from typing import TypeVar

@@ -10,6 +10,7 @@ from numpy import ndarray
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, verdict_of
+from jcr.records.notebook import hand_eye_table
 from jcr.records.words import remedy, unobservable
 
 
@@ -79,7 +80,7 @@ class NextPose:
     turned_rad: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RobotNoise:
     """One-sigma noise of the gripper poses per axis."""
 
@@ -87,7 +88,7 @@ class RobotNoise:
     rotation: float
     estimated: bool
     given: tuple[float, float] | None = None
-    """m, rad: what the user said of it; counted where the residuals say no more."""
+    """m, rad: what the user gave; used where the residuals determine no more."""
     systematic: float = 0.0
     """rad: size of the systematic errors; of joint offsets where the arm is known, else of the gripper's rotation."""
     systematic_left: tuple[float, float] = (0.0, 0.0)
@@ -124,6 +125,13 @@ class Budget:
     faults: Float[ndarray, "7 7"]
     """What findings and their uncertainty add."""
 
+    @property
+    def mostly_systematic(self) -> bool:
+        """Whether most of the translation's variance is systematic errors of the robot, which images of the same region
+        leave."""
+        others = self.robot_random, self.intrinsics, self.images, self.faults
+        return bool(np.trace(self.robot_systematic[:3, :3]) >= sum(np.trace(part[:3, :3]) for part in others))
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -157,7 +165,7 @@ class ScaleCheck:
     """One-sigma uncertainty that the calibration leaves in that."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthCheck:
     """A depth camera's lengths against the robot's, at features whose depth the images and the robot give."""
 
@@ -249,7 +257,7 @@ Where = Literal["seen", "camera", "scene"]
 """What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Requirement:
     """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
 
@@ -336,7 +344,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageResiduals:
-    """What the calibration says of each pose that the solver was given."""
+    """Residual and verdict of each pose that the solver was given."""
 
     inliers: Bool[ndarray, " n"]
     translation_residual_m: Float[ndarray, " n"]
@@ -369,7 +377,7 @@ class AngleRatio:
 
 @dataclass(frozen=True)
 class RobotExamined:
-    """What the residuals say of the robot itself."""
+    """What the residuals show of the robot itself."""
 
     noise: RobotNoise
     systematic_p: float | None = None
@@ -381,7 +389,7 @@ class RobotExamined:
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """What else than the robot's positions says how long a metre is."""
+    """Measures of the scale beside the robot's positions."""
 
     network: ScaleCheck | None = None
     """None where the reconstruction's unit is not meant to be the metre."""
@@ -479,8 +487,12 @@ class HandEye(Assessed):
         """Whether nothing but an unmet requirement rejects it: other stages can build on it."""
         return verdict_of(one for one in self.findings if one.kind is not Kind.NOT_EXACT_ENOUGH) != "rejected"
 
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        return hand_eye_table(self)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """What came of one back end that was tried."""
 

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jcr.records.notebook import capture_table
+
 LensModel = Literal["pinhole", "rational", "fisheye"]
 COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3"),
@@ -118,6 +120,10 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        return capture_table(self)
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,30 @@ class Finding:
     details: Mapping[str, float | str] = field(default_factory=dict)
     """Further numbers (m, rad, px, shares) and names that the sentence needs."""
 
+    @classmethod
+    def of(
+        cls,
+        kind: Kind,
+        severity: Severity,
+        mend: Mend = "none",
+        *images: str,
+        value: float | None = None,
+        std: float | None = None,
+        p: float | None = None,
+        **details: float | str,
+    ) -> "Finding":
+        """A finding about these images, with further numbers and names as `details`."""
+        return cls(
+            kind=kind,
+            severity=severity,
+            mend=mend,
+            images=images,
+            value=value,
+            std=std,
+            p=p,
+            details=details,
+        )
+
     @property
     def covariance(self) -> Float[ndarray, "7 7"]:
         """What it adds to that of the calibration."""
@@ -118,7 +142,7 @@ class Finding:
 
 
 def no_reconstruction(error: NotTrustedError) -> tuple[Finding, ...]:
-    """What a failure of every back end says, as findings."""
+    """The failure of every back end as findings."""
     details = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)
     more = (
@@ -139,9 +163,9 @@ CAMERA = frozenset(
         Kind.INTRINSICS,
     }
 )
-"""Kinds that say that the camera is not one with these intrinsics."""
+"""Kinds by which the camera is not one with these intrinsics."""
 BENT = frozenset({Kind.LENGTHS, Kind.BASE_LEANS, Kind.TOOL_SAGS})
-"""Kinds that say that the robot's poses are bent by where the gripper is."""
+"""Kinds by which the robot's poses are bent, depending on where the gripper is."""
 LASTING = (
     CAMERA
     | BENT

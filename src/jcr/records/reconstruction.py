@@ -34,7 +34,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """What the images alone say of the cameras, and how surely; the robot was not asked."""
+    """The cameras as the images alone determine them, with their covariance; no robot pose is used."""
 
     recon_from_camera: Float[ndarray, "m 4 4"]
     covariance: Float[ndarray, "r r"]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy import ndarray
 
 from jcr.records.findings import Finding, Kind
 from jcr.rounding import significant
@@ -89,6 +90,25 @@ def network_scale(off_percent: float, std_percent: float) -> str:
         return f"the network's own lengths are {1 + off / 100:.3g} times the robot's"
     direction = "long" if off > 0 else "short"
     return f"the network's own lengths are {abs(off):.3g} ± {std:.2g} % too {direction} compared with the robot's"
+
+
+def worst_direction(gripper_from_camera: ndarray, covariance: ndarray) -> str:
+    """The least certain direction of the translation, e.g. "along the optical axis: ±4.0 mm", by a covariance (7,7) in
+    COVARIANCE_ORDER."""
+    variance, vectors = np.linalg.eigh(covariance[:3, :3])
+    direction = vectors[:, 2]
+    std_mm = 1e3 * float(np.sqrt(variance[2]))
+    named = {
+        "the optical axis": gripper_from_camera[:3, 2],
+        "the image's x axis": gripper_from_camera[:3, 0],
+        "the image's y axis": gripper_from_camera[:3, 1],
+    }
+    name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
+    if abs(axis @ direction) < np.cos(np.radians(30)):
+        name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
+    # An offset that no motion shows may be uncertain by metres.
+    size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
+    return f"along {name}: ±{size}"
 
 
 def joined(words: Iterable[str]) -> str:

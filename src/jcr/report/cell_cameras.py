@@ -1,56 +1,62 @@
 """The section of the cell's other cameras and arms: where each is, how surely, and by which images."""
 
-from html import escape
+from typing import Any
 
 import numpy as np
 
 from jcr.cell.cameras_json import ArmPlaced, CameraPlaced, CamerasFile, TransformUncertainty
-from jcr.report.markup import filled
-from jcr.report.transform import copy_button
+from jcr.report.render import Section
 from jcr.rounding import significant
 
 
-def cameras_section(cameras: CamerasFile) -> str:
+def cameras_section(cameras: CamerasFile) -> Section:
     """A card for each."""
     cards = [_camera(camera) for camera in cameras.cameras] + [_arm(arm) for arm in cameras.arms]
-    return filled("cell_cameras.html", cards="\n".join(cards))
+    return Section("cameras", {"cards": cards})
 
 
-def _camera(camera: CameraPlaced) -> str:
+def _camera(camera: CameraPlaced) -> dict[str, Any]:
     arm = "" if camera.arm is None else f" of arm {camera.arm}"
     name = "base_from_camera" if camera.mount == "base" else f"gripper_from_camera{arm}"
-    images = "".join(
-        f"<tr><td>{escape(image.image)}</td><td>{image.points} points</td><td>"
-        + ("" if image.reprojection_px is None else f"{significant(image.reprojection_px)} px")
-        + f"</td><td>{escape(image.reason or 'used')}</td></tr>"
+    images = [
+        (
+            image.image,
+            f"{image.points} points",
+            "" if image.reprojection_px is None else f"{significant(image.reprojection_px)} px",
+            image.reason or "used",
+        )
         for image in camera.images
-    )
-    remarks = "".join(f"<li>{escape(text)}</li>" for text in camera.warnings)
-    doubt = "" if camera.doubt is None else '<p class="why">Rejected.</p>'
-    body = _transform(name, camera.parent_from_camera, camera.uncertainty)
-    return (
-        f'<div class="notation wide"><header><h3>{escape(camera.name)}: {escape(name)}</h3>'
-        f"{body}{doubt}<ul>{remarks}</ul><table>{images}</table></div>"
-    )
+    ]
+    placed = _transform(name, camera.parent_from_camera, camera.uncertainty)
+    return placed | {
+        "title": f"{camera.name}: {name}",
+        "rejected": camera.doubt is not None,
+        "remarks": camera.warnings,
+        "images": images,
+    }
 
 
-def _arm(arm: ArmPlaced) -> str:
-    body = _transform("base_from_other_base", arm.base_from_other_base, arm.uncertainty)
-    return f'<div class="notation wide"><header><h3>arm {escape(arm.name)}: base_from_other_base</h3>{body}</div>'
+def _arm(arm: ArmPlaced) -> dict[str, Any]:
+    name = "base_from_other_base"
+    placed = _transform(name, arm.base_from_other_base, arm.uncertainty)
+    return placed | {"title": f"arm {arm.name}: {name}", "rejected": False, "remarks": (), "images": ()}
 
 
-def _transform(name: str, matrix: list[list[float]] | None, sure: TransformUncertainty | None) -> str:
-    """The rest of the header, the matrix and its standard deviations."""
-    if matrix is None or sure is None:
-        return "</header>"
-    rows = "\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in matrix)
-    millimetres = ", ".join(significant(value) for value in sure.translation_std_mm)
-    degrees = ", ".join(significant(value) for value in sure.rotation_std_deg)
+def _transform(
+    name: str, matrix: list[list[float]] | None, uncertainty: TransformUncertainty | None
+) -> dict[str, Any]:
+    """The matrix as text, for people and to copy, and its standard deviations; None where there is none."""
+    if matrix is None or uncertainty is None:
+        return {"name": name, "matrix": None}
     scene = ""
-    if sure.at_scene_mm is not None and sure.scene_distance_m is not None:
-        scene = f"; ± {significant(sure.at_scene_mm)} mm at the scene, {sure.scene_distance_m:.2f} m away"
-    button = copy_button(str(np.round(np.array(matrix), 9).tolist()), name)
-    return (
-        f'{button}</header><pre class="matrix">{rows}</pre>'
-        f'<p class="note">metres; ± {millimetres} mm, {degrees} ° (1 σ){scene}</p>'
-    )
+    if uncertainty.at_scene_mm is not None and uncertainty.scene_distance_m is not None:
+        far = f"{uncertainty.scene_distance_m:.2f} m away"
+        scene = f"; ± {significant(uncertainty.at_scene_mm)} mm at the scene, {far}"
+    millimetres = ", ".join(significant(value) for value in uncertainty.translation_std_mm)
+    degrees = ", ".join(significant(value) for value in uncertainty.rotation_std_deg)
+    return {
+        "name": name,
+        "matrix": "\n".join("".join(f"{value:>10.6f}" for value in row)[1:] for row in matrix),
+        "copied": str(np.round(np.array(matrix), 9).tolist()),
+        "std": f"± {millimetres} mm, {degrees} ° (1 σ){scene}",
+    }

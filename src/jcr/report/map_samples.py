@@ -1,4 +1,4 @@
-"""What the trained map says, asked where an image of it needs an answer."""
+"""Samples of the trained map for the drawings of it: points of its surface, and slices."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,26 +14,28 @@ if TYPE_CHECKING:
 
 MAX_CELLS = 700_000
 """Questions that find the surface: well under a second on one core."""
-FIRST_DRAWS, DRAWS = 10, 100
-"""Per cell that the surface may cross, and per cell that it was then found in."""
+FIRST_DRAWS, DRAWS = 8, 2
+"""Per cell that the surface may cross, and per third (along each axis) of one that it was then found in."""
 LAYER = 0.005
 """Metres; thickness of the layers among which the support surface is looked for."""
 CLEARANCE = 0.02
 """Metres above the support surface at which the horizontal slice lies: in the surface itself all is solid."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SurfacePoints:
-    """Points sampled where predicted occupancy is high, on the sides of it that somebody has seen."""
+    """Points sampled where predicted occupancy is high, on the sides of it that some camera has seen."""
 
     points_in_base: Float[ndarray, "n 3"]
     color: UInt8[ndarray, "n 3"]
     label: Int[ndarray, " n"]
     unknown_share: float
-    """Share of the workspace that nobody has seen."""
+    """Share of the workspace that no camera has seen."""
+    point_size: float
+    """Side (m) of the squares that are drawn in place of the points."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Slice:
     """Occupancy on an axis-aligned rectangle of the base frame; rows run along the second axis, upwards."""
 
@@ -61,24 +63,30 @@ def sample_surface(scene: "SceneMap", count: int, seed: int = 0) -> SurfacePoint
 
     rng = np.random.default_rng(seed)
 
-    def draw(cells: Float[ndarray, "k 3"], each: int) -> tuple[Float[ndarray, "k d 3"], Bool[ndarray, "k d"]]:
-        x = cells[:, None] + rng.uniform(-pitch / 2, pitch / 2, (len(cells), each, 3))
+    def solid_points(cells: Float[ndarray, "k 3"], side: float, each: int) -> Float[ndarray, "m 3"]:
+        """A solid point of each cell of that side in which `each` draws find one."""
+        x = cells[:, None] + side * (rng.random((len(cells), each, 3), np.float32) - 0.5)
         drawn = scene.query(x.reshape(-1, 3))
-        return x, ((drawn.occupancy >= 0.5) & ~drawn.unknown).reshape(x.shape[:2])
+        solid = ((drawn.occupancy >= 0.5) & ~drawn.unknown).reshape(x.shape[:2])
+        found = solid.any(1)
+        return x[found, solid[found].argmax(1)]
 
-    # Most of the border is where sight ended in thin air; the rest is drawn from again.
-    cells = centers[border]
-    cells = cells[draw(cells, FIRST_DRAWS)[1].any(1)]
-    x, solid = draw(cells, DRAWS)
-    x = x[solid]
-    # One a third of a cell: how thick the solid side is known to be must not decide how dense it looks.
-    third = np.floor((x - low) / (pitch / 3)).astype(np.int64)
-    thirds = np.ravel_multi_index(tuple(third.T), [3 * side for side in shape], mode="clip")
-    _, one = np.unique(thirds, return_index=True)
-    x = x[rng.permutation(one)[:count]]
+    # Most of the border is where sight ended in thin air; the rest is drawn from again, one point a third of a cell: how
+    # thick the solid side is known to be must not decide how dense it looks.
+    found = solid_points(centers[border], pitch, FIRST_DRAWS)
+    cells = low + pitch * (np.floor((found - low) / pitch) + 0.5)
+    thirds = np.stack(np.meshgrid(*[(-pitch / 3, 0.0, pitch / 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    x = solid_points((cells[:, None] + thirds).reshape(-1, 3), pitch / 3, DRAWS)
+    x = x[rng.permutation(len(x))[:count]]
     answer = scene.query(x)
     color = (255 * answer.color + 0.5).clip(0, 255).astype(np.uint8)
-    return SurfacePoints(x, color, answer.label, float(sample.unknown.mean()))
+    return SurfacePoints(
+        points_in_base=x,
+        color=color,
+        label=answer.label,
+        unknown_share=float(sample.unknown.mean()),
+        point_size=point_size(x),
+    )
 
 
 def slices(scene: "SceneMap", surface: SurfacePoints) -> tuple[Slice, Slice]:
@@ -107,7 +115,8 @@ def _slice(scene: "SceneMap", axes: tuple[int, int], at: float) -> Slice:
     x = np.full((len(b), len(a), 3), at)
     x[..., axes[0]], x[..., axes[1]] = np.meshgrid(a, b)
     sample = scene.query(x.reshape(-1, 3))
-    return Slice(axes, at, extent, sample.occupancy.reshape(x.shape[:2]), sample.unknown.reshape(x.shape[:2]))
+    occupancy, unknown = (values.reshape(x.shape[:2]) for values in (sample.occupancy, sample.unknown))
+    return Slice(axes=axes, at=at, extent=extent, occupancy=occupancy, unknown=unknown)
 
 
 def _fullest(values: Float[ndarray, " n"], width: float) -> float:

@@ -1,7 +1,6 @@
 """The section of residuals: a bar each image, and the fit as a whole, before and after features refined it."""
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 from jaxtyping import Float
@@ -10,50 +9,35 @@ from numpy import ndarray
 from jcr.calibration.words import missed
 from jcr.geometry import step_between
 from jcr.records import HandEye
-from jcr.report.markup import filled
-from jcr.report.pictures import shown_names
+from jcr.report.images import shown_names
+from jcr.report.render import Section
 from jcr.results import PosesResult, RunResult
 from jcr.rounding import significant
 
+NOTICEABLE = 1.05
+"""Times the random noise, from which the noise with systematic errors is named beside it."""
 
-def residuals_section(result: RunResult | PosesResult) -> str:
+
+def residuals_section(result: RunResult | PosesResult) -> Section:
     """Residuals image by image and of the whole, before and after the images' features refined the fit."""
     now, before = result.hand_eye, result.hand_eye.before
-    rows, used = [], now.inliers
     fits = [now] if before is None else [now, before]
-    longest_mm, longest_deg = (
-        max(float(residual(fit)[used].max(initial=0.0)) for fit in fits) or 1.0
-        for residual in (_residual_mm, _residual_deg)
-    )
-    names = shown_names(result.calibration.images)
-    for k, row in enumerate(result.image_index):
-        position = _bar([_residual_mm(fit)[k] for fit in fits], longest_mm, " mm")
-        orientation = _bar([_residual_deg(fit)[k] for fit in fits], longest_deg, "°")
-        rows.append(
-            f'<tr class="{"used" if used[k] else "rejected"}"><th>{escape(names[int(row)])}</th>'
-            f"<td>{position}</td><td>{orientation}</td></tr>"
-        )
-    heads, moved, tick = ["from camera poses"], "", ""
-    if before is not None:
-        step = step_between(before.gripper_from_camera, now.gripper_from_camera)
-        heads = ["from camera poses alone", "with the images' features"]
-        moved = (
-            "<p>Refining with the images' features moved the camera on the gripper by "
-            f"{significant(1e3 * float(np.linalg.norm(step[:3])))} mm and "
-            f"{significant(float(np.degrees(np.linalg.norm(step[3:]))))}°.</p>"
-        )
-        tick = (
-            " The upright tick is the same image by camera poses alone, before its features refined the fit."
-        )
-    return filled(
-        "residuals.html",
-        noise=_why_noise_is_larger(now),
-        tick=tick,
-        rows="".join(rows),
-        heads="".join(f"<th>{head}</th>" for head in heads),
-        whole=_whole(fits[::-1]),
-        moved=moved,
-    )
+    names, used = shown_names(result.calibration.images), now.inliers
+    columns = []
+    for residual, unit in ((_residual_mm, " mm"), (_residual_deg, "°")):
+        values = [residual(fit) for fit in fits]
+        longest = max(float(value[used].max(initial=0.0)) for value in values) or 1.0
+        columns.append([_bar([value[k] for value in values], longest, unit) for k in range(len(used))])
+    content = {
+        "refined": None if before is None else _refinement(before, now),
+        "rows": [
+            (bool(used[k]), names[int(row)], [column[k] for column in columns])
+            for k, row in enumerate(result.image_index)
+        ],
+        "noise": _noise(now),
+        "whole": _whole(fits[::-1]),
+    }
+    return Section("residuals", content)
 
 
 def _residual_mm(fit: HandEye) -> Float[ndarray, " n"]:
@@ -64,38 +48,34 @@ def _residual_deg(fit: HandEye) -> Float[ndarray, " n"]:
     return np.degrees(fit.images.rotation_residual_rad)
 
 
-def _why_noise_is_larger(fit: HandEye) -> str:
+def _refinement(before: HandEye, now: HandEye) -> tuple[str, str]:
+    """Millimetres and degrees by which the images' features moved the camera on the gripper."""
+    step = step_between(before.gripper_from_camera, now.gripper_from_camera)
+    degrees = float(np.degrees(np.linalg.norm(step[3:])))
+    return significant(1e3 * float(np.linalg.norm(step[:3]))), significant(degrees)
+
+
+def _noise(fit: HandEye) -> dict[str, str | int | None]:
     """Why the robot pose noise per axis is not the size of the residuals."""
     count = 6 * int(fit.inliers.sum())
-    taken = np.sqrt(count / max(count - 13, 1))
     noise, together = fit.robot_noise.translation, fit.robot_noise.together[0]
-    return (
-        f"The robot pose noise ({significant(1e3 * noise)} mm per axis"
-        + (f", {significant(1e3 * together)} mm with systematic errors" if together > 1.05 * noise else "")
-        + f") may be more than what these bars suggest: 13 unknowns were fitted to {count} numbers and took part of it "
-        f"away (a factor of {taken:.2f}), features pull the poses towards them, and of few images its size is itself "
-        "uncertain, which is counted. A bar is the length of three axes together."
-    )
-
-
-def _bar(values: Sequence[float], longest: float, unit: str) -> str:
-    """A bar for the first value, a tick for the second if there is one."""
-    shares = [min(100 * value / longest, 100) for value in values]
-    tick = f'<b style="left:{shares[1]:.1f}%"></b>' if len(shares) > 1 else ""
-    return (
-        f'<div class="bar"><div class="track"><i style="width:{shares[0]:.1f}%"></i>{tick}</div>'
-        f"<span>{significant(values[0])}{unit}</span></div>"
-    )
-
-
-def _whole(fits: Sequence[HandEye]) -> str:
-    held_out = [missed(fit.held_out) if fit.held_out else "–" for fit in fits]
-    rows = {
-        "leave-one-out error": held_out,
-        "mean δ<sub>t</sub>": [f"{significant(1e3 * fit.residuals.translation)} mm" for fit in fits],
-        "mean δ<sub>R</sub> (Frobenius norm)": [significant(fit.residuals.rotation) for fit in fits],
+    return {
+        "mm": significant(1e3 * noise),
+        "together_mm": significant(1e3 * together) if together > NOTICEABLE * noise else None,
+        "count": count,
+        "factor": f"{np.sqrt(count / max(count - 13, 1)):.2f}",
     }
-    return "".join(
-        f"<tr><th>{name}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
-        for name, cells in rows.items()
-    )
+
+
+def _bar(values: Sequence[float], longest: float, unit: str) -> tuple[float, float | None, str]:
+    """Percent of the bar for the first value, of a tick for the second if there is one, and the number."""
+    shares = [min(100 * float(value) / longest, 100.0) for value in values]
+    return shares[0], shares[1] if len(shares) > 1 else None, f"{significant(values[0])}{unit}"
+
+
+def _whole(fits: Sequence[HandEye]) -> dict[str, list[str]]:
+    return {
+        "error": [missed(fit.held_out) if fit.held_out else "–" for fit in fits],
+        "translation": [f"{significant(1e3 * fit.residuals.translation)} mm" for fit in fits],
+        "rotation": [significant(fit.residuals.rotation) for fit in fits],
+    }

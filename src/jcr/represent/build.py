@@ -92,9 +92,9 @@ def build_scene(
         "carving_s": f"{carved - start:.3f}",
         "training_s": f"{time.perf_counter() - carved:.3f}",
     }
-    fields.spread("occupancy")
-    seen = with_clear_cells(without_doubts(seen), fields.field_of("occupancy"))
-    return SceneMap(fields, seen, cloud.label_names, history)
+    scene = SceneMap(fields, without_doubts(seen), cloud.label_names, history)
+    scene.seen = with_clear_cells(scene.seen, fields.field_of("occupancy"))
+    return scene
 
 
 def feature_lattices(seen: SeenGrid) -> list[Lattice]:

@@ -1,7 +1,6 @@
 """The file of a map; without torch, which its fields need, reading one says what to install."""
 
 import json
-from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,11 +8,8 @@ from jcr.errors import InputError
 from jcr.extras import extra
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from jcr.represent.scene import SceneMap
 
-FORMAT = "jcr.map/1"
 FILE = "map.safetensors"
 
 
@@ -31,7 +27,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
     require_packages("a map")
     from safetensors import SafetensorError, safe_open
 
-    from jcr.represent.scene import scene_of
+    from jcr.represent.scene import FORMAT, digest, scene_of
 
     try:
         with safe_open(path, "pt") as file:
@@ -56,11 +52,3 @@ def require_packages(what: str, otherwise: str = "") -> None:
     """InputError where a package is not installed that training, reading and meshing a map need."""
     for package in ("torch", "safetensors", "skimage"):
         extra(package, "map", what, otherwise)
-
-
-def digest(tensors: "dict[str, Tensor]") -> str:
-    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
-    total = blake2b(digest_size=16)
-    for name in sorted(tensors):
-        total.update(name.encode() + tensors[name].numpy().tobytes())
-    return total.hexdigest()

@@ -1,7 +1,8 @@
 """Answers of a map at points."""
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,19 +10,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 from jcr.represent.chunks import in_chunks
-from jcr.represent.seen import CLEAR, CROSSED
-
-if TYPE_CHECKING:
-    from jcr.represent.scene import SceneMap
+from jcr.represent.distance import DistanceGrid
+from jcr.represent.fields import Fields
+from jcr.represent.seen import CLEAR, CROSSED, SeenGrid
 
 
 class Sample:
     """Answers at n points, each worked out when first asked for; arrays or tensors, as the points were."""
 
     def __init__(
-        self, scene: "SceneMap", x_in_base: Float[Tensor, "n 3"], unknown: str, tensors: bool
+        self,
+        fields: Fields,
+        seen: SeenGrid,
+        distance_grid: Callable[[str], DistanceGrid],
+        x_in_base: Float[Tensor, "n 3"],
+        *,
+        unknown: str,
+        tensors: bool,
     ) -> None:
-        self._scene, self._x, self._unknown_as, self._tensors = scene, x_in_base, unknown, tensors
+        """`distance_grid` gives the signed distance with the unknown as "occupied" or as "free"."""
+        self._fields, self._seen, self._distance_grid = fields, seen, distance_grid
+        self._properties = [name for shape in fields.shapes for name in shape.heads]
+        self._x, self._unknown_as, self._tensors = x_in_base, unknown, tensors
 
     @property
     def occupancy(self) -> Any:
@@ -54,28 +64,26 @@ class Sample:
     @cached_property
     def label(self) -> Any:
         """Segment (n,) of surfaces, named by the map's `label_names`; 0 = none, and where nobody has looked."""
-        scene = self._scene
 
         def label(x: Tensor) -> tuple[Tensor]:
-            if "label" not in scene.properties:
+            if "label" not in self._properties:
                 return (torch.zeros(len(x), dtype=torch.int64, device=x.device),)
-            return (torch.where(scene.seen.at(x) > 0, scene.fields(x, ("label",))["label"].argmax(1), 0),)
+            return (torch.where(self._seen.at(x) > 0, self._fields(x, ("label",))["label"].argmax(1), 0),)
 
         return self._given(in_chunks(label, self._x))[0]
 
     @cached_property
     def values(self) -> dict[str, Any]:
         """Further continuous properties (n,d) that the map was trained with; NaN outside of the workspace."""
-        further = [name for name in self._scene.properties if name not in ("occupancy", "color", "label")]
+        further = [name for name in self._properties if name not in ("occupancy", "color", "label")]
         return {name: self._continuous(name, -np.inf, np.inf) for name in further}
 
     @cached_property
     def _occupancy_unknown(self) -> tuple[Any, ...]:
         unseen = {"occupied": 1.0, "free": 0.0, "report": 0.5}[self._unknown_as]
-        scene = self._scene
 
         def occupancy_unknown(x: Tensor) -> tuple[Tensor, Tensor]:
-            state = scene.seen.at(x)
+            state = self._seen.at(x)
             # Most of a workspace is unseen or clear, where the field need not be asked, but for gradients.
             unknown = state == 0
             occupancy = torch.where(unknown, unseen, 0.0)
@@ -83,7 +91,7 @@ class Sample:
             (seen,) = asked.nonzero(as_tuple=True)
             if len(seen) == 0:
                 return occupancy, unknown
-            inner = scene.fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()
+            inner = self._fields(x[seen], ("occupancy",))["occupancy"][:, 0].sigmoid()
             # A cell that was hit but not crossed lies behind the surface: it can be solid, never free.
             known = ((state[seen] & CROSSED) != 0) | (inner >= 0.5)
             occupancy = occupancy.index_put((seen,), torch.where(known, inner, unseen))
@@ -94,20 +102,18 @@ class Sample:
 
     @cached_property
     def _distance_gradient(self) -> tuple[Any, ...]:
-        grid = self._scene.distance_grid("occupied" if self._unknown_as == "occupied" else "free")
+        grid = self._distance_grid("occupied" if self._unknown_as == "occupied" else "free")
 
         def distance_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
-            answer = torch.where(self._scene.seen.index(x)[1][:, None], grid.at(x), torch.nan)
+            answer = torch.where(self._seen.index(x)[1][:, None], grid.at(x), torch.nan)
             return answer[:, 0], answer[:, 1:]
 
         return self._given(in_chunks(distance_gradient, self._x))
 
     def _continuous(self, name: str, low: float, high: float) -> Any:
-        scene = self._scene
-
         def continuous(x: Tensor) -> tuple[Tensor]:
-            value = scene.fields(x, (name,))[name].clamp(low, high)
-            return (torch.where(scene.seen.index(x)[1][:, None], value, torch.nan),)
+            value = self._fields(x, (name,))[name].clamp(low, high)
+            return (torch.where(self._seen.index(x)[1][:, None], value, torch.nan),)
 
         return self._given(in_chunks(continuous, self._x))[0]
 

@@ -3,6 +3,7 @@
 import json
 import threading
 from dataclasses import asdict
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,10 +17,10 @@ from torch import Tensor
 from jcr.errors import InputError
 from jcr.files import write_bytes
 from jcr.geometry import apply, require_rigid
+from jcr.records.notebook import table
 from jcr.represent.chunks import in_chunks
 from jcr.represent.distance import DistanceGrid, distance_grid
 from jcr.represent.fields import Fields, FieldShape, Lattice
-from jcr.represent.map_file import FORMAT, digest
 from jcr.represent.robot import JointValues, RobotSpheres, load_robot
 from jcr.represent.sample import Sample
 from jcr.represent.seen import CROSSED, HIT, SeenGrid, dilate, halve
@@ -28,6 +29,8 @@ FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 """What is answered to `unknown="report"`."""
 
 Unknown = Literal["occupied", "free", "report"]
+FORMAT = "jcr.map/1"
+"""Of the file that `SceneMap.save` writes and map_file.py reads."""
 
 
 class SceneMap:
@@ -51,6 +54,18 @@ class SceneMap:
         self.fields.spread("occupancy")
         self._distance: dict[str, DistanceGrid] = {}
         self._lock = threading.Lock()
+
+    def _repr_html_(self) -> str:
+        """A table, for notebooks."""
+        lower, upper = self.box.round(3).tolist()
+        rows = [
+            ("workspace", f"{lower} to {upper} m, base frame"),
+            ("cell", f"{1e3 * self.cell:.1f} mm"),
+            ("properties", ", ".join(self.properties)),
+            ("labels", ", ".join(self.label_names)),
+            *self.history.items(),
+        ]
+        return table("map", rows)
 
     @property
     def box(self) -> Float[ndarray, "2 3"]:
@@ -77,7 +92,8 @@ class SceneMap:
         finite.
         """
         _check_choice(unknown)
-        return Sample(self, self._points(x_in_base, "points"), unknown, isinstance(x_in_base, Tensor))
+        x, tensors = self._points(x_in_base, "points"), isinstance(x_in_base, Tensor)
+        return Sample(self.fields, self.seen, self.distance_grid, x, unknown=unknown, tensors=tensors)
 
     def check_spheres(
         self,
@@ -230,6 +246,14 @@ class SceneMap:
         tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
         metadata = {"format": FORMAT, "about": json.dumps(about), "digest": digest(tensors)}
         write_bytes(path, save(tensors, metadata=metadata))
+
+
+def digest(tensors: dict[str, Tensor]) -> str:
+    """Of all numbers of a map: a bit that flipped in its weights would else answer a planner wrongly."""
+    total = blake2b(digest_size=16)
+    for name in sorted(tensors):
+        total.update(name.encode() + tensors[name].numpy().tobytes())
+    return total.hexdigest()
 
 
 def scene_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> SceneMap:

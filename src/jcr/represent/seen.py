@@ -134,8 +134,8 @@ def _before_nearest(
     axis = F.normalize(F.normalize(points, dim=1).mean(0), dim=0)
     across = torch.linalg.cross(axis, torch.eye(3, device=axis.device)[axis.abs().argmin()])
     across = F.normalize(across, dim=0)
-    turn = torch.stack([across, torch.linalg.cross(axis, across), axis])
-    u, v, depth = (points @ turn.T).unbind(-1)
+    rotation = torch.stack([across, torch.linalg.cross(axis, across), axis])
+    u, v, depth = (points @ rotation.T).unbind(-1)
     ahead = depth > 0.1 * points.norm(dim=1)
     u, v, depth = u[ahead] / depth[ahead], v[ahead] / depth[ahead], depth[ahead]
     u0, v0 = u.min(), v.min()
@@ -145,16 +145,16 @@ def _before_nearest(
     bins = ((v - v0) / pitch).long() * columns + ((u - u0) / pitch).long()
     nearest = torch.zeros(rows * columns, device=u.device)
     nearest.scatter_reduce_(0, bins, depth, "amin", include_self=False)
-    u, v, depth = (assumed @ turn.T).unbind(-1)
+    u, v, depth = (assumed @ rotation.T).unbind(-1)
     column, row = ((u / depth - u0) / pitch).floor(), ((v / depth - v0) / pitch).floor()
     inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
     bins = (row * columns + column)[inside].long()
     nearest.scatter_reduce_(0, bins, depth[inside], "amin")
 
-    # The centres of the blocks in the turned frame are an outer sum, one term an axis.
+    # The centres of the blocks in the rotated frame are an outer sum, one term an axis.
     def along(row: int) -> Tensor:
-        start = turn[row] @ (lower + block / 2 - center)
-        x, y, z = (turn[row, a] * block * torch.arange(n, device=u.device) for a, n in enumerate(blocks))
+        start = rotation[row] @ (lower + block / 2 - center)
+        x, y, z = (rotation[row, a] * block * torch.arange(n, device=u.device) for a, n in enumerate(blocks))
         return start + x + y[:, None] + z[:, None, None]
 
     depth = along(2)

@@ -14,7 +14,7 @@ from jcr.errors import InputError
 from jcr.records import Capture, Reconstruction
 
 MOST = 1024
-"""Labels that are believed to be labels; an image given by mistake has more."""
+"""Largest number of labels; an image given by mistake has more."""
 
 
 @dataclass(frozen=True)

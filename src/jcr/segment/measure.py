@@ -33,7 +33,7 @@ SAME_TOP = 0.05
 """Of the height by which images left out may move the top (jackknife) when it is the same top they show."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ObjectSize:
     """One object on the support plane; standard deviations are one sigma."""
 
@@ -63,16 +63,16 @@ class Measured:
     """Largest footprint first."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Shape:
-    """What the points of one object say in the support's frame."""
+    """Size and place of one object, in the support's frame."""
 
     top: float
     top_std: float
     """How far below the top a rim may lie that is narrower than what depth resolves."""
     spread: float
     """One-sigma spread of the points about the top."""
-    turn: float
+    rotation_rad: float
     """Radians from the support's x axis to the longer side."""
     center: Float[ndarray, "2"]
     sides: Float[ndarray, "2"]
@@ -84,7 +84,7 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
 
     The support plane's own label, and label 0, are no objects. `scale_std` is the relative uncertainty (one
     sigma) of the calibration's scale. Standard deviations are the jackknife's over images (Efron and Stein
-    1981): depth errors go together within an image, so the number of points says nothing. To it add the scale,
+    1981): depth errors go together within an image, so the number of points does not count. To it add the scale,
     the spread of the top over the root of the number of images, how narrow the top is and how bent the table, and
     at the sides half a cell. Raises InputError when no plane carries the scene.
     """
@@ -105,7 +105,7 @@ def measure(cloud: PointCloud, scale_std: float = 0.0, support: Support | None =
         parts = []
         for k in np.unique(image):
             if (image != k).sum() >= FEWEST:
-                part = _shape(x[image != k], support.roughness, whole.turn)
+                part = _shape(x[image != k], support.roughness, whole.rotation_rad)
                 parts.append([part.top - plane_without.get(k, 0.0), *part.sides])
         sizes.append(
             _size(int(label), cloud.label_names[label], len(x), whole, np.array(parts), support, scale_std)
@@ -131,7 +131,7 @@ def _size(
         jackknife = np.sqrt((len(parts) - 1) * parts[:, [1, 2, 0]].var(0))
     std = np.sqrt(jackknife**2 + own**2 + (scale_std * size) ** 2)
     support_from_box = transform(
-        rotation_exp(np.array([0.0, 0.0, shape.turn])), np.append(shape.center, shape.top / 2)
+        rotation_exp(np.array([0.0, 0.0, shape.rotation_rad])), np.append(shape.center, shape.top / 2)
     )
     outline = np.column_stack([shape.outline, np.zeros(len(shape.outline))])
     return ObjectSize(
@@ -155,17 +155,27 @@ def _without_each(values: Float[ndarray, " n"], image: Int[ndarray, " n"]) -> di
     return {int(k): float((values.sum() - total[k]) / left[k]) for k in np.flatnonzero(count) if left[k] > 0}
 
 
-def _shape(x_in_support: Float[ndarray, "n 3"], roughness: float, turn: float | None = None) -> _Shape:
+def _shape(
+    x_in_support: Float[ndarray, "n 3"], roughness: float, rotation_rad: float | None = None
+) -> _Shape:
     top, top_std, spread = _top(x_in_support, roughness)
     xy, area = _dense(x_in_support[:, :2])
     middle = xy.mean(0)
-    turn = _turn(_outline(xy - middle)) if turn is None else turn
-    along = (xy - middle) @ _axes(turn).T
+    rotation_rad = _rotation_to_longer_side(_outline(xy - middle)) if rotation_rad is None else rotation_rad
+    along = (xy - middle) @ _axes(rotation_rad).T
     ends = [SIDE_SHARE, 1 - SIDE_SHARE]
     low, high = np.quantile(along, ends, axis=0, weights=area, method="inverted_cdf")
     within = ((along >= low) & (along <= high)).all(1)
-    center = middle + (low + high) / 2 @ _axes(turn)
-    return _Shape(top, top_std, spread, turn, center, high - low, _outline(xy[within] - middle) + middle)
+    center = middle + (low + high) / 2 @ _axes(rotation_rad)
+    return _Shape(
+        top=top,
+        top_std=top_std,
+        spread=spread,
+        rotation_rad=rotation_rad,
+        center=center,
+        sides=high - low,
+        outline=_outline(xy[within] - middle) + middle,
+    )
 
 
 def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
@@ -173,11 +183,11 @@ def _outline(xy: Float[ndarray, "n 2"]) -> Float[ndarray, "k 2"]:
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
 
 
-def _turn(hull: Float[ndarray, "k 2"]) -> float:
+def _rotation_to_longer_side(hull: Float[ndarray, "k 2"]) -> float:
     """Radians to the longer side of the smallest rectangle around a convex outline."""
-    turn = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
-    length, width = np.ptp(hull @ _axes(turn).T, axis=0)
-    return turn + np.pi / 2 * (length < width)
+    rotation_rad = float(np.radians(cv2.minAreaRect(hull.astype(np.float32))[2]))
+    length, width = np.ptp(hull @ _axes(rotation_rad).T, axis=0)
+    return rotation_rad + np.pi / 2 * (length < width)
 
 
 def _top(x_in_support: Float[ndarray, "n 3"], roughness: float) -> tuple[float, float, float]:
@@ -264,5 +274,7 @@ def _dense(xy: Float[ndarray, "n 2"]) -> tuple[Float[ndarray, "k 2"], Float[ndar
     return xy[kept], 1 / count[cell][kept]
 
 
-def _axes(turn: float) -> Float[ndarray, "2 2"]:
-    return np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+def _axes(rotation_rad: float) -> Float[ndarray, "2 2"]:
+    return np.array(
+        [[np.cos(rotation_rad), np.sin(rotation_rad)], [-np.sin(rotation_rad), np.cos(rotation_rad)]]
+    )

@@ -20,6 +20,7 @@ from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import apply_similarity
 from jcr.progress import Progress
+from jcr.reconstruct.hub import cached_files
 from jcr.records import HandEye, Reconstruction
 from jcr.segment.labels import LabelImages
 
@@ -42,19 +43,27 @@ OVERLAP = 0.5
 
 
 def load_sam(weights: str) -> "Sam2Model":
-    """Segment Anything 2 by hub id or path; raises InputError, with the remedy, where it cannot be had."""
+    """Segment Anything 2 by hub id or path; InputError, with the remedy, where it is not on this machine or damaged."""
     extra("transformers", "sam", "--segments sam")
     from transformers import Sam2Model, logging
+
+    folder = weights
+    if not os.path.isdir(weights):
+        if not (cached := cached_files(weights)):
+            raise InputError(
+                f"--sam-weights {weights}: not on this machine; jcr models get {weights} downloads them"
+            )
+        folder = str(cached[0].parent)
 
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()  # loading takes moments, and --quiet means quiet
     try:
-        model = Sam2Model.from_pretrained(weights)
+        model = Sam2Model.from_pretrained(folder, local_files_only=True)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        hint = "the folder must hold config.json and model.safetensors" if os.path.isdir(weights) else ""
         raise InputError(
-            f"--sam-weights {weights}: cannot be loaded ({reason}); {hint or 'check the name'}"
+            f"--sam-weights {weights}: cannot be loaded ({reason}); the folder must hold config.json and "
+            "model.safetensors"
         ) from None
     finally:
         if bars:

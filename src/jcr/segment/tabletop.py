@@ -54,7 +54,7 @@ PLANES, SAMPLE = 400, 20_000
 def support_plane(cloud: PointCloud, seed: int = 0) -> Support:
     """The plane with most points on it that has the cameras on one side (RANSAC, then robust least squares).
 
-    What was filled in by planes is left out of the fit and its noise: it lies where a plane was believed to be.
+    What was filled in by planes is left out of the fit and its noise: it lies on planes by construction.
     Raises InputError when no plane holds a tenth of the points.
     """
     draw = np.random.default_rng(seed)

@@ -1,35 +1,22 @@
-"""Simulated systematic robot errors: reported poses from nominal kinematics, true poses from a bent arm.
+"""Simulated arms: where a camera on them looks, and the truth for one whose reported poses are bent.
 
 The truth for a hand-eye calibration of such an arm is the *effective* transform: of all hand-eye transforms and
 bases, the one that best predicts the camera from the reported poses over the workspace of the capture. The physical
 transform differs from it by a constant that no pose shows.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.errors import InputError
-from jcr.geometry import inverse, retract, rotation_exp, skew, step_between, transform
-from jcr.handeye.equation import predict, residuals
+from jcr.geometry import inverse, rotation_exp, skew, transform
 from jcr.handeye.inverse_kinematics import inverse_kinematics, reach_toward
-from jcr.handeye.known_scale import FREE, Fit, fit_known_scale
-from jcr.handeye.robots import (
-    Arm,
-    ErrorSizes,
-    Joints,
-    Kind,
-    bent_kinematics,
-    error_names,
-    error_std,
-    forward_kinematics,
-    kinematic_jacobian,
-)
+from jcr.handeye.known_scale import Fit, fit_known_scale
+from jcr.handeye.robots import Arm, Joints, forward_kinematics, kinematic_jacobian
+from jcr.simulate.bent_arm import BentArm
 from jcr.simulate.poses import Pattern, gripper_poses, random_hand_eye
 
-ALL_KINDS: tuple[Kind, ...] = ("joint", "link", "sag", "gear")
 EFFECTIVE_POSES = 120
 """Poses to which the effective hand-eye transform is fitted."""
 EFFECTIVE_NOISE = (1e-3, 2e-3)
@@ -52,34 +39,6 @@ STRIDE = 0.4
 """rad by which joints move about a posture while what the gripper carries is watched."""
 NEAREST, FARTHEST = 0.6, 1.5
 """Accepted distance to the aim, over that of the wished view."""
-
-
-@dataclass(frozen=True)
-class BentArm:
-    """An arm with drawn errors."""
-
-    arm: Arm
-    errors: Float[ndarray, " p"]
-    """In the order of `error_names(arm, ALL_KINDS)`; m and rad."""
-
-    def reported(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
-        """base_from_gripper (n,4,4) as the controller computes it."""
-        return forward_kinematics(self.arm, joints)
-
-    def true(self, joints: Joints) -> Float[ndarray, "n 4 4"]:
-        """base_from_gripper (n,4,4) of the bent arm."""
-        return bent_kinematics(self.arm, joints, self.errors, ALL_KINDS)
-
-    def named_errors(self) -> dict[str, float]:
-        """The errors that are not zero, by name (m, rad)."""
-        names = error_names(self.arm, ALL_KINDS)
-        return {name: float(value) for name, value in zip(names, self.errors, strict=True) if value}
-
-
-def bend(arm: Arm, sizes: ErrorSizes, rng: np.random.Generator) -> BentArm:
-    """The arm with random errors of the given sizes."""
-    std = error_std(arm, sizes, ALL_KINDS)
-    return BentArm(arm, std * rng.normal(size=len(std)))
 
 
 def hand_eye_on(arm: Arm, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
@@ -215,7 +174,7 @@ def patterned(
     if not posture.fits:
         raise InputError(
             f"--pattern {pattern}: a {arm.name} does not reach all of its views (up to "
-            f"{1e3 * posture.missed_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
+            f"{1e3 * posture.misfit_m.max():.0f} mm off); choose a larger arm, another --seed, or varied"
         )
     return posture.joints
 
@@ -256,18 +215,6 @@ def effective_exchanged(
     """The pair that from reported poses best predicts where the camera sees the object; as effective_about."""
     reported, true = bent.reported(joints), bent.true(joints)
     object_from_camera = inverse(true @ gripper_from_object) @ base_from_camera
-    x, z, weight = base_from_camera, gripper_from_object, 1 / np.repeat(EFFECTIVE_NOISE, 3)
-    for _ in range(30):
-        predicted = predict(x, 1.0, z, object_from_camera)
-        off = step_between(reported, inverse(predicted))
-        rotation_t = np.swapaxes(predicted[:, :3, :3], 1, 2)
-        to_inverse = np.zeros((len(true), 6, 6))
-        to_inverse[:, :3, :3] = to_inverse[:, 3:, 3:] = -rotation_t
-        to_inverse[:, :3, 3:] = -rotation_t @ skew(predicted[:, :3, 3])
-        j = to_inverse @ residuals(x, 1.0, z, inverse(reported), object_from_camera)[1]
-        rows = (weight[:, None] * j[:, :, FREE]).reshape(-1, len(FREE))
-        step = -np.linalg.lstsq(rows, (weight * off).ravel(), rcond=1e-9)[0]
-        x, z = retract(x, step[:6]), retract(z, step[6:])
-        if np.abs(step).max() < 1e-12:
-            break
-    return x, z
+    start = base_from_camera, gripper_from_object
+    found = fit_known_scale(reported, object_from_camera, start, EFFECTIVE_NOISE, exchanged=True)
+    return found.gripper_from_camera, found.base_from_recon

@@ -11,7 +11,7 @@ from numpy import ndarray
 from jcr.capture.images import encode_png
 from jcr.files import write_bytes, write_text
 from jcr.records import Intrinsics
-from jcr.simulate.robots import BentArm
+from jcr.simulate.bent_arm import BentArm
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the 16-bit depth images."""

@@ -15,7 +15,7 @@ from jcr.geometry import apply
 from jcr.progress import Progress, silent
 from jcr.records import verdict_of
 from jcr.records.words import reached_in_words, sentence
-from jcr.report.figures import TRACK_COLOR, label_colors
+from jcr.report.raster import TRACK_COLOR, label_colors
 from jcr.represent.scene import Unknown
 from jcr.view.layers import (
     LEAST,

@@ -13,8 +13,8 @@ from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
-from jcr.reconstruct.direct.coarse_to_fine import axes_meet, free_directions, moved
-from jcr.reconstruct.direct.direct import evening, pyramid, reconstruct
+from jcr.reconstruct.direct.coarse_to_fine import after_step, axes_meet, free_directions
+from jcr.reconstruct.direct.direct import exposure_gains, pyramid, reconstruct_direct
 from jcr.reconstruct.direct.photometric import (
     Cameras,
     Level,
@@ -24,7 +24,7 @@ from jcr.reconstruct.direct.photometric import (
     on_rays,
     strongest,
 )
-from jcr.reconstruct.direct.search import starts_from_nothing
+from jcr.reconstruct.direct.search import starting_hand_eyes
 from jcr.records import Intrinsics
 from jcr.simulate.capture import SimulateOptions, simulate
 
@@ -43,7 +43,7 @@ def plain(tmp_path_factory):
 
 def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     capture, truth = plain
-    reconstruction = reconstruct(capture)
+    reconstruction = reconstruct_direct(capture)
     hand_eye = calibrate(capture, reconstruction)
     assert hand_eye.converged and hand_eye.inliers.all()
     missed = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
@@ -61,7 +61,7 @@ def test_a_picture_of_another_pose_is_left_out_and_named(plain):
     capture, truth = plain
     poses = capture.base_from_gripper.copy()
     poses[4] = poses[0]
-    reconstruction = reconstruct(replace(capture, base_from_gripper=poses))
+    reconstruction = reconstruct_direct(replace(capture, base_from_gripper=poses))
     assert reconstruction.image_index.tolist() == [0, 1, 2, 3, 5]
     assert f"fit nowhere near their poses: {capture.images[4]}" in " ".join(reconstruction.notes)
     x = calibrate(replace(capture, base_from_gripper=poses), reconstruction).gripper_from_camera
@@ -76,7 +76,7 @@ def test_pictures_of_other_poses_are_refused(plain):
         intrinsics=truth.intrinsics,
     )
     with pytest.raises(NotTrustedError, match="direct alignment"):
-        reconstruct(mixed)
+        reconstruct_direct(mixed)
 
 
 def test_images_of_different_exposure_are_evened(plain):
@@ -84,9 +84,9 @@ def test_images_of_different_exposure_are_evened(plain):
     images = [read_image(capture.folder / name) for name in capture.images]
     level = pyramid(images, truth.intrinsics)[60]
     cameras = Cameras(truth.base_from_camera)
-    np.testing.assert_array_equal(evening(level, cameras), 1)  # what differs is shading
+    np.testing.assert_array_equal(exposure_gains(level, cameras), 1)  # what differs is shading
     factor = np.array([0.75, 1.3, 1.0, 0.9, 1.1, 1.0])
-    found = evening(level.times(factor), cameras) * factor
+    found = exposure_gains(level.times(factor), cameras) * factor
     left = np.abs(np.log(found) - np.log(found).mean()).max()
     assert left < 0.1 < 0.25 < np.abs(np.log(factor)).max()
 
@@ -97,19 +97,19 @@ def test_pictures_of_nothing_are_refused(plain, tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.new("RGB", capture.image_size, (120, 110, 100)).save(tmp_path / name)
     with pytest.raises(NotTrustedError, match="one colour"):
-        reconstruct(replace(capture, folder=tmp_path))
+        reconstruct_direct(replace(capture, folder=tmp_path))
 
 
 def test_two_images_are_too_few(plain):
     capture, _ = plain
     two = replace(capture, images=capture.images[:2], base_from_gripper=capture.base_from_gripper[:2])
     with pytest.raises(InputError, match="3 images or more"):
-        reconstruct(two)
+        reconstruct_direct(two)
 
 
 def test_one_start_looks_where_the_camera_does(plain):
     capture, truth = plain
-    starts = starts_from_nothing(capture.base_from_gripper)
+    starts = starting_hand_eyes(capture.base_from_gripper)
     assert rotation_between_deg(starts[:, :3, :3], truth.gripper_from_camera[:3, :3]).min() < 15
 
 
@@ -174,7 +174,7 @@ def test_gradient_is_that_of_the_energy(tied):
     step = 1e-3
     slope = np.zeros_like(gradient)
     for k, direction in enumerate(step * np.eye(len(gradient))):
-        ahead, behind = (energy(level, moved(off, sign * direction), points, 0.2) for sign in (1, -1))
+        ahead, behind = (energy(level, after_step(off, sign * direction), points, 0.2) for sign in (1, -1))
         slope[k] = (ahead - behind) / (2 * step)
     cosine = slope @ gradient / (np.linalg.norm(slope) * np.linalg.norm(gradient))
     assert cosine > 0.99
@@ -182,9 +182,9 @@ def test_gradient_is_that_of_the_energy(tied):
 
 def test_free_cameras_keep_the_first_and_the_scale():
     cameras = cameras_over_a_plane()
-    directions = free_directions(cameras, lens_held=True)
+    directions = free_directions(cameras, intrinsics_known=True)
     assert directions.shape == (25, 6 * 3 - 1)
-    after = moved(cameras, 1e-6 * directions.sum(1))
+    after = after_step(cameras, 1e-6 * directions.sum(1))
     np.testing.assert_allclose(after.base_from_camera[0], cameras.base_from_camera[0])
     assert after.zoom == cameras.zoom
     before = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera

@@ -36,7 +36,7 @@ def loaded() -> "LoadedNetwork":
     network = Dust3r(
         enc_embed_dim=32, enc_depth=2, enc_num_heads=2, dec_embed_dim=32, dec_depth=2, dec_num_heads=2
     )
-    return LoadedNetwork(network.eval().requires_grad_(False), "seeded", "none", is_metric=True)
+    return LoadedNetwork(network.eval().requires_grad_(False), is_metric=True)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_every_image_is_encoded_once_and_the_cache_spares_the_network(
     flipped.write_bytes(content)
     cut.write_bytes(cut.read_bytes()[:-1])
     poses = np.tile(np.eye(4), (4, 1, 1))
-    memory._say.cache_clear()
+    memory._write_once.cache_clear()
     third, notes = predict_pairs(loaded, images, NAMES, poses, options(tmp_path))
     assert sum(decoded) == 14
     assert notes == (f"2 of the pairs in the cache {tmp_path} were damaged: predicted again",)

@@ -15,12 +15,14 @@ from jcr.cli import dispatch
 from jcr.errors import InputError
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, weights_of
 from jcr.reconstruct.global_alignment.pairs import read_pairs
+from jcr.reconstruct.hub import Weights
 
 if TYPE_CHECKING:
     import torch
 
     from jcr.reconstruct.dust3r.dust3r import Dust3rOptions
     from jcr.reconstruct.dust3r.network import Dust3r
+    from jcr.reconstruct.dust3r.weights import LoadedNetwork
 
 pytestmark = pytest.mark.slow
 
@@ -85,6 +87,13 @@ def write_folder(folder: Path, network: "Dust3r", config: dict[str, object] = CO
     return folder
 
 
+def load(path: Path, device: str = "cpu") -> "LoadedNetwork":
+    """The network in a file or folder of unknown licence."""
+    from jcr.reconstruct.dust3r.weights import load_weights
+
+    return load_weights(Weights(path, str(path), "unknown"), device)
+
+
 def assert_same_output(network: "Dust3r", loaded: "Dust3r") -> None:
     import torch
 
@@ -98,16 +107,16 @@ def assert_same_output(network: "Dust3r", loaded: "Dust3r") -> None:
 def test_every_layout_loads_to_the_same_network(
     tmp_path: Path, network: "Dust3r", capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from jcr.reconstruct.dust3r.weights import fingerprint, load_weights
+    from jcr.reconstruct.dust3r.weights import fingerprint
 
     folder = write_folder(tmp_path / "folder", network)
     pth = write_pth(tmp_path / "weights.pth", network)
     for source in (folder, folder / "model.safetensors", pth):
-        loaded = load_weights(source)
+        loaded = load(source)
         assert_same_output(network, loaded.network)
         assert fingerprint(loaded.network) == fingerprint(network)
         assert not loaded.is_metric
-    load_weights(pth)
+    load(pth)
     said = capsys.readouterr().err
     assert said.count(f"weights {pth}: licence unknown") == 1
 
@@ -115,18 +124,14 @@ def test_every_layout_loads_to_the_same_network(
 def test_a_second_decoder_that_is_not_stored_is_a_copy_of_the_first(tmp_path: Path, linear: "Dust3r") -> None:
     import torch
 
-    from jcr.reconstruct.dust3r.weights import load_weights
-
     state = {key: value for key, value in linear.state_dict().items() if not key.startswith("dec_blocks2.")}
     torch.save({"args": argparse.Namespace(model=LINEAR_MODEL), "model": state}, tmp_path / "croco.pth")
-    loaded = load_weights(tmp_path / "croco.pth").network
+    loaded = load(tmp_path / "croco.pth").network
     assert torch.equal(loaded.dec_blocks2[1].mlp.fc1.weight, linear.dec_blocks[1].mlp.fc1.weight)
 
 
 def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: "Dust3r") -> None:
     import torch
-
-    from jcr.reconstruct.dust3r.weights import load_weights
 
     model = MODEL.replace("AsymmetricCroCo3DStereo", "AsymmetricMASt3R").replace("'dpt'", "'catmlp+dpt'")
     model = model.replace("'pts3d'", "'pts3d+desc24'").replace(")\n", "")[:-1] + ", two_confs=True)"
@@ -136,7 +141,7 @@ def test_mast3r_is_the_same_network_in_metres(tmp_path: Path, network: "Dust3r")
         for layer in (1, 2)
         for leaf in ("weight", "bias")
     }
-    loaded = load_weights(write_pth(tmp_path / "mast3r.pth", network, model, **matching))
+    loaded = load(write_pth(tmp_path / "mast3r.pth", network, model, **matching))
     assert loaded.is_metric
     assert_same_output(network, loaded.network)
 
@@ -155,8 +160,6 @@ class Trap:
 def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
     import torch
 
-    from jcr.reconstruct.dust3r.weights import load_weights
-
     sprung = tmp_path / "sprung"
     content = {"args": argparse.Namespace(model=MODEL, trap=Trap(sprung)), "model": {}}
     bad = tmp_path / "bad.pth"
@@ -165,7 +168,7 @@ def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
     else:
         torch.save(content, bad)
     with pytest.raises(InputError, match=r"bad\.pth: damaged, or holds code"):
-        load_weights(bad)
+        load(bad)
     assert not sprung.exists()
 
 
@@ -180,20 +183,17 @@ def test_a_pickle_with_code_does_not_run(tmp_path: Path, layout: str) -> None:
     ],
 )
 def test_the_model_string_is_read_and_never_evaluated(tmp_path: Path, linear: "Dust3r", model: str) -> None:
-    from jcr.reconstruct.dust3r.weights import load_weights
 
     with pytest.raises(InputError, match="no checkpoint of DUSt3R"):
-        load_weights(write_pth(tmp_path / "weights.pth", linear, model))
+        load(write_pth(tmp_path / "weights.pth", linear, model))
 
 
 def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear: "Dust3r") -> None:
     import torch
 
-    from jcr.reconstruct.dust3r.weights import load_weights
-
     def complaint(source: Path | str) -> str:
         with pytest.raises(InputError) as caught:
-            load_weights(source)
+            load(source)
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -232,7 +232,7 @@ def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, linear:
     write_pth(pth, linear, LINEAR_MODEL)
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="use --device cpu"):
-            load_weights(pth, "cuda")
+            load(pth, "cuda")
 
 
 @pytest.mark.parametrize(("device", "expected"), [("cpu", "cpu"), ("cuda", "cuda"), ("auto", "cuda")])
@@ -247,33 +247,34 @@ def test_predict_runs_on_the_device_that_is_asked_for(
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("jcr.reconstruct.dust3r.dust3r.predict", predict)
-    assert dispatch(["predict", str(tabletop), str(tmp_path / "pairs.npz"), "--device", device]) == 2
+    command = ["predict", str(tabletop), str(tmp_path / "pairs.npz"), "--weights", str(tmp_path)]
+    assert dispatch([*command, "--device", device]) == 2
     assert used == [expected]
 
 
-def test_a_hub_id_comes_from_the_cache_and_offline_says_so(
+def test_a_hub_id_comes_from_the_cache(
     tmp_path: Path, linear: "Dust3r", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import huggingface_hub.constants
 
     from jcr.reconstruct.dust3r.weights import load_weights
 
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
     row = BACKENDS["dust3r"]
-    hub_id, licence = weights_of(ReconstructOptions("dust3r"))
-    assert hub_id == row.hub_id and not row.has_weights()
-    with pytest.raises(InputError, match="not in the cache and not to be had from the hub"):
-        load_weights(hub_id)
-    repository = tmp_path / f"models--{hub_id.replace('/', '--')}"
+    assert not row.has_weights()
+    repository = tmp_path / f"models--{row.hub_id.replace('/', '--')}"
+    # Of another commit than the pinned one: whatever was downloaded last, by this program or another.
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("0" * 40)
     (repository / "snapshots").mkdir()
     write_folder(repository / "snapshots" / ("0" * 40), linear, LINEAR_CONFIG)
     assert row.has_weights()
-    loaded = load_weights(hub_id, licence=licence)
-    assert loaded.licence.startswith("CC BY-NC-SA 4.0")
-    assert_same_output(linear, loaded.network)
+    weights = weights_of(ReconstructOptions("dust3r"))
+    assert weights.name == row.hub_id and weights.licence.startswith("CC BY-NC-SA 4.0")
+    assert_same_output(linear, load_weights(weights).network)
+    # The pinned one is preferred.
+    write_folder(repository / "snapshots" / row.revision, linear, LINEAR_CONFIG)
+    assert weights_of(ReconstructOptions("dust3r")).path.name == row.revision
 
 
 def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(

@@ -7,8 +7,7 @@ import numpy as np
 from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.geometry import apply, inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
-from jcr.reconstruct.global_alignment.align import AlignOptions
-from jcr.reconstruct.global_alignment.alignment import pinhole_of
+from jcr.reconstruct.global_alignment.alignment import AlignOptions, pinhole_of
 from jcr.reconstruct.global_alignment.gauss_newton import Problem, Solution, solve_free
 from jcr.reconstruct.global_alignment.kinematic import HandEyeCameras, solve_kinematic
 from jcr.reconstruct.global_alignment.observations import weight_is_log

@@ -11,16 +11,15 @@ from benchmarks.synthetic_pairs import PairErrors, synthetic_pairs
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import scale_in_words
 from jcr.geometry import inverse, rotation_exp, rotation_log, transform
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs
 from jcr.reconstruct.from_pairs import reconstruction_from_pairs
-from jcr.reconstruct.global_alignment.align import AlignOptions, align
+from jcr.reconstruct.global_alignment.align import AlignOptions, align, align_with_robot
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.global_alignment.with_robot import align_with_robot
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
 from jcr.records import Capture, HandEye, Reconstruction
+from jcr.records.words import network_scale
 
 SIZE = (48, 36)
 FEW_PIXELS = AlignOptions(pixels=432)
@@ -161,9 +160,9 @@ def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: 
     content = calibration_file(made.capture, reconstruction, found, {}, "0")
     assert content.scale_check.off_percent == check.off_percent
     assert any("check the unit of the gripper poses" in text for text in content.warnings) == (factor > 10)
-    assert ("agrees with the robot's" in scale_in_words(check)) == (factor == 1)
-    assert ("too long" in scale_in_words(check)) == (factor == 1.05)
-    assert ("times the robot's" in scale_in_words(check)) == (factor == 1000)
+    assert ("agrees with the robot's" in network_scale(check.off_percent, check.std_percent)) == (factor == 1)
+    assert ("too long" in network_scale(check.off_percent, check.std_percent)) == (factor == 1.05)
+    assert ("times the robot's" in network_scale(check.off_percent, check.std_percent)) == (factor == 1000)
     unknown = calibrate(made.capture, replace(reconstruction, is_metric=False))
     assert unknown.scale_evidence.network is None
 

@@ -21,6 +21,7 @@ from jcr.geometry import (
     rotation_between_deg,
     transform,
 )
+from jcr.reconstruct.hub import Weights
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 pytestmark = pytest.mark.slow  # draws, and torch
@@ -106,22 +107,26 @@ class Fake:
 
 
 def options(**changes):
-    from jcr.reconstruct.views_at_once.cost import Cost
-    from jcr.reconstruct.views_at_once.views_at_once import ViewsOptions
+    from jcr.reconstruct.views_at_once.views_at_once import Cost, ViewsOptions
 
     def load(weights, device):
         raise AssertionError
 
-    made = ViewsOptions("da3", load, Path("weights"), "Apache-2.0", Cost(0.1, 0.1, 1.0, 0.1))
+    made = ViewsOptions(
+        backend="da3",
+        load=load,
+        weights=Weights(Path("weights"), "weights", "Apache-2.0"),
+        cost=Cost(0.1, 0.1, 1.0, 0.1),
+    )
     return replace(made, **changes)
 
 
 def test_matches_by_colour_put_predicted_cameras_right_and_say_how_surely(capture: Capture) -> None:
     from jcr.calibration.stage import calibrate
-    from jcr.reconstruct.views_at_once.views_at_once import reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     predict = Fake()
-    found = reconstruct(capture, options(), predict=predict)
+    found = reconstruct_views_at_once(capture, options(), predict=predict)
     assert found.evidence is not None and "refined" in found.notes[1]
     truth = base_from_camera()
     base, scale = fit_similarity(truth[:, :3, 3], found.recon_from_camera[:, :3, 3])
@@ -171,10 +176,10 @@ def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
 def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better(
     capture: Capture, better: bool
 ) -> None:
-    from jcr.reconstruct.views_at_once.views_at_once import reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     predict = Fake(bend=0.02, better_again=better)
-    found = reconstruct(capture, options(takes_poses=True), predict=predict)
+    found = reconstruct_views_at_once(capture, options(takes_poses=True), predict=predict)
     assert predict.shown[0] is None and len(predict.shown) == 2
     between = inverse(predict.shown[1][0]) @ predict.shown[1]
     true = inverse(base_from_camera()[0]) @ base_from_camera()
@@ -182,14 +187,14 @@ def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better
     note = next(note for note in found.notes if note.startswith("second pass"))
     if not better:
         assert note.endswith("not kept")
-    once = reconstruct(capture, options(), predict=Fake(bend=0.02))
+    once = reconstruct_views_at_once(capture, options(), predict=Fake(bend=0.02))
     assert found.evidence is not None and once.evidence is not None
     # Its cameras are the robot's: those of the images alone stay.
     np.testing.assert_array_equal(found.evidence.recon_from_camera, once.evidence.recon_from_camera)
 
 
 def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
-    from jcr.reconstruct.views_at_once.views_at_once import reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     turned, shifted = capture.base_from_gripper.copy(), capture.base_from_gripper.copy()
     turned[2] = retract(turned[2], np.array([0, 0, 0, 0.25, 0.15, 0.25]))
@@ -198,20 +203,22 @@ def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
         (turned, "2.png: its angles to the other views"),
         (shifted, "3.png: its matches lie"),
     ):
-        found = reconstruct(replace(capture, base_from_gripper=gripper), options(), predict=Fake())
+        found = reconstruct_views_at_once(
+            replace(capture, base_from_gripper=gripper), options(), predict=Fake()
+        )
         named = [text for text in found.warnings if "check its pose" in text]
         assert len(named) == 1 and named[0].startswith(said), named
 
 
 def test_what_does_not_fit_the_memory_is_refused_before_it_is_begun(capture: Capture) -> None:
-    from jcr.reconstruct.views_at_once.views_at_once import reconstruct
+    from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
     with pytest.raises(InputError, match=r"--backend da3 with 6 images needs .* raise --memory-gb"):
-        reconstruct(capture, options(memory_gb=0.3), predict=Fake())
+        reconstruct_views_at_once(capture, options(memory_gb=0.3), predict=Fake())
 
 
 def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -> None:
-    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct
+    from jcr.reconstruct.views_at_once.single_views import SingleViewsOptions, reconstruct_single_views
 
     # Cameras and points as structure from motion has them: exact, few, in a unit of its own.
     unit, truth = 3.0, inverse(base_from_camera()[0]) @ base_from_camera()
@@ -230,7 +237,11 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
         backend="colmap",
     )
-    made = SingleViewsOptions("moge", options().load, Path("w"), "MIT", lambda capture, progress: sparse)
+    made = SingleViewsOptions(
+        load=options().load,
+        weights=Weights(Path("w"), "w", "MIT"),
+        cameras=lambda capture, progress: sparse,
+    )
 
     def one_by_one(views):
         found = Fake(bend=0.02)(views)
@@ -238,7 +249,7 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
         points = found.x_in_camera * np.float32(0.5 * 1.1)
         return replace(found, x_in_camera=points, recon_from_camera=None, is_metric=True)
 
-    found = reconstruct(capture, made, predict=one_by_one)
+    found = reconstruct_single_views(capture, made, predict=one_by_one)
     base, scale = fit_similarity(base_from_camera()[:, :3, 3], found.recon_from_camera[:, :3, 3])
     assert found.is_metric and scale == pytest.approx(1 / 1.1, rel=0.02), (
         "its metre is kept, to be held against the robot's"

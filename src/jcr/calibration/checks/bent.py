@@ -12,8 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.calibration.adjust import adjust_case, refined_by
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.geometry import step_between
 from jcr.handeye.bent import STRAINS, WAYS, Bent, bends, by_scale, tested, to_straight
 from jcr.handeye.solve import judged
@@ -23,7 +22,7 @@ LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing. Of 132 simulated captures of 8 to 20 images, 72 of them by arms with
 joint offsets of up to 1° and links 1 mm off, none comes below 1e-5, and none of seven real ones."""
 MATERIAL = 0.5
-"""Standard deviations that the answer would move by on an axis, or nobody need know."""
+"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 MIN_IMAGES = 6
 """With fewer no size of errors is known beside."""
 

@@ -29,8 +29,7 @@ from jcr.adjust.score_test import (
     tested,
 )
 from jcr.calibration.adjust import adjust_case, focal_of_each
-from jcr.calibration.case import Case, of_points
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked, of_points
 from jcr.calibration.checks.given_intrinsics import intrinsics_contradiction
 from jcr.calibration.checks.imaged import Combinations, Imaged, of_case
 from jcr.camera import parameter_names, parameters
@@ -40,7 +39,7 @@ from jcr.records import Finding, Intrinsics, Kind, Mend, Tracks
 LOG_P = float(np.log(1e-6))
 """Chance of any one alarm where there is nothing, before it is divided by the number of places of a change."""
 MATERIAL = 0.5
-"""Standard deviations that the answer would move by on an axis: what does less is nobody's worry."""
+"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 OF_FIRST_STEP = 0.2
 """Share of that which the first step towards a fault must go, for the adjustments that follow take long."""
 AT_ONCE = 2
@@ -65,14 +64,14 @@ MIN_IMAGES = 5
 LEAST_PART = 2
 """Images before and after a change."""
 ASPECT = ("fx", "p1", "p2")
-"""Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is held."""
+"""Of estimated intrinsics, whose focal length is one and whose tangential distortion is none: what is tested."""
 MENDS: dict[Kind, Mend] = {Kind.THIN_PRISM: "intrinsics", Kind.CENTRE_SAGS: "mount"}
 """What would help where other images would not."""
 FOCUS = {"distance", "scatter", "zoom"}
 """Of a focal length that differs between images, one is named."""
 NEARLY_ALL = 0.9
 """Of the squares of what the focal length differs by."""
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def check_camera(case: Case) -> Checked:
@@ -275,20 +274,20 @@ def _all(state: _State) -> Float[ndarray, "e r"]:
 
 
 def _most_likely(state: _State, dismissed: Sequence[_Hypothesis]) -> _Hypothesis | None:
-    """Of the hypotheses whose p is little enough to be believed the one that explains most.
+    """Of the hypotheses whose p is small enough the one that explains most.
 
     What the camera's model leaves grows with whatever is wrong, until every explanation gains as little. Which of them
     is the right one shows where it may not.
     """
-    believed = [
+    likely = [
         one
         for one in _hypotheses(state)
         if not any(_alike(one, other) for other in (*state.found, *dismissed))
         and _log_p(one, state, state.equations) <= LOG_P
     ]
-    if len(believed) < 2:
-        return believed[0] if believed else None
-    return min(believed, key=lambda one: _log_p(one, state, state.equations_of_a_good_camera))
+    if len(likely) < 2:
+        return likely[0] if likely else None
+    return min(likely, key=lambda one: _log_p(one, state, state.equations_of_a_good_camera))
 
 
 def _log_p(one: _Hypothesis, state: _State, equations: Alternatives) -> float:
@@ -403,13 +402,13 @@ def _largest_px(
 
 def _freed(kind: str, equations: Alternatives) -> tuple[str, ...]:
     """Parameters of the intrinsics that a hypothesis frees, of those that the model has."""
-    return tuple(name for name in (LENS if kind == "intrinsics" else ASPECT) if name in equations.names)
+    return tuple(name for name in (INTRINSICS if kind == "intrinsics" else ASPECT) if name in equations.names)
 
 
 def _parameters(std: dict[str, float], given: Intrinsics, now: Intrinsics) -> dict[str, float]:
     """Parameters as they are and as they were given; standard deviations of those that were freed."""
     found: dict[str, float] = {}
     for name, old, new in zip(parameter_names(given), parameters(given), parameters(now), strict=True):
-        if name in LENS:
+        if name in INTRINSICS:
             found |= {name: float(new), f"{name}_given": float(old)}
     return found | {f"{name}_std": float(value) for name, value in std.items()}

@@ -1,10 +1,11 @@
-"""What was found before the calibration and is to be known with it: of the capture, its arm, its reconstruction."""
+"""What capture, arm and reconstruction show by themselves: too few images used, the pose convention, warnings."""
 
 from dataclasses import replace
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.capture.checks import how_rotated
+from jcr.capture.names import paired_by_name
+from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.observability import observability
 from jcr.records import Finding, Kind
 
@@ -18,18 +19,32 @@ def check_registered(case: Case) -> Checked:
     every = len(case.used) == len(capture)
     if every or hand_eye.observability.observable or not observability(capture.base_from_gripper).observable:
         return Checked()
-    few = Finding(
-        kind=Kind.FEW_USED,
-        severity="rejects",
-        mend="reconstruction",
-        value=float(len(case.used)),
-        details={"of": float(len(capture))},
+    few = Finding.of(
+        Kind.FEW_USED, "rejects", "reconstruction", value=float(len(case.used)), of=float(len(capture))
     )
     findings = tuple(
         replace(one, mend="reconstruction") if one.kind is Kind.UNOBSERVABLE else one
         for one in hand_eye.findings
     )
     return Checked((few,), replace(hand_eye, findings=findings))
+
+
+def check_convention(case: Case) -> Checked:
+    """The convention by which the gripper poses fit, where there is one.
+
+    Of degenerate motions another may fit by chance: what is missing comes first.
+    """
+    rows, capture = case.reconstruction.image_index, case.capture
+    by_name = paired_by_name(capture.images, capture.base_from_gripper)
+    found = better_reading(
+        case.base_from_gripper,
+        case.recon_from_camera,
+        {by_number: poses[rows] for by_number, poses in by_name.items()},
+    )
+    if found is None:
+        return Checked()
+    observable = case.hand_eye.observability.observable
+    return Checked((convention_finding(found, "rejects" if observable else "warns"),))
 
 
 def check_arm(case: Case) -> Checked:
@@ -46,8 +61,5 @@ def check_images(case: Case) -> Checked:
 def check_reconstruction(case: Case) -> Checked:
     """What the back end warned of."""
     return Checked(
-        tuple(
-            Finding(kind=Kind.RECONSTRUCTION, severity="warns", details={"text": text})
-            for text in case.reconstruction.warnings
-        )
+        tuple(Finding.of(Kind.RECONSTRUCTION, "warns", text=text) for text in case.reconstruction.warnings)
     )

@@ -24,7 +24,7 @@ NORMAL = 1.4826
 
 
 def depth_check(capture: Capture, reconstruction: Reconstruction, hand_eye: HandEye) -> DepthCheck | None:
-    """What the robot says of the depth images; None without any, or where too few features have a depth.
+    """Scale and noise of the depth images by the robot; None without any, or where too few features have a depth.
 
     Raises InputError where a depth image cannot be read.
     """

@@ -15,8 +15,7 @@ from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import freed_intrinsics
 from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.imaged import Imaged, of_case
 from jcr.camera import PARAMETERS, by_parameters, parameters, unproject
 from jcr.geometry import ARM, step_between
@@ -40,9 +39,9 @@ def intrinsics_contradiction(case: Case) -> Checked:
     """What the used images show against the intrinsics that were given; nothing where they agree.
 
     The calibration is then the one with the intrinsics that the images show, which those that were given are no part of;
-    one that was rejected stays, and the finding says by how much they move it.
+    one that was rejected stays, and the finding has the shift.
     """
-    held, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
+    given, fit = case.reconstruction.intrinsics, case.hand_eye.before or case.hand_eye
     contradiction = contradicted_by(of_case(case))
     if contradiction is None or contradiction[1].severity == "informs":
         return Checked()
@@ -50,7 +49,7 @@ def intrinsics_contradiction(case: Case) -> Checked:
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
         return Checked((contradicted,), refined, freed)
     with_found, as_given = (
-        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(held, HELD)))
+        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(given, HELD)))
     )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shift = max(
@@ -77,7 +76,7 @@ def contradicted_by(imaged: Imaged, sure: float = SURE) -> tuple[Adjusted, Findi
     if not found:
         return None
     severity = "warns" if surely else "informs"
-    return freed, Finding(kind=Kind.INTRINSICS, severity=severity, mend="intrinsics", details=found)
+    return freed, Finding.of(Kind.INTRINSICS, severity, "intrinsics", **found)
 
 
 def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
@@ -88,25 +87,25 @@ def _shift(start: Estimate, end: Estimate) -> Float[ndarray, "7"]:
 
 def _found_off(imaged: Imaged, adjusted: Adjusted, sure: float, share: float) -> dict[str, float]:
     """Each part of the intrinsics that is off by `sure` standard deviations and by `share` of what matters (px)."""
-    held = imaged.start
-    camera, covariance = freed_intrinsics(adjusted, prior_of(held, ESTIMATED), imaged.camera)
-    by = camera - parameters(held)
+    given = imaged.start
+    camera, covariance = freed_intrinsics(adjusted, prior_of(given, ESTIMATED), imaged.camera)
+    by = camera - parameters(given)
     std = np.sqrt(np.diag(covariance))
     off: dict[str, float] = {}
-    if abs(by[0]) > max(sure * std[0], share * OFF * held.fx):
-        off |= {"focal": float(camera[0]), "focal_std": float(std[0]), "focal_given": held.fx}
-    used_radius = np.linalg.norm(unproject(held, imaged.x_px)[:, :2], axis=1)
+    if abs(by[0]) > max(sure * std[0], share * OFF * given.fx):
+        off |= {"focal": float(camera[0]), "focal_std": float(std[0]), "focal_given": given.fx}
+    used_radius = np.linalg.norm(unproject(given, imaged.x_px)[:, :2], axis=1)
     radius = np.linspace(0.2, 1.0, 9) * np.quantile(used_radius, 0.95)
     ray = np.stack([radius, 0 * radius, np.ones(9)], axis=1)
-    bends = by_parameters(held, ray)[:, 0, [K1, K2]]
+    bends = by_parameters(given, ray)[:, 0, [K1, K2]]
     bent_px = bends @ by[[K1, K2]]
     bent_std_px = np.sqrt(np.einsum("rk,kl,rl->r", bends, covariance[np.ix_([K1, K2], [K1, K2])], bends))
     most = int(np.abs(bent_px).argmax())
     px, px_std = float(abs(bent_px[most])), float(bent_std_px[most])
-    if px > max(sure * px_std, share * OFF * held.fx * radius[most]):
+    if px > max(sure * px_std, share * OFF * given.fx * radius[most]):
         off |= {"bend": px, "bend_std": px_std}
     centre_std = std[[CX, CY]]
-    if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * held.width)).any():
+    if (np.abs(by[[CX, CY]]) > np.maximum(sure * centre_std, share * OFF_CENTRE * given.width)).any():
         off |= {"cx": float(camera[CX]), "cy": float(camera[CY]), "centre_std": float(centre_std.max())}
-        off |= {"cx_given": held.cx, "cy_given": held.cy}
+        off |= {"cx_given": given.cx, "cy_given": given.cy}
     return off

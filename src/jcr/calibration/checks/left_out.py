@@ -33,25 +33,20 @@ def left_out_poses(capture: Capture, made: Reconstruction, hand_eye: HandEye) ->
         if fits.any():
             is_pose_of[row] = int(np.where(fits, metres, np.inf).argmin())
         findings.append(
-            Finding(
-                kind=Kind.POSE_CONTRADICTS_IMAGE,
-                severity="warns",
-                mend="poses",
-                images=(capture.images[row],),
+            Finding.of(
+                Kind.POSE_CONTRADICTS_IMAGE,
+                "warns",
+                "poses",
+                capture.images[row],
                 value=float(metres[row]),
-                details={"rotation": float(radians[row])},
+                rotation=float(radians[row]),
             )
         )
     swapped = [(i, j) for i, j in is_pose_of.items() if i < j and is_pose_of.get(j) == i]
     named = {capture.images[row] for pair in swapped for row in pair}
     return (
         *(
-            Finding(
-                kind=Kind.POSES_SWAPPED,
-                severity="rejects",
-                mend="poses",
-                images=(capture.images[i], capture.images[j]),
-            )
+            Finding.of(Kind.POSES_SWAPPED, "rejects", "poses", capture.images[i], capture.images[j])
             for i, j in swapped
         ),
         *(finding for finding in findings if finding.images[0] not in named),

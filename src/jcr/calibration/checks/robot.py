@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.robot_errors import of_poses
 from jcr.handeye.joint_offsets import joint_offsets, systematic_p_value
 from jcr.handeye.residuals import angle_ratio
@@ -19,7 +18,7 @@ SURE = 2.5
 """Standard deviations from which a joint's offset, or a ratio of angles, is named."""
 NOTABLE_RATIO = 0.003
 NOTABLE_ERRORS = 3e-5, float(np.radians(0.003))
-"""m, rad; real arms err by more, and of less nobody need hear."""
+"""m, rad: smaller systematic errors, which every real arm has, are not reported."""
 
 
 def check_robot(case: Case) -> Checked:
@@ -44,7 +43,7 @@ def angle_finding(ratio: float, std: float) -> Finding | None:
     """Camera angles over gripper angles, where they are clearly not 1; which X it is does not matter."""
     if abs(ratio - 1) <= max(SURE * std, NOTABLE_RATIO):
         return None
-    return Finding(kind=Kind.ANGLE_RATIO, severity="informs", mend="robot", value=ratio, std=std)
+    return Finding.of(Kind.ANGLE_RATIO, "informs", "robot", value=ratio, std=std)
 
 
 def _systematic_finding(robot: RobotExamined) -> Finding | None:
@@ -55,14 +54,7 @@ def _systematic_finding(robot: RobotExamined) -> Finding | None:
     offsets = robot.joint_offsets
     off = [] if offsets is None else np.flatnonzero(np.abs(offsets.offset) > SURE * offsets.std).tolist()
     if offsets is None or not off:
-        return Finding(
-            kind=Kind.SYSTEMATIC_ERRORS,
-            severity="informs",
-            mend="robot",
-            value=left[0],
-            p=p,
-            details={"rotation": left[1]},
-        )
+        return Finding.of(Kind.SYSTEMATIC_ERRORS, "informs", "robot", value=left[0], p=p, rotation=left[1])
     sizes = {f"joint_{k + 1}": float(offsets.offset[k]) for k in off}
     stds = {f"joint_{k + 1}_std": float(offsets.std[k]) for k in off}
     return Finding(

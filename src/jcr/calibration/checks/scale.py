@@ -1,11 +1,10 @@
-"""What else than the robot's positions knows how long a metre is: a network, a depth camera, or nothing."""
+"""Measures of the scale beside the robot's positions: a network's, a depth camera's, or none."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.depth_camera import depth_check
 from jcr.records import Finding, Kind, ScaleCheck
 
@@ -22,12 +21,8 @@ def check_network_scale(case: Case) -> Checked:
     hand_eye = replace(hand_eye, scale_evidence=replace(hand_eye.scale_evidence, network=check))
     if abs(np.log(hand_eye.scale)) < max(FAR_SCALE, 3 * np.sqrt(hand_eye.covariance[6, 6])):
         return Checked((), hand_eye)
-    far = Finding(
-        kind=Kind.NETWORK_SCALE,
-        severity="warns",
-        mend="poses",
-        value=check.off_percent / 100,
-        std=check.std_percent / 100,
+    far = Finding.of(
+        Kind.NETWORK_SCALE, "warns", "poses", value=check.off_percent / 100, std=check.std_percent / 100
     )
     return Checked((far,), hand_eye)
 
@@ -48,4 +43,4 @@ def check_scale_source(case: Case) -> Checked:
         or case.hand_eye.scale_evidence.depth is not None
     ):
         return Checked()
-    return Checked((Finding(kind=Kind.SCALE_FROM_ROBOT, severity="informs"),))
+    return Checked((Finding.of(Kind.SCALE_FROM_ROBOT, "informs"),))

@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.linalg import solve_triangular
 
-from jcr.calibration.case import Case
-from jcr.calibration.checks.checked import Checked
+from jcr.calibration.case import Case, Checked
 from jcr.distributions import f as f_distribution
 from jcr.handeye.equation import PRIOR_STD, ROTATION, TRANSLATION, Poses, residuals
 from jcr.records import Finding, HandEye, Kind
@@ -23,7 +22,7 @@ from jcr.records import Finding, HandEye, Kind
 LOG_P = float(np.log(1e-4))
 """Chance of any one alarm where there is nothing."""
 MATERIAL = 0.5
-"""Standard deviations that the answer would move by on an axis, or nobody need know."""
+"""Standard deviations by which a fault must move the camera's place on some axis to be reported."""
 BY_CHANCE = 0.02
 """Share of groupings in any other order that may explain as much: the errors of real arms have heavy tails."""
 GROUPINGS = 200
@@ -36,7 +35,7 @@ MANY_PLACES = 60
 """Of a longer capture changes are looked for at this many places."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Found:
     log_p: float
     base: Float[ndarray, "13"]
@@ -67,7 +66,7 @@ def sequence_fault(
     time_s: Float[ndarray, " m"] | None = None,
     still: bool = False,
 ) -> Finding | None:
-    """What the order of the images says against one calibration of them; None where it says nothing.
+    """What the order of the images shows against one calibration of them; None where that is nothing.
 
     `images` are their names in the order of taking, `systematic` is the covariance of the systematic errors of their
     poses at 1 rad, `time_s` when they were taken; without, delay is counted in
@@ -179,10 +178,16 @@ class _Problem:
         """Those of some images."""
         rows = (6 * images[:, None] + np.arange(6)).ravel()
         systematic = self.systematic[np.ix_(rows, rows)]
-        return _Equations(images, self.residual[images], self.by[images], systematic, self.noise)
+        return _Equations(
+            images=images,
+            residual=self.residual[images],
+            by=self.by[images],
+            systematic=systematic,
+            noise=self.noise,
+        )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Equations:
     images: Int[ndarray, " k"]
     residual: Float[ndarray, "k 6"]
@@ -259,7 +264,7 @@ def _tested(
     inverse = np.linalg.pinv(both.T @ both) * least / freedom
     shift = found[:7] - without[:7]
     log_p = float(f_distribution.logsf(ratio, p, freedom))
-    return _Found(log_p, found[:13], found[13:], inverse[13:, 13:], shift)
+    return _Found(log_p=log_p, base=found[:13], value=found[13:], covariance=inverse[13:, 13:], shift=shift)
 
 
 def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[ndarray, "m 6"]:
@@ -271,5 +276,5 @@ def _velocity(base_from_gripper: Poses, moment: Float[ndarray, " m"]) -> Float[n
     position = CubicSpline(moment, base_from_gripper[:, :3, 3])
     rotation = RotationSpline(moment, Rotation.from_matrix(base_from_gripper[:, :3, :3]))
     little = 1e-3 * float(np.diff(moment).min())
-    turned = rotation(moment + little) * rotation(moment - little).inv()
-    return np.concatenate([position(moment, 1), turned.as_rotvec() / (2 * little)], axis=1)
+    rotation_between = rotation(moment + little) * rotation(moment - little).inv()
+    return np.concatenate([position(moment, 1), rotation_between.as_rotvec() / (2 * little)], axis=1)

@@ -9,12 +9,16 @@ they explain the rejection.
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from jcr.calibration.case import Case
+from jcr.calibration.case import Case, Checked
 from jcr.calibration.checks.bent import check_bent
 from jcr.calibration.checks.camera import check_camera
-from jcr.calibration.checks.capture import check_arm, check_images, check_reconstruction, check_registered
-from jcr.calibration.checks.checked import Checked
-from jcr.calibration.checks.convention import check_convention
+from jcr.calibration.checks.capture import (
+    check_arm,
+    check_convention,
+    check_images,
+    check_reconstruction,
+    check_registered,
+)
 from jcr.calibration.checks.robot import check_robot
 from jcr.calibration.checks.scale import check_depth_camera, check_network_scale, check_scale_source
 from jcr.calibration.checks.sequence import MIN_IMAGES, check_sequence
@@ -58,7 +62,7 @@ CHECKS = (
         lambda case: _is_observable(case) and len(case.names) >= MIN_IMAGES and not _has(case, CAMERA | BENT),
     ),
     Check(check_images),
-    # A unit that somebody vouches for was used for the scale, and is no check of it.
+    # A unit with a stated standard deviation was used for the scale, and is no check of it.
     Check(
         check_network_scale,
         lambda case: case.reconstruction.is_metric and case.reconstruction.metric_std is None,

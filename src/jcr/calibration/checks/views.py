@@ -19,7 +19,7 @@ MANY = 1 / 4
 
 
 def view_findings(capture: Capture) -> tuple[Finding, ...]:
-    """What its images alone say against a capture, causes of a rejection where it is rejected; empty of sharp images of
+    """What its images alone show against a capture, causes of a rejection where it is rejected; empty of sharp images of
     several views."""
     first = read_image(capture.folder / capture.images[0])
     metres, radians = largest_motion(capture.base_from_gripper)
@@ -32,27 +32,18 @@ def view_findings(capture: Capture) -> tuple[Finding, ...]:
     findings = []
     if is_still:
         details = {"rotation": radians}
-        findings.append(
-            Finding(kind=Kind.STATIC_IMAGES, severity="rejects", mend="images", value=metres, details=details)
-        )
+        findings.append(Finding.of(Kind.STATIC_IMAGES, "rejects", "images", value=metres, **details))
     blurred = tuple(name for name, share in width.items() if share > BLURRED_EDGE)
     if blurred:
         edge_px = max(*capture.image_size, EDGES_AT) * float(np.median([width[name] for name in blurred]))
         findings.append(
-            Finding(
-                kind=Kind.BLURRED,
-                severity="warns",
-                mend="images",
-                images=blurred,
-                value=edge_px,
-                details={"of": float(len(capture))},
-            )
+            Finding.of(Kind.BLURRED, "warns", "images", *blurred, value=edge_px, of=float(len(capture)))
         )
     return tuple(findings)
 
 
 def as_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What the images alone say, of a capture that is rejected: it is because of that where it concerns many images."""
+    """The findings of the images alone on a capture that is rejected; those that concern many images reject it."""
     return tuple(
         replace(one, severity="rejects")
         if one.kind is Kind.BLURRED and len(one.images) > MANY * float(one.details["of"])

@@ -17,7 +17,7 @@ DEPTH_RANGE = (0.55, 1.8)
 MEET_WITHIN = (0.1, 2.0)
 """m. Distance at which they may."""
 AGREED = 0.5
-"""Cost of a point beyond which its depth is not believed."""
+"""Cost of a point beyond which its depth is not used."""
 IMAGES_AT_FULL = 10
 """With more images each has fewer points, as each point is seen more often."""
 SETTLED = 0.995
@@ -51,8 +51,8 @@ def axes_meet(base_from_camera: Float[ndarray, "*batch n 4 4"]) -> Float[ndarray
     return nearest_to_lines(base_from_camera[..., :3, 3], base_from_camera[..., :3, 2])
 
 
-def judged(level: Level, cameras: Cameras, stage: Stage) -> Found:
-    """What the colours say of cameras as they are."""
+def with_cost(level: Level, cameras: Cameras, stage: Stage) -> Found:
+    """The cameras with the cost of their colours' differences, at the best depth of each point."""
     host, x_px = strongest(level, _per_image(level, stage))
     return Found(cameras, on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)[1])
 
@@ -69,12 +69,12 @@ def _depths(cameras: Cameras) -> Float[ndarray, "d n"]:
     return middle / np.linspace(1 / DEPTH_RANGE[0], 1 / DEPTH_RANGE[1], DEPTHS)[:, None]
 
 
-def tied_directions(lens_held: bool) -> Float[ndarray, "7 q"]:
+def tied_directions(intrinsics_known: bool) -> Float[ndarray, "7 q"]:
     """Directions in which cameras on a robot's gripper, all alike, and their intrinsics may move."""
-    return np.eye(7)[:, : 6 if lens_held else 7]
+    return np.eye(7)[:, : 6 if intrinsics_known else 7]
 
 
-def free_directions(cameras: Cameras, lens_held: bool) -> Float[ndarray, "p q"]:
+def free_directions(cameras: Cameras, intrinsics_known: bool) -> Float[ndarray, "p q"]:
     """Directions in which cameras may move one by one: the first stays, and so does their common scale."""
     pose = cameras.base_from_camera
     grown = np.zeros((len(pose), 6))
@@ -82,27 +82,27 @@ def free_directions(cameras: Cameras, lens_held: bool) -> Float[ndarray, "p q"]:
     fixed = np.zeros((8, 6 * len(pose) + 1))
     fixed[:6, :6] = np.eye(6)
     fixed[6, :-1] = grown.ravel()
-    fixed[7, -1] = lens_held
+    fixed[7, -1] = intrinsics_known
     return null_space(fixed)
 
 
-def aligned(
+def align_photometrically(
     level: Level, cameras: Cameras, stage: Stage, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
-    """Search along the rays, and Gauss-Newton, in turn."""
+    """Search along the rays and Gauss-Newton, alternately."""
     host, x_px = strongest(level, _per_image(level, stage))
     before, points = np.inf, None
     for _ in range(stage.rounds):
         points, cost = on_rays(level, cameras, host, x_px, _depths(cameras), stage.sigma, AGREED)
         if cost > SETTLED * before:
             break
-        cameras, points = descended(level, cameras, points, stage.sigma, directions)
+        cameras, points = after_descent(level, cameras, points, stage.sigma, directions)
         before = cost
     assert points is not None
     return cameras, points
 
 
-def descended(
+def after_descent(
     level: Level, cameras: Cameras, points: Points, sigma: float, directions: Float[ndarray, "p q"]
 ) -> tuple[Cameras, Points]:
     """A few steps of Levenberg and Marquardt; the cameras move together where there are 7 parameters.
@@ -119,7 +119,7 @@ def descended(
             damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
             step = -directions @ np.linalg.solve(damped, gradient)
             depth = points.depth * np.exp(np.clip(system.depth_step(step), -0.05, 0.05))
-            tried = moved(cameras, step), replace(points, depth=depth)
+            tried = after_step(cameras, step), replace(points, depth=depth)
             cost = energy(level, *tried, sigma)
             if cost < best:
                 break
@@ -133,7 +133,7 @@ def descended(
     return cameras, points
 
 
-def moved(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
+def after_step(cameras: Cameras, step: Float[ndarray, " p"]) -> Cameras:
     """Cameras after twists (v, ω) in camera axes, one for all or one for each, and a step of the log focal length."""
     pose, twist = cameras.base_from_camera, step[:-1].reshape(-1, 6, 1)
     return Cameras(

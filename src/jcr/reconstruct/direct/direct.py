@@ -9,7 +9,7 @@ From there coarse to fine, with a depth for each of a few thousand pixels; in th
 that what disagrees with the robot's motion shows.
 
 Pointmaps are matched near edges; plain surfaces between them are filled with planes (jcr/depth/priors.py).
-The page `plain-tables` says when, and what it gives.
+The page `plain-tables` describes when, and with what errors.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,21 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import apply, inverse, step_axes
 from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.direct.coarse_to_fine import Stage, aligned, free_directions, tied_directions
+from jcr.reconstruct.direct.coarse_to_fine import (
+    Stage,
+    align_photometrically,
+    free_directions,
+    tied_directions,
+)
 from jcr.reconstruct.direct.photometric import (
     Cameras,
     Level,
     Points,
     equations,
-    exposures,
     in_base,
     in_view,
     make_level,
+    relative_exposures,
     squared_misfit,
 )
 from jcr.reconstruct.direct.search import SIZES, search
@@ -42,11 +47,11 @@ from jcr.records import CameraEvidence, Capture, Intrinsics, Reconstruction, Tra
 FREED = (Stage(60, 300, 3, 0.12), Stage(120, 300, 3, 0.1))
 """Found without the robot poses."""
 FINEST = Stage(240, 300, 3, 0.1)
-UNEVEN = Stage(60, 300, 1, 0.2)
+BEFORE_GAINS = Stage(60, 300, 1, 0.2)
 """Where brightness is compared, before it is even."""
-EVENINGS = 3
+GAIN_ROUNDS = 3
 """How often gains are estimated: each time more points agree."""
-EVEN_ENOUGH = 0.05
+LEAST_GAIN = 0.05
 """Difference of log brightness below which it is left alone: shading and gloss look like as much."""
 GUESSED_FOCAL = 0.8
 """In long sides, where nothing is known of the intrinsics."""
@@ -61,12 +66,12 @@ REGION = 0.05
 """m. Points within it share their errors: they are pixels of one edge, seen from many sides."""
 
 
-def reconstruct(
+def reconstruct_direct(
     capture: Capture, progress: Progress | None = None, *, memory_gb: float = 8.0
 ) -> Reconstruction:
     """Camera poses by the colours of a capture's images, with the robot's poses to start from.
 
-    Known intrinsics are held, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
+    Known intrinsics stay, else a focal length is estimated. The unit is the robot's metre only roughly, the frame
     is the first camera's; `evidence` has the covariance. Raises InputError with fewer than three images, and
     NotTrustedError where another place of the camera fits as well, or too few pixels are explained.
     """
@@ -77,37 +82,39 @@ def reconstruct(
     images = [read_image(capture.folder / name) for name in capture.images]
     given, warnings = usable_lens(capture.intrinsics)
     notes: tuple[str, ...] = ()
-    lens = given or _guessed_lens(capture.image_size)
-    levels = pyramid(images, lens)
-    held = given is not None
-    found = search(levels, capture.base_from_gripper, held, report)
-    factor = evening(levels[FREED[0].height], found.cameras)
+    intrinsics = given or _guessed_intrinsics(capture.image_size)
+    levels = pyramid(images, intrinsics)
+    known = given is not None
+    found = search(levels, capture.base_from_gripper, known, report)
+    factor = exposure_gains(levels[FREED[0].height], found.cameras)
     levels = {height: level.times(factor) for height, level in levels.items()}
-    rows, cameras = fitting_images(levels[FREED[0].height], found.cameras, held)
+    rows, cameras = images_that_fit(levels[FREED[0].height], found.cameras, known)
     if len(rows) < len(capture):
         names = ", ".join(name for k, name in enumerate(capture.images) if k not in rows)
         notes = (f"direct alignment: left out, for they fit nowhere near their poses: {names}",)
         levels = {height: level.rows(rows) for height, level in levels.items()}
     for k, stage in enumerate(FREED):
         report("direct alignment", 0.7 + 0.1 * k)
-        cameras, _ = aligned(levels[stage.height], cameras, stage, free_directions(cameras, held))
+        cameras, _ = align_photometrically(
+            levels[stage.height], cameras, stage, free_directions(cameras, known)
+        )
     level = levels[FINEST.height]
-    cameras, points = aligned(level, cameras, FINEST, free_directions(cameras, held))
+    cameras, points = align_photometrically(level, cameras, FINEST, free_directions(cameras, known))
     report("direct alignment", 1.0)
     if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
         raise NotTrustedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few",
             "take images that overlap more, of a scene that does not move or shine",
         )
-    covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, held))
+    covariance = camera_covariance(level, cameras, points, FINEST.sigma, free_directions(cameras, known))
     points = points.where(points.agreed)
-    lens = zoomed(lens, cameras.zoom)
-    tracks = _tracks(level, cameras, points, FINEST.sigma, lens)
+    intrinsics = zoomed(intrinsics, cameras.zoom)
+    tracks = _tracks(level, cameras, points, FINEST.sigma, intrinsics)
     recon_from_camera = inverse(cameras.base_from_camera[0]) @ cameras.base_from_camera
     return Reconstruction(
         image_index=rows,
         recon_from_camera=recon_from_camera,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=tracks,
         backend="direct",
         notes=notes,
@@ -116,27 +123,31 @@ def reconstruct(
     )
 
 
-def evening(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
+def exposure_gains(level: Level, cameras: Cameras) -> Float[ndarray, " n"]:
     """By what to multiply the images so that they are equally bright, though the camera chose its exposure again."""
     factor = np.ones(level.count)
-    for _ in range(EVENINGS):
+    for _ in range(GAIN_ROUNDS):
         even = level.times(factor)
-        _, points = aligned(even, cameras, UNEVEN, np.zeros((7, 0)))
-        factor /= exposures(even, cameras, points, UNEVEN.sigma)
-    return factor if np.abs(np.log(factor)).max() > EVEN_ENOUGH else np.ones(level.count)
+        _, points = align_photometrically(even, cameras, BEFORE_GAINS, np.zeros((7, 0)))
+        factor /= relative_exposures(even, cameras, points, BEFORE_GAINS.sigma)
+    return factor if np.abs(np.log(factor)).max() > LEAST_GAIN else np.ones(level.count)
 
 
-def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int[ndarray, " m"], Cameras]:
+def images_that_fit(
+    level: Level, cameras: Cameras, intrinsics_known: bool
+) -> tuple[Int[ndarray, " m"], Cameras]:
     """The images that show what the others do, and their cameras on the robot's poses, which the rest do not bend.
 
     Each image shows a share of the other images' points in their colour. One whose share is far below the others' even
-    when its camera is free is not where the robot says, or not of this scene. Raises NotTrustedError where fewer than
-    three are left.
+    when its camera is free is not where the robot reports it, or not of this scene. Raises NotTrustedError where fewer
+    than three are left.
     """
     rows = np.arange(level.count)
     while True:
-        cameras, _ = aligned(level, cameras, FREED[0], tied_directions(lens_held))
-        alone, points = aligned(level, cameras, FREED[0], free_directions(cameras, lens_held))
+        cameras, _ = align_photometrically(level, cameras, FREED[0], tied_directions(intrinsics_known))
+        alone, points = align_photometrically(
+            level, cameras, FREED[0], free_directions(cameras, intrinsics_known)
+        )
         _, u, v, seen = in_view(level, alone, points)
         shows = seen & (squared_misfit(level, points, u, v) < FREED[0].sigma ** 2)
         share = shows.sum(1) / np.maximum(seen.sum(1), 1)
@@ -149,17 +160,16 @@ def fitting_images(level: Level, cameras: Cameras, lens_held: bool) -> tuple[Int
         cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
 
 
-def _guessed_lens(size: tuple[int, int]) -> Intrinsics:
+def _guessed_intrinsics(size: tuple[int, int]) -> Intrinsics:
     focal = GUESSED_FOCAL * max(size)
     return Intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, *size)
 
 
-def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics) -> dict[int, Level]:
+def pyramid(images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics) -> dict[int, Level]:
     """Undistorted images by height in pixels."""
-    grid = pinhole_inside(
-        lens, round(FINEST.height * max(lens.width, lens.height) / min(lens.width, lens.height))
-    )
-    stack = np.stack([undistort_image(image, lens, grid) for image in images]).astype(np.float32) / 255
+    width, height = intrinsics.width, intrinsics.height
+    grid = pinhole_inside(intrinsics, round(FINEST.height * max(width, height) / min(width, height)))
+    stack = np.stack([undistort_image(image, intrinsics, grid) for image in images]).astype(np.float32) / 255
     heights = {*SIZES, *(stage.height for stage in FREED), FINEST.height}
     return {height: make_level(stack, grid, height) for height in heights}
 
@@ -189,7 +199,7 @@ def camera_covariance(
     return spread * steps @ inverse_normal @ steps.T
 
 
-def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, lens: Intrinsics) -> Tracks:
+def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, intrinsics: Intrinsics) -> Tracks:
     """The points, where their host sees them and where the others do that show their colour."""
     _, u, v, seen = in_view(level, cameras, points)
     shown = seen & (squared_misfit(level, points, u, v) < sigma**2)
@@ -198,7 +208,7 @@ def _tracks(level: Level, cameras: Cameras, points: Points, sigma: float, lens: 
     x_grid = np.concatenate([points.x_px, np.column_stack([u[shown], v[shown]])])
     return Tracks(
         image=np.concatenate([points.host, image]),
-        x_px=project(lens, unproject(zoomed(level.grid, cameras.zoom), x_grid)),
+        x_px=project(intrinsics, unproject(zoomed(level.grid, cameras.zoom), x_grid)),
         point=np.concatenate([host, point]),
         points_in_recon=apply(inverse(cameras.base_from_camera[0]), in_base(level, cameras, points)),
         from_pointmaps=True,

@@ -24,14 +24,14 @@ SEEN_BY = 0.6
 NEAREST = 0.05
 """m. In front of the camera."""
 _FAINT = 2.0 / 255
-"""Change of colour per pixel below which a pixel says nothing of where it is."""
+"""Change of colour per pixel below which a pixel does not show where it is."""
 _BORDER_PX = 2
 _SHARED = 5
 """Points that two images must share before their brightness is compared."""
 _KEEP_DEPTH = 1e-3
 """Information that keeps a depth that the images do not determine where it is."""
 _CHUNK = 500
-"""Points whose equations are held at a time: less than 100 MB for 15 images."""
+"""Points whose equations are in memory at a time: less than 100 MB for 15 images."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def _sample(
     return cv2.remap(stack, u, v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
+def relative_exposures(level: Level, cameras: Cameras, points: Points, sigma: float) -> Float[ndarray, " n"]:
     """How bright each image is beside the others (their geometric mean is 1), from points that they share."""
     _, u, v, seen = in_view(level, cameras, points)
     shown, own = _sample(level.color, level, u, v).mean(-1), points.color.mean(-1)
@@ -290,7 +290,7 @@ def _linearised(
     """Per chunk of points: weighted residuals (n,k,3), and their derivatives by the twists (…,6) of the image that
     looks and of the host, by the log focal length and by the log depth."""
     poses = cameras.base_from_camera
-    turn = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
+    rotation = (poses[:, None, :3, :3].swapaxes(-1, -2) @ poses[None, :, :3, :3]).astype(np.float32)
     for start in range(0, len(points.host), _CHUNK):
         rows = slice(start, start + _CHUNK)
         some = points.where(rows)
@@ -301,7 +301,7 @@ def _linearised(
         weight = (seen & some.agreed) / (1 + _squared(residual) / np.float32(sigma**2)) ** 2
         root = np.sqrt(weight, dtype=np.float32)[..., None]
         x_in_host = in_host(level, cameras, some).astype(np.float32)
-        other_from_host = turn[:, some.host]
+        other_from_host = rotation[:, some.host]
         moves = np.zeros((*x.shape, 14), np.float32)
         moves[..., 0:3] = -np.eye(3)
         moves[..., 3:6] = skew(x)

@@ -10,10 +10,17 @@ from numpy import ndarray
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
 from jcr.progress import Progress
-from jcr.reconstruct.direct.coarse_to_fine import Found, Stage, aligned, axes_meet, judged, tied_directions
+from jcr.reconstruct.direct.coarse_to_fine import (
+    Found,
+    Stage,
+    align_photometrically,
+    axes_meet,
+    tied_directions,
+    with_cost,
+)
 from jcr.reconstruct.direct.photometric import Cameras, Level, strongest
 
-TURNS, TILTS, TILT_DEG = 24, 6, 15.0
+ROTATIONS, TILTS, TILT_DEG = 24, 6, 15.0
 """Starts about the viewing direction that the robot's poses suggest, which was off by 4 to 22° in five captures."""
 SCREENED_POINTS = 40
 """Per image, by which starts are ranked before any is improved."""
@@ -33,7 +40,7 @@ SIZES = (COARSEST.height, COARSE.height, JUDGE.height)
 def search(
     levels: dict[int, Level],
     base_from_gripper: Float[ndarray, "n 4 4"],
-    lens_held: bool,
+    intrinsics_known: bool,
     report: Progress,
 ) -> Found:
     """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
@@ -41,23 +48,23 @@ def search(
         raise NotTrustedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"
         )
-    directions = tied_directions(lens_held)
+    directions = tied_directions(intrinsics_known)
     screen = replace(COARSEST, per_image=SCREENED_POINTS)
 
     def screened(x: Float[ndarray, "4 4"]) -> Found:
-        return judged(levels[screen.height], Cameras(base_from_gripper @ x), screen)
+        return with_cost(levels[screen.height], Cameras(base_from_gripper @ x), screen)
 
-    ranked = _best_first([screened(x) for x in starts_from_nothing(base_from_gripper)])[:KEPT]
+    ranked = _best_first([screened(x) for x in starting_hand_eyes(base_from_gripper)])[:KEPT]
     coarse = []
     for k, start in enumerate(ranked):
         report("direct alignment", 0.1 + 0.4 * k / len(ranked))
-        cameras, _ = aligned(levels[COARSEST.height], start.cameras, COARSEST, directions)
-        coarse.append(judged(levels[COARSE.height], cameras, COARSE))
+        cameras, _ = align_photometrically(levels[COARSEST.height], start.cameras, COARSEST, directions)
+        coarse.append(with_cost(levels[COARSE.height], cameras, COARSE))
     fine = []
     for k, start in enumerate(different(coarse)[:KEPT_BASINS]):
         report("direct alignment", 0.5 + 0.2 * k / KEPT_BASINS)
-        cameras, _ = aligned(levels[COARSE.height], start.cameras, COARSE, directions)
-        fine.append(judged(levels[JUDGE.height], cameras, JUDGE))
+        cameras, _ = align_photometrically(levels[COARSE.height], start.cameras, COARSE, directions)
+        fine.append(with_cost(levels[JUDGE.height], cameras, JUDGE))
     best, *rivals = different(fine)
     if rivals and best.cost > CLEARLY_BETTER * rivals[0].cost:
         raise NotTrustedError(
@@ -68,7 +75,7 @@ def search(
     return best
 
 
-def starts_from_nothing(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
+def starting_hand_eyes(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[ndarray, "t 4 4"]:
     """Hand-eye transforms by which the cameras look at a common place, rotated and tilted all around."""
     # Directions evenly over the sphere (Fibonacci's spiral).
     k = np.arange(600) + 0.5
@@ -82,11 +89,11 @@ def starts_from_nothing(base_from_gripper: Float[ndarray, "n 4 4"]) -> Float[nda
     towards = axes_meet(cameras)[:, None] - cameras[..., :3, 3]
     cosine = (towards * cameras[..., :3, 2]).sum(-1) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-9)
     best = facing[cosine.mean(1).argmax()]
-    turn = 2 * np.pi * np.arange(TURNS) / TURNS
+    rotation = 2 * np.pi * np.arange(ROTATIONS) / ROTATIONS
     toward = 2 * np.pi * np.arange(TILTS) / TILTS
     tilt = np.radians(TILT_DEG) * np.column_stack([np.cos(toward), np.sin(toward), 0 * toward])
     tilts = rotation_exp(np.concatenate([np.zeros((1, 3)), tilt]))
-    rotations = best @ tilts[:, None] @ rotation_exp(turn[:, None] * [0.0, 0.0, 1.0])
+    rotations = best @ tilts[:, None] @ rotation_exp(rotation[:, None] * [0.0, 0.0, 1.0])
     return transform(rotations.reshape(-1, 3, 3), np.zeros(3))
 
 

@@ -13,28 +13,21 @@ from jcr.reconstruct.dust3r.weights import load_weights
 from jcr.reconstruct.from_pairs import reconstruction_from_pairs
 from jcr.reconstruct.global_alignment.alignment import AlignOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
-from jcr.reconstruct.preprocess import (
-    PreparedImages,
-    image_grid,
-    prepare_images,
-)
+from jcr.reconstruct.hub import Weights
+from jcr.reconstruct.preprocess import PreparedImages, image_grid, prepare_images
 from jcr.records import Capture, Reconstruction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dust3rOptions:
     """Pairwise pointmaps of a network, aligned."""
 
-    weights: str
-    """File, folder or hub id."""
-    licence: str
-    """Of the weights."""
+    weights: Weights
     device: str = "cpu"
     """Where the network runs: cpu or cuda."""
     pairs: PairOptions = field(default_factory=PairOptions)
-    align: AlignOptions = field(default_factory=AlignOptions)
     backend: str = "dust3r"
-    """What the reconstruction says it is from."""
+    """Its row of the table of back ends."""
 
 
 def predict(
@@ -46,7 +39,7 @@ def predict(
     that cannot be used, or a memory budget that is too small.
     """
     program = resident()
-    loaded = load_weights(options.weights, options.device, options.licence)
+    loaded = load_weights(options.weights, options.device)
     images = prepare_images(capture, lambda size: image_grid(size, options.pairs.image_size))
     predictions, notes = predict_pairs(
         loaded,
@@ -58,10 +51,12 @@ def predict(
         program=program,
         aligned=aligned,
     )
-    return images, predictions, (f"weights {loaded.source}: licence {loaded.licence}", *notes)
+    return images, predictions, (options.weights.note, *notes)
 
 
-def reconstruct(capture: Capture, options: Dust3rOptions, progress: Progress | None = None) -> Reconstruction:
+def reconstruct_dust3r(
+    capture: Capture, options: Dust3rOptions, progress: Progress | None = None
+) -> Reconstruction:
     """Camera poses, pointmaps and tracks of a capture, up to one similarity, or in metres with MASt3R.
 
     Raises InputError as `predict` does.
@@ -76,7 +71,7 @@ def reconstruct(capture: Capture, options: Dust3rOptions, progress: Progress | N
             rows,
             predictions,
             poses,
-            options.align,
+            AlignOptions(),
             backend=options.backend,
             notes=notes,
             progress=progress,

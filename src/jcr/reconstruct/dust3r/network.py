@@ -10,7 +10,8 @@ Shapes: b images or pairs, n tokens = h/16 · w/16, c channels.
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -42,105 +43,83 @@ class Pointmap(NamedTuple):
     confidence: Tensor
 
 
-class Dust3r(nn.Module):
-    """The network, built from the fields of a published configuration.
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The fields of a published configuration; ValueError for one that this network does not cover."""
 
-    Raises ValueError for a configuration that this network does not cover.
+    enc_embed_dim: int = 768
+    enc_depth: int = 12
+    enc_num_heads: int = 12
+    dec_embed_dim: int = 512
+    dec_depth: int = 8
+    dec_num_heads: int = 16
+    head_type: str = "linear"
+    pos_embed: str = "RoPE100"
+    mlp_ratio: float = 4.0
+    patch_size: int = PATCH
+    output_mode: str = "pts3d"
+    depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf"))
+    conf_mode: Sequence[object] = ("exp", 1, float("inf"))
+    # How the published network was trained: these change nothing here.
+    img_size: object = None
+    patch_embed_cls: str = "PatchEmbedDust3R"
+    landscape_only: bool = False
+    freeze: str = "none"
+
+    def __post_init__(self) -> None:
+        covered = {
+            "pos_embed": (re.fullmatch(r"RoPE\d+(?:\.\d+)?", self.pos_embed), "RoPE100"),
+            "head_type": (self.head_type in ("linear", "dpt"), "linear or dpt"),
+            "patch_size": (self.patch_size == PATCH, PATCH),
+            "output_mode": (self.output_mode == "pts3d", "pts3d"),
+            "depth_mode": (list(self.depth_mode) == ["exp", -float("inf"), float("inf")], "exp, unbounded"),
+            "conf_mode": (list(self.conf_mode) == ["exp", 1, float("inf")], "exp from 1"),
+            "dec_depth": (self.head_type == "linear" or self.dec_depth > 9, "over 9 with a dpt head"),
+        }
+        for name, (known, remedy) in covered.items():
+            if not known:
+                raise ValueError(f"{name} = {getattr(self, name)!r} is not covered; it must be {remedy}")
+
+
+class Dust3r(nn.Module):
+    """The network, built from the fields of a published configuration (`Config`).
+
+    Raises ValueError for a configuration that this network does not cover, TypeError for an unknown field.
     """
 
-    def __init__(
-        self,
-        *,
-        enc_embed_dim: int = 768,
-        enc_depth: int = 12,
-        enc_num_heads: int = 12,
-        dec_embed_dim: int = 512,
-        dec_depth: int = 8,
-        dec_num_heads: int = 16,
-        head_type: str = "linear",
-        pos_embed: str = "RoPE100",
-        mlp_ratio: float = 4.0,
-        patch_size: int = PATCH,
-        output_mode: str = "pts3d",
-        depth_mode: Sequence[object] = ("exp", -float("inf"), float("inf")),
-        conf_mode: Sequence[object] = ("exp", 1, float("inf")),
-        img_size: object = None,
-        patch_embed_cls: str = "PatchEmbedDust3R",
-        landscape_only: bool = False,
-        freeze: str = "none",
-    ) -> None:
-        """The last four say how the published network was trained and change nothing here."""
+    def __init__(self, **fields: Any) -> None:
         super().__init__()
-        frequency = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", pos_embed)
-        expected = {
-            "pos_embed": (pos_embed, frequency, "RoPE100"),
-            "head_type": (head_type, head_type in ("linear", "dpt"), "linear or dpt"),
-            "patch_size": (patch_size, patch_size == PATCH, PATCH),
-            "output_mode": (output_mode, output_mode == "pts3d", "pts3d"),
-            "depth_mode": (
-                depth_mode,
-                list(depth_mode) == ["exp", -float("inf"), float("inf")],
-                "exp, unbounded",
-            ),
-            "conf_mode": (conf_mode, list(conf_mode) == ["exp", 1, float("inf")], "exp from 1"),
-            "dec_depth": (dec_depth, head_type == "linear" or dec_depth > 9, "over 9 with a dpt head"),
-        }
-        for name, (value, known, cure) in expected.items():
-            if not known:
-                raise ValueError(f"{name} = {value!r} is not covered; it must be {cure}")
-        assert frequency is not None
-        self.rope_base = float(frequency[1])
-        self.head_dims = (enc_embed_dim // enc_num_heads, dec_embed_dim // dec_num_heads)
+        config = Config(**fields)
+        enc_dim, dec_dim = config.enc_embed_dim, config.dec_embed_dim
+        self.rope_base = float(config.pos_embed.removeprefix("RoPE"))
+        self.head_dims = (enc_dim // config.enc_num_heads, dec_dim // config.dec_num_heads)
         self.mixed_precision: bool | None = None
         """bfloat16 inside encoder, decoder and heads; None: where the device is CUDA."""
 
-        self.patch_embed = PatchEmbed(enc_embed_dim)
-        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_embed_dim))  # only its pre-training used it
+        self.patch_embed = PatchEmbed(enc_dim)
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, dec_dim))  # only its pre-training used it
         self.enc_blocks = nn.ModuleList(
-            EncoderBlock(enc_embed_dim, enc_num_heads, mlp_ratio) for _ in range(enc_depth)
+            EncoderBlock(enc_dim, config.enc_num_heads, config.mlp_ratio) for _ in range(config.enc_depth)
         )
-        self.enc_norm = nn.LayerNorm(enc_embed_dim, eps=1e-6)
-        self.decoder_embed = nn.Linear(enc_embed_dim, dec_embed_dim)
+        self.enc_norm = nn.LayerNorm(enc_dim, eps=1e-6)
+        self.decoder_embed = nn.Linear(enc_dim, dec_dim)
         self.dec_blocks, self.dec_blocks2 = (
-            nn.ModuleList(DecoderBlock(dec_embed_dim, dec_num_heads, mlp_ratio) for _ in range(dec_depth))
+            nn.ModuleList(
+                DecoderBlock(dec_dim, config.dec_num_heads, config.mlp_ratio) for _ in range(config.dec_depth)
+            )
             for _ in range(2)
         )
-        self.dec_norm = nn.LayerNorm(dec_embed_dim, eps=1e-6)
+        self.dec_norm = nn.LayerNorm(dec_dim, eps=1e-6)
+        linear = config.head_type == "linear"
         self.downstream_head1, self.downstream_head2 = (
-            LinearHead(dec_embed_dim)
-            if head_type == "linear"
-            else DptHead(enc_embed_dim, dec_embed_dim, dec_depth)
-            for _ in range(2)
+            LinearHead(dec_dim) if linear else DptHead(enc_dim, dec_dim, config.dec_depth) for _ in range(2)
         )
 
     def forward(
-        self,
-        image1: Float[Tensor, "b 3 h w"],
-        image2: Float[Tensor, "b 3 h2 w2"],
-        true_shape1: Int[Tensor, "b 2"] | None = None,
-        true_shape2: Int[Tensor, "b 2"] | None = None,
+        self, image1: Float[Tensor, "b 3 h w"], image2: Float[Tensor, "b 3 h2 w2"]
     ) -> tuple[Pointmap, Pointmap]:
-        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16.
-
-        A row whose true (height, width) is the transpose of the tensor's is a portrait image that was laid
-        down to batch it with landscape ones; it is stood up for the network, its pointmap laid down again.
-        """
-        if true_shape1 is None and true_shape2 is None:
-            return self.decode(self.encode(image1), self.encode(image2))
-        lying = torch.stack([_lying(image1, true_shape1), _lying(image2, true_shape2)], 1)
-        view1, view2 = (
-            Pointmap(image.new_empty(*image[:, 0].shape, 3), torch.empty_like(image[:, 0]))
-            for image in (image1, image2)
-        )
-        for lies1, lies2 in lying.unique(dim=0).tolist():
-            rows = (lying == torch.tensor([lies1, lies2], device=lying.device)).all(1).nonzero()[:, 0]
-            features1 = self.encode(image1[rows].mT if lies1 else image1[rows])
-            features2 = self.encode(image2[rows].mT if lies2 else image2[rows])
-            part1, part2 = self.decode(features1, features2)
-            for view, part, lies in ((view1, part1, lies1), (view2, part2, lies2)):
-                view.points[rows] = part.points.transpose(1, 2) if lies else part.points
-                view.confidence[rows] = part.confidence.mT if lies else part.confidence
-        return view1, view2
+        """Pointmaps of images in [-1, 1] whose height and width are multiples of 16, as they stand (portrait too)."""
+        return self.decode(self.encode(image1), self.encode(image2))
 
     def encode(self, images: Float[Tensor, "b 3 h w"], many_pairs: bool = False) -> Features:
         """Features of images in [-1, 1]; each image needs this once, however many pairs it is in.
@@ -427,11 +406,3 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: FeatureMap) -> FeatureMap:
         return x + self.conv2(F.relu_(self.conv1(F.relu(x))))
-
-
-def _lying(image: Tensor, true_shape: Tensor | None) -> Tensor:
-    """Per row: whether the image lies on its side in the tensor."""
-    height, width = image.shape[-2:]
-    if true_shape is None or height == width:
-        return torch.zeros(len(image), dtype=torch.bool, device=image.device)
-    return (true_shape[:, 0] == width).to(image.device)

@@ -17,7 +17,7 @@ FEW_IMAGES = 12
 """Up to here "auto" predicts every pair (132); a chain that is wrong costs more than it saves."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PairOptions:
     """Which pairs of images the network sees, and within what memory."""
 
@@ -102,7 +102,7 @@ def _first_calibration(
     miss = rotation_angle(np.swapaxes(rotation_a @ rotation, -1, -2) @ rotation @ rotation_b)
     if np.median(miss) > np.radians(10):
         return "the pairs of neighbours do not agree with the robot's rotations"
-    # (R_A − I) t − λ_k R t_B = −t_A, linear in the lever arm t, held near 0 a little, and one λ_k per pair.
+    # (R_A − I) t − λ_k R t_B = −t_A, linear in the lever arm t, with a weak prior at 0, and one λ_k per pair.
     motions = np.arange(len(views))
     lever, scales = rotation_a - np.eye(3), np.zeros((len(views), 3, len(views)))
     scales[motions, :, motions] = -camera_motion[:, :3, 3] @ rotation.T

@@ -177,7 +177,7 @@ class _Predictor:
                     array[e] = values
                 predictions.release()
         if damaged and self.cache is not None:
-            self._say(
+            self._warn(
                 f"{damaged} of the pairs in the cache {self.cache.folder} were damaged: predicted again"
             )
         if missing or self.aligned:
@@ -263,9 +263,9 @@ class _Predictor:
     def _ask_less(self) -> None:
         if self.batch > 1:
             self.batch //= 2
-            self._say(f"out of memory on the {self.device}: going on with {self.batch} pairs at a time")
+            self._warn(f"out of memory on the {self.device}: going on with {self.batch} pairs at a time")
         elif self.device.type == "cuda":
-            self._say(f"one pair does not fit on the {self.device}: going on, slowly, on the CPU")
+            self._warn(f"one pair does not fit on the {self.device}: going on, slowly, on the CPU")
             self.device = torch.device("cpu")
             self.network.to(self.device)
             self.features = {row: _each(Tensor.cpu, features) for row, features in self.features.items()}
@@ -276,7 +276,7 @@ class _Predictor:
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
 
-    def _say(self, note: str) -> None:
+    def _warn(self, note: str) -> None:
         """At once, as what follows takes longer, and in the notes of the result."""
         logger.warning(note)
         self.notes += (note,)
@@ -313,7 +313,7 @@ def _reserve(file: int, size: int) -> None:
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file, 0, size)
         return
-    # macOS has no such call: zeros reserve as much room, but take the time of writing them.
+    # macOS has no such call: zeros reserve as much, but take the time of writing them.
     zeros = bytes(1 << 20)
     while size:
         size -= os.write(file, zeros[:size])

@@ -1,7 +1,7 @@
-"""Published weights into the network: .pth, safetensors, a folder or a hub id, without executing a pickle.
+"""Published weights into the network: .pth, safetensors or a folder, without executing a pickle.
 
 Weights come in two layouts: a .pth of {'args': Namespace(model="AsymmetricCroCo3DStereo(...)"), 'model':
-state dict}, and a folder of config.json with model.safetensors, which is also what a hub id resolves to.
+state dict}, and a folder of config.json with model.safetensors, which is also what the hub has.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from jcr.errors import InputError
 from jcr.reconstruct.dust3r.network import Dust3r
-from jcr.reconstruct.hub import HUB_FILES, cached_files
+from jcr.reconstruct.hub import HUB_FILES, Weights
 
 
 @dataclass(frozen=True)
@@ -28,24 +28,18 @@ class LoadedNetwork:
     """A network ready to predict, and what its weights bring with them."""
 
     network: Dust3r
-    source: str
-    """The path or hub id asked for."""
-    licence: str
     is_metric: bool
     """Its points are meant to be in metres."""
 
 
-def load_weights(source: str | Path, device: str = "cpu", licence: str = "unknown") -> LoadedNetwork:
-    """A network with the weights of a .pth, a .safetensors beside its config.json, a folder, or a hub id.
+def load_weights(weights: Weights, device: str = "cpu") -> LoadedNetwork:
+    """A network with the weights of a .pth, a .safetensors beside its config.json, or a folder with one of these.
 
-    A hub id is downloaded (resumed where it stopped; HF_HUB_OFFLINE honoured) unless it is in the cache. The
-    `licence` is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
+    Their licence is printed on stderr. Raises InputError for what is missing, damaged or not of this network.
     """
-    path = Path(source)
-    if not path.exists() and re.fullmatch(r"[\w.-]+/[\w.-]+", str(source)) and path.suffix not in _READERS:
-        path = _download(str(source))
-    elif not path.exists():
-        raise InputError(f"{source}: no such weights; give a file, a folder or a hub id (jcr models)")
+    path = weights.path
+    if not path.exists():
+        raise InputError(f"{path}: no such weights; give a file, a folder or a hub id (jcr models)")
     if path.is_dir():
         path = _file_in(path)
     if path.suffix not in _READERS:
@@ -59,8 +53,8 @@ def load_weights(source: str | Path, device: str = "cpu", licence: str = "unknow
         network = network.to(torch.device(device)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"device {device}: {_line(error)}; use --device cpu") from None
-    _announce(str(source), licence)
-    return LoadedNetwork(network, str(source), licence, is_metric=bool(mast3r))
+    _announce(weights.note)
+    return LoadedNetwork(network, is_metric=bool(mast3r))
 
 
 def fingerprint(network: Dust3r) -> str:
@@ -71,28 +65,6 @@ def fingerprint(network: Dust3r) -> str:
         values = tensor.flatten()[spread.to(tensor.device)].float().cpu().numpy()
         digest.update(f"{key}{tuple(tensor.shape)}".encode() + values.tobytes())
     return digest.hexdigest()
-
-
-def _download(hub_id: str) -> Path:
-    """The model.safetensors of a hub id beside its config.json, from the cache where both are there."""
-    import httpx
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.utils import logging as hub_logging
-
-    if cached := cached_files(hub_id):
-        return cached[1]
-    sys.stderr.write(f"fetching {hub_id} from the hub\n")
-    verbosity = hub_logging.get_verbosity()
-    hub_logging.set_verbosity_error()  # its retries, five of them, are no news to the user
-    try:
-        return Path([hf_hub_download(hub_id, name) for name in HUB_FILES][1])
-    except (OSError, ValueError, httpx.HTTPError) as error:
-        raise InputError(
-            f"{hub_id}: not in the cache and not to be had from the hub ({_line(error)}); "
-            "connect, or pass the weights as a file"
-        ) from None
-    finally:
-        hub_logging.set_verbosity(verbosity)
 
 
 def _file_in(folder: Path) -> Path:
@@ -213,9 +185,9 @@ def _build(config: dict[str, object], state: dict[str, Tensor], path: Path) -> D
 
 
 @functools.cache
-def _announce(source: str, licence: str) -> None:
+def _announce(note: str) -> None:
     """Once per process and source."""
-    sys.stderr.write(f"weights {source}: licence {licence}\n")
+    sys.stderr.write(f"{note}\n")
 
 
 def _line(error: BaseException) -> str:

@@ -2,7 +2,7 @@
 
 The model is the published one: a depth map, a focal length and a camera per image; a rigid transform and a
 scale per pair, tied to no camera; residual norms (not their squares) weighted by log confidence; Adam from a
-spanning tree of the pairs. It stands as the baseline that `align_fast` is measured against.
+spanning tree of the pairs. It is the baseline that Gauss-Newton is measured against.
 """
 
 import math
@@ -43,16 +43,49 @@ def align_adam(
     chosen = [observe(predictions, pinhole, k, pixels[k], log_weight) for k in range(count)]
     start = initial_state(chosen, predictions.edges, pinhole)
     everything = (observe(predictions, pinhole, k, slice(None), log_weight) for k in range(count))
-    model = PointmapModel(
-        start, np.stack([initial_depth(o, start) for o in everything]), predictions, pinhole
-    )
-
+    depth = np.stack([initial_depth(o, start) for o in everything])
+    model = PointmapModel(start, depth, predictions, pinhole)
     groups = [slice(e, e + PAIRS_AT_ONCE) for e in range(0, len(predictions.edges), PAIRS_AT_ONCE)]
-    optimizer = torch.optim.Adam(
-        [parameter for parameter in model.parameters() if parameter.requires_grad],
-        lr=options.learning_rate,
-        betas=(0.9, 0.9),
-    )
+    _descend(model, predictions, groups, options, log_weight, progress)
+    with torch.no_grad():
+        points = model.points()
+        residual = [
+            torch.maximum(
+                *(
+                    model.distance(points, group, view).median(dim=1).values / model.range(group, view)
+                    for view in (0, 1)
+                )
+            )
+            for group in groups
+        ]
+        recon_from_camera = transform(
+            model.rotation(model.camera_quat_xyzw).double().numpy(), model.camera_center.double().numpy()
+        )
+        focal = model.focal().double().numpy()
+        return Alignment(
+            recon_from_camera=inverse(recon_from_camera[0]) @ recon_from_camera,
+            focal_px=np.stack([focal, focal * pinhole.aspect], axis=1),
+            principal_point_px=pinhole.principal_point_px,
+            depth=model.log_depth.exp().reshape(count, height, width).numpy(),
+            confidence=_mean_confidence(predictions, log_weight),
+            pair_scale=model.scale().double().numpy(),
+            pair_residual=torch.cat(residual).double().numpy(),
+            seconds=time.perf_counter() - begin,
+            method="adam",
+        )
+
+
+def _descend(
+    model: "PointmapModel",
+    predictions: PairPredictions,
+    groups: list[slice],
+    options: AlignOptions,
+    log_weight: bool,
+    progress: Progress | None,
+) -> None:
+    """Adam on eq. 1, its rate falling to 0 along a cosine; the pairs are taken in `groups` to bound the memory."""
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.Adam(parameters, lr=options.learning_rate, betas=(0.9, 0.9))
     for step in range(options.steps):
         cosine = math.cos(math.pi * step / options.steps)
         optimizer.param_groups[0]["lr"] = 0.5 * options.learning_rate * (1 + cosine)
@@ -62,41 +95,14 @@ def align_adam(
         gathered = points.detach().requires_grad_()
         for group in groups:
             loss = torch.zeros(())
-            for view in (0, 1):
-                conf = (predictions.conf, predictions.conf2)[view][group].reshape(-1, height * width)
-                weight = torch.from_numpy(weigh(conf, log_weight))
+            for view, confidence in enumerate((predictions.conf, predictions.conf2)):
+                weight = torch.from_numpy(weigh(confidence[group], log_weight)).flatten(1)
                 loss = loss + (weight * model.distance(gathered, group, view)).mean(dim=1).sum()
             loss.backward()
         points.backward(gathered.grad)
         optimizer.step()
         if progress is not None:
             progress("align pairs", (step + 1) / options.steps)
-
-    with torch.no_grad():
-        points = model.points()
-        relative = [
-            model.distance(points, group, view).median(dim=1).values / model.range(group, view)
-            for group in groups
-            for view in (0, 1)
-        ]
-        recon_from_camera = transform(
-            model.rotation(model.camera_quat_xyzw).double().numpy(), model.camera_center.double().numpy()
-        )
-        focal = model.focal().double().numpy()
-        depth = model.log_depth.exp().reshape(count, height, width).numpy()
-        scale = model.scale().double().numpy()
-    residual = [torch.maximum(*relative[k : k + 2]) for k in range(0, len(relative), 2)]
-    return Alignment(
-        recon_from_camera=inverse(recon_from_camera[0]) @ recon_from_camera,
-        focal_px=np.stack([focal, focal * pinhole.aspect], axis=1),
-        principal_point_px=pinhole.principal_point_px,
-        depth=depth,
-        confidence=_mean_confidence(predictions, log_weight),
-        pair_scale=scale,
-        pair_residual=torch.cat(residual).double().numpy(),
-        seconds=time.perf_counter() - begin,
-        method="adam",
-    )
 
 
 class PointmapModel(torch.nn.Module):

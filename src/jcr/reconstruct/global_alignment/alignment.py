@@ -16,14 +16,14 @@ LEAST_PIXELS = 50
 """Several for each coarse cell that tells how far residuals go together."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AlignOptions:
     """How pairwise pointmaps become one reconstruction."""
 
     method: Literal["fast", "adam"] = "fast"
     """fast: Gauss-Newton on chosen pixels; adam: gradient descent on every pixel, as published (slow)."""
     focal: Literal["auto", "shared", "own", "given"] = "auto"
-    """shared: one for all images; own: one per image; given: held at the predictions' intrinsics; auto: given
+    """shared: one for all images; own: one per image; given: fixed at the predictions' intrinsics; auto: given
     where the predictions carry intrinsics, else shared."""
     principal_point_px: tuple[float, float] | None = None
     """x, y on the pointmaps' grid, pixel (0, 0) being a centre; unset: the predictions' intrinsics where they
@@ -49,7 +49,7 @@ class Pinhole:
     """One focal length for all images."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Alignment:
     """One reconstruction from pairwise pointmaps: a camera and a depth map per image, a scale per pair.
 
@@ -100,13 +100,13 @@ def pinhole_of(predictions: PairPredictions, options: AlignOptions) -> Pinhole:
         raise InputError(
             "focal 'given', but the predictions carry no intrinsics; add them or ask for 'shared'"
         )
-    held = given is not None and options.focal in ("auto", "given")
+    known = given is not None and options.focal in ("auto", "given")
     height, width = predictions.conf.shape[1:]
     middle = (width / 2, height / 2) if given is None else (given.cx, given.cy)
     return Pinhole(
         principal_point_px=options.principal_point_px or middle,
         aspect=given.fy / given.fx if given else 1.0,
-        focal_px=given.fx if given and held else None,
+        focal_px=given.fx if given and known else None,
         shared=options.focal != "own",
     )
 

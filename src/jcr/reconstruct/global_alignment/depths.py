@@ -38,5 +38,5 @@ def fused_depth(
         weight = observations.weight * agreement(r, noise)
         hessian, gradient = depth_equations(r, noise, weight)
         log_depth -= np.clip(gradient / hessian, -0.3, 0.3)
-    say = noise.along**-2 / (noise.along**-2).sum()
-    return np.exp(log_depth), say @ weight
+    share = noise.along**-2 / (noise.along**-2).sum()
+    return np.exp(log_depth), share @ weight

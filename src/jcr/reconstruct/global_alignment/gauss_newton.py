@@ -25,7 +25,13 @@ from jcr.progress import Progress
 from jcr.reconstruct.global_alignment.alignment import Alignment, AlignOptions, Pinhole, pinhole_of
 from jcr.reconstruct.global_alignment.depths import fused_depth
 from jcr.reconstruct.global_alignment.initial_estimate import initial_state
-from jcr.reconstruct.global_alignment.normal_equations import Layout, PairTies, image_equations
+from jcr.reconstruct.global_alignment.normal_equations import (
+    ImageEquations,
+    Layout,
+    PairTies,
+    ReducedEquations,
+    image_equations,
+)
 from jcr.reconstruct.global_alignment.observations import (
     ImageObservations,
     choose_pixels,
@@ -45,7 +51,7 @@ START_SPREAD = 0.01
 """Of the pairs' errors, relative to the depth and in radians, until it is measured."""
 LEAST_SPREAD = 1e-5
 GAUGE_WEIGHT = 1e3
-"""Of the held sum of the log pair scales, in units of what the pointmaps say of one: stiff beside it."""
+"""Of the fixed sum of the log pair scales, over the information of the pointmaps on one of them."""
 NORMAL_SQUARE_MEDIAN = 0.455
 """Median of the square of a unit normal."""
 DEPTH_CHUNK = 4096
@@ -53,9 +59,9 @@ DEPTH_CHUNK = 4096
 CONTRADICTION = 4.0
 """A pair whose residual is this many times the median one is named to the user."""
 USELESS = 0.2
-"""Residual of the middle pair, relative to the distance, that no network worth its weights comes near."""
+"""Residual of the middle pair, relative to the distance, of pairs that do not belong together."""
 
-NOTHING = "the alignment of the pairs came to nothing; their pointmaps have too little in common"
+UNDETERMINED = "the pointmaps of the pairs have too little in common to be aligned"
 
 
 @runtime_checkable
@@ -79,7 +85,7 @@ class Cameras(Protocol):
 
 
 class FreeCameras:
-    """Cameras that may stand anywhere; the first one and the product of the pair scales are held (gauge)."""
+    """Cameras that may stand anywhere; the first one and the product of the pair scales are fixed (gauge)."""
 
     def __init__(self, recon_from_camera: Float[ndarray, "n 4 4"]) -> None:
         self.recon_from_camera = recon_from_camera
@@ -90,9 +96,9 @@ class FreeCameras:
     ) -> Float[ndarray, " p"]:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns."""
         scales = layout.scales
-        held = hessian.copy()
-        held[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
-        self.normal = held[6:, 6:]
+        fixed = hessian.copy()
+        fixed[np.ix_(scales, scales)] += GAUGE_WEIGHT * hessian.diagonal()[scales].mean()
+        self.normal = fixed[6:, 6:]
         step = np.zeros(layout.size)
         step[6:] = -np.linalg.solve(self.normal, gradient[6:])
         self.recon_from_camera = retract(self.recon_from_camera, step[: 6 * layout.images].reshape(-1, 6))
@@ -114,6 +120,11 @@ class Problem:
     pinhole: Pinhole
     log_weight: bool
 
+    @classmethod
+    def of(cls, predictions: PairPredictions, options: AlignOptions) -> "Problem":
+        """What the predictions and `options` give."""
+        return cls(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
+
     @property
     def layout(self) -> Layout:
         """The unknowns."""
@@ -130,9 +141,9 @@ class Problem:
         return [self.observe(k, pixels) for k, pixels in enumerate(choose_pixels(self.predictions, count))]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Solution:
-    """What Gauss-Newton came to."""
+    """The result of Gauss-Newton."""
 
     state: State
     cameras: Cameras
@@ -150,9 +161,8 @@ def align_fast(
 ) -> Alignment:
     """Align from a start in closed form, on few pixels, then on many, and settle the depth of every pixel."""
     begin = time.perf_counter()
-    problem = Problem(predictions, pinhole_of(predictions, options), weight_is_log(predictions))
-    solution = solve_free(problem, options)
-    return dense_alignment(problem, solution, begin, progress)
+    problem = Problem.of(predictions, options)
+    return dense_alignment(problem, solve_free(problem, options), begin, progress)
 
 
 def solve_free(problem: Problem, options: AlignOptions) -> Solution:
@@ -183,66 +193,105 @@ def gauss_newton(
     eliminated: neither is a problem for least_squares.py. Raises NotTrustedError where the pointmaps do not determine
     the unknowns.
     """
-    focals = [layout.focal(k) for k in range(layout.images)]
-    iteration = 0
-    while True:
-        misfit = [
-            residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)
-        ]
-        noise = measure_noise(images, misfit)
-        # The residuals of an image, which are most of the memory, go as its equations come.
-        equations = [image_equations(o, misfit.pop(0), own) for o, own in zip(images, noise, strict=True)]
-        observer_axes = adjoint(inverse(state.recon_from_camera))
-        ties = [
-            PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
-            for o in images
-        ]
-        try:
-            reduced = [own.reduced(tie) for own, tie in zip(equations, ties, strict=True)]
-        except np.linalg.LinAlgError:
-            raise NotTrustedError(NOTHING) from None
-
-        to_twist = twist_from_step(state.recon_from_camera)
-        selections = [_selection(o, layout, to_twist) for o in images]
-        hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-        for selection, own in zip(selections, reduced, strict=True):
-            hessian += selection.T @ (selection.T @ own.hessian).T
-            gradient += selection.T @ own.gradient
-        # A pair nobody believes keeps its scale.
-        scales = layout.scales
-        hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
-        try:
-            step = cameras.step(layout, hessian, gradient)
-        except np.linalg.LinAlgError:
-            step = np.full(layout.size, np.nan)
-        if not np.isfinite(step).all():
-            raise NotTrustedError(NOTHING)
-
-        log_depth, pair_error = [], np.zeros_like(state.pair_error)
-        variance = np.zeros_like(state.pair_error)
-        for k, o in enumerate(images):
-            local_step = selections[k] @ step
-            pair_step = reduced[k].pair_step(local_step)
-            # An error of a pair moves its view as a step of its observer does.
-            local_step[: pair_step.size] -= pair_step.ravel()
-            # A far step of a pixel without parallax must not take it behind or beyond the scene.
-            depth_step = np.clip(equations[k].depth_step(local_step), -0.5, 0.5)
-            log_depth.append(state.log_depth[k] + depth_step)
-            pair_error[o.second_pairs] = ties[k].error + np.einsum("kij,kj->ki", ties[k].axes, pair_step)
-            variance[o.second_pairs] = reduced[k].error_variance
-        pair_spread = _spread(pair_error, variance, pair_spread)
-        state = State(
-            recon_from_camera=cameras.recon_from_camera,
-            log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
-            log_pair_scale=state.log_pair_scale + step[layout.scales],
-            pair_error=pair_error,
-            log_depth=log_depth,
-        )
-        iteration += 1
+    for iteration in range(1, ITERATIONS + 1):
+        noise, linearised = _linearised(images, state, layout, pair_spread)
+        step = _step(linearised, layout, cameras)
+        state, variance = _after_step(images, state, layout, cameras, linearised, step)
+        pair_spread = _spread(state.pair_error, variance, pair_spread)
         settled = bool(np.abs(step).max() < tolerance)
         if settled or iteration == ITERATIONS:
-            return Solution(state, cameras, images, noise, pair_spread, settled)
-        del equations, reduced  # or they would stay until the next ones are complete
+            return Solution(
+                state=state,
+                cameras=cameras,
+                images=images,
+                noise=noise,
+                pair_spread=pair_spread,
+                settled=settled,
+            )
+        del linearised  # or they would stay until the next ones are complete
+    raise AssertionError
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The normal equations of one image's pointmaps at a state."""
+
+    equations: ImageEquations
+    ties: PairTies
+    reduced: ReducedEquations
+    selection: csr_array
+    """Takes a step of all unknowns to the local ones of these equations."""
+
+
+def _linearised(
+    images: list[ImageObservations], state: State, layout: Layout, pair_spread: Float[ndarray, "6"]
+) -> tuple[list[Noise], list[_Linearised]]:
+    """Noise of every image's pointmaps, and the equations weighted by it; NotTrustedError where they are singular."""
+    misfit = [residuals(o, state, log_depth) for o, log_depth in zip(images, state.log_depth, strict=True)]
+    noise = measure_noise(images, misfit)
+    observer_axes = adjoint(inverse(state.recon_from_camera))
+    to_twist = twist_from_step(state.recon_from_camera)
+    found = []
+    for o, own in zip(images, noise, strict=True):
+        # The residuals of an image, which are most of the memory, go as its equations come.
+        equations = image_equations(o, misfit.pop(0), own)
+        ties = PairTies(observer_axes[o.observers], state.pair_error[o.second_pairs], pair_spread)
+        try:
+            reduced = equations.reduced(ties)
+        except np.linalg.LinAlgError:
+            raise NotTrustedError(UNDETERMINED) from None
+        found.append(_Linearised(equations, ties, reduced, _selection(o, layout, to_twist)))
+    return noise, found
+
+
+def _step(linearised: list[_Linearised], layout: Layout, cameras: Cameras) -> Float[ndarray, " p"]:
+    """The step of all unknowns that are not eliminated; the cameras take theirs. NotTrustedError where it is none."""
+    hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+    for image in linearised:
+        hessian += image.selection.T @ (image.selection.T @ image.reduced.hessian).T
+        gradient += image.selection.T @ image.reduced.gradient
+    # A pair without weight keeps its scale.
+    scales = layout.scales
+    hessian[scales, scales] += 1e-9 * hessian.diagonal()[scales].max()
+    try:
+        step = cameras.step(layout, hessian, gradient)
+    except np.linalg.LinAlgError:
+        step = np.full(layout.size, np.nan)
+    if not np.isfinite(step).all():
+        raise NotTrustedError(UNDETERMINED)
+    return step
+
+
+def _after_step(
+    images: list[ImageObservations],
+    state: State,
+    layout: Layout,
+    cameras: Cameras,
+    linearised: list[_Linearised],
+    step: Float[ndarray, " p"],
+) -> tuple[State, Float[ndarray, "e 6"]]:
+    """The state after a step of the unknowns that are not eliminated, and the variances of the pairs' errors."""
+    log_depth, pair_error = [], np.zeros_like(state.pair_error)
+    variance = np.zeros_like(state.pair_error)
+    for o, before, image in zip(images, state.log_depth, linearised, strict=True):
+        local_step = image.selection @ step
+        pair_step = image.reduced.pair_step(local_step)
+        # An error of a pair moves its view as a step of its observer does.
+        local_step[: pair_step.size] -= pair_step.ravel()
+        # A far step of a pixel without parallax must not take it behind or beyond the scene.
+        log_depth.append(before + np.clip(image.equations.depth_step(local_step), -0.5, 0.5))
+        ties = image.ties
+        pair_error[o.second_pairs] = ties.error + np.einsum("kij,kj->ki", ties.axes, pair_step)
+        variance[o.second_pairs] = image.reduced.error_variance
+    focals = [layout.focal(k) for k in range(layout.images)]
+    after = State(
+        recon_from_camera=cameras.recon_from_camera,
+        log_focal=state.log_focal + np.array([0.0 if c is None else step[c] for c in focals]),
+        log_pair_scale=state.log_pair_scale + step[layout.scales],
+        pair_error=pair_error,
+        log_depth=log_depth,
+    )
+    return after, variance
 
 
 def _spread(
@@ -308,7 +357,7 @@ def _warnings(residual: Float[ndarray, " e"], settled: bool) -> tuple[str, ...]:
     """What speaks against an alignment."""
     warnings, middle = [], float(np.median(residual))
     if not settled:
-        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations; trust it little")
+        warnings.append(f"the alignment had not settled after {ITERATIONS} iterations and may be wrong")
     if middle > USELESS:
         warnings.append(
             f"the pairs disagree by {100 * middle:.0f} % of the distance; nothing can be built on them"

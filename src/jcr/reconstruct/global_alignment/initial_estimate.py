@@ -98,11 +98,11 @@ def _depth_by_resection(o: ImageObservations, focal: float) -> Float[ndarray, " 
         use = weight > 0
         if use.sum() < 6:
             continue
-        found, turn, shift, inliers = cv2.solvePnPRansac(
+        found, rotation, shift, inliers = cv2.solvePnPRansac(
             points[use], x_px[use], np.eye(3), None, reprojectionError=0.02, flags=cv2.SOLVEPNP_SQPNP
         )
         if found and len(inliers) > best_inliers:
-            depth = points @ cv2.Rodrigues(turn)[0][2] + shift[2]
+            depth = points @ cv2.Rodrigues(rotation)[0][2] + shift[2]
             best_depth, best_inliers = np.maximum(depth, 0.01 * np.median(np.abs(depth))), len(inliers)
     return best_depth
 
@@ -127,24 +127,24 @@ def _similarities(
         weight = o.weight[:n].astype(np.float64)
         fit = fit_similarity(y, x.T, weight)
         for _ in range(5):
-            relative = _miss(y, x, *fit) / scale
+            relative = _distances(y, x, *fit) / scale
             middle = np.median(relative, axis=1, keepdims=True)
             fit = fit_similarity(y, x.T, weight / (1.0 + (relative / (2.0 * middle + 1e-9)) ** 2) ** 2)
         first_from_second[o.pair[:n]] = fit[0]
         log_ratio[o.pair[:n]] = np.log(fit[1])
-        residual[o.pair[:n]] = np.median(_miss(y, x, *fit) / scale, axis=1)
+        residual[o.pair[:n]] = np.median(_distances(y, x, *fit) / scale, axis=1)
     return PairSimilarities(first_from_second, log_ratio, residual)
 
 
-def _miss(
+def _distances(
     y: Float[ndarray, "k m 3"],
     x: Float[ndarray, "3 m"],
     y_from_x: Float[ndarray, "k 4 4"],
     ratio: Float[ndarray, " k"],
 ) -> Float[ndarray, "k m"]:
     """Distance of y from the transformed x."""
-    moved = ratio[:, None, None] * (y_from_x[:, :3, :3] @ x) + y_from_x[:, :3, 3:]
-    return np.linalg.norm(np.swapaxes(y, 1, 2) - moved, axis=1)
+    transformed = ratio[:, None, None] * (y_from_x[:, :3, :3] @ x) + y_from_x[:, :3, 3:]
+    return np.linalg.norm(np.swapaxes(y, 1, 2) - transformed, axis=1)
 
 
 def _contradiction(edges: Int[ndarray, "e 2"], pairs: PairSimilarities, images: int) -> Float[ndarray, " e"]:

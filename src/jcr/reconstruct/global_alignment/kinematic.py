@@ -11,14 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.geometry import (
-    inverse,
-    retract,
-    scale_translation,
-    skew,
-    step_axes,
-    step_between,
-)
+from jcr.geometry import inverse, retract, scale_translation, skew, step_axes, step_between
 from jcr.handeye.closed_form import initial_estimate
 from jcr.handeye.systematic import REACH
 from jcr.reconstruct.global_alignment.gauss_newton import (
@@ -33,7 +26,7 @@ from jcr.reconstruct.global_alignment.pairs import PairPredictions
 from jcr.reconstruct.global_alignment.pointmap_residuals import State
 
 VAGUE = 10.0
-"""One-sigma prior (m, rad) of gripper_from_camera: says nothing, yet keeps unobservable motions solvable."""
+"""One-sigma prior (m, rad) of gripper_from_camera: vague, yet it keeps unobservable motions solvable."""
 
 STRAIN = 5.0
 """Standard deviations by which a gripper pose may move before the user is warned."""
@@ -47,9 +40,7 @@ class HandEyeCameras:
     """Cameras on a gripper: base_from_camera[i] = base_from_gripper[i] · gripper_from_camera."""
 
     def __init__(
-        self,
-        base_from_gripper: Float[ndarray, "n 4 4"],
-        gripper_from_camera: Float[ndarray, "4 4"],
+        self, base_from_gripper: Float[ndarray, "n 4 4"], gripper_from_camera: Float[ndarray, "4 4"]
     ) -> None:
         self.measured = base_from_gripper
         self.base_from_gripper = base_from_gripper
@@ -73,8 +64,8 @@ class HandEyeCameras:
     ) -> Float[ndarray, " p"]:
         """Solve the reduced normal equations, move the cameras, and return the step of all unknowns.
 
-        Unknowns in turn: a step of gripper_from_camera and one of each gripper pose, both in gripper axes, then what
-        `layout` has beside cameras. A rotation of the gripper carries the camera along, one of the camera on it
+        Unknowns in this order: a step of gripper_from_camera and one of each gripper pose, both in gripper axes, then
+        what `layout` has beside cameras. A rotation of the gripper carries the camera along, one of the camera on it
         does not.
         """
         images = layout.images

@@ -45,7 +45,7 @@ class Layout:
 def depth_equations(
     r: Residuals, noise: Noise, weight: Float[ndarray, "k m"]
 ) -> tuple[Float[ndarray, " m"], Float[ndarray, " m"]]:
-    """Gauss-Newton hessian and gradient of the log depths alone, every pointmap an independent witness."""
+    """Gauss-Newton hessian and gradient of the log depths alone, every pointmap independent."""
     weight = weight / r.distance
     w_across = weight / noise.across[:, None] ** 2
     w_along = weight / noise.along[:, None] ** 2
@@ -57,7 +57,7 @@ def depth_equations(
     return total + np.float32(1e-6) * total.max() + np.float32(1e-30), gradient.sum(axis=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageEquations:
     """Gauss-Newton equations of one image: local unknowns are relative twists, its pair scales, its focal.
 
@@ -118,7 +118,7 @@ class PairTies:
         return np.einsum("kji,kj->ki", self.axes, self.error / self.spread**2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReducedEquations:
     """Equations of one image's local unknowns, without its depths and the errors of its pairs."""
 
@@ -185,7 +185,7 @@ def image_equations(observations: ImageObservations, r: Residuals, noise: Noise)
         ]
     )
     depth_hessian = (depth_pull.sum(axis=0) * arm).sum(axis=0)
-    # A pixel nobody predicts keeps its depth.
+    # A pixel without weight keeps its depth.
     depth_hessian += np.float32(1e-6) * depth_hessian.max() + np.float32(1e-30)
     return ImageEquations(
         hessian=hessian,

@@ -1,4 +1,4 @@
-"""What all pairs say about chosen pixels of one image, laid out for vector arithmetic."""
+"""The pointmaps of all pairs at chosen pixels of one image, laid out for vector arithmetic."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from jcr.reconstruct.global_alignment.alignment import Pinhole
 from jcr.reconstruct.global_alignment.pairs import PairPredictions
 
 CELL_SIDE = 4
-"""Residuals are correlated over an image; their cell means on a 4x4 grid tell by how much."""
+"""Residuals are correlated over an image; their cell means on a 4x4 grid measure by how much."""
 POOR = 0.2
 """Share of a good pixel's weight under which a cell's best pixel is not worth having."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImageObservations:
     """Pointmaps of one image, seen from the cameras of other images (`second` views) and from its own.
 
@@ -59,7 +59,7 @@ def choose_pixels(predictions: PairPredictions, count: int) -> list[Int[ndarray,
     """Flat indices per image: the most confident pixel of each of about `count` equal cells.
 
     Equal cells keep the whole field of view, which a plain ranking by confidence would give up. Cells without
-    a pixel worth having (sky, say) are left out. Raises InputError for an image without any confidence.
+    a pixel worth having (sky) are left out. Raises InputError for an image without any confidence.
     """
     height, width = predictions.conf.shape[1:]
     side = np.sqrt(max(1.0, height * width / count))

@@ -36,7 +36,7 @@ class PairPredictions:
     conf2: Float[ndarray, "e h w"]
     """Of `pts3d_in_other_view`."""
     images: tuple[str, ...] = ()
-    """Names by which the capture speaks of the images; empty when the file does not say."""
+    """Names of the images in the capture; empty when the file has none."""
     colors: UInt8[ndarray, "n h w 3"] | None = None
     """RGB at the pointmaps' pixels."""
     intrinsics: Intrinsics | None = None
@@ -47,7 +47,7 @@ class PairPredictions:
 
     @property
     def image_count(self) -> int:
-        """Images the edges speak of."""
+        """Images that the edges join."""
         return len(self.images) or int(self.edges.max()) + 1
 
     def release(self) -> None:
@@ -162,38 +162,21 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
             raise InputError(
                 f"{source}: {name} has shape {arrays[name].shape}, it needs {dimensions} dimensions"
             )
-    edges, pts3d = arrays["edges"], arrays["pts3d"]
-    count, height, width = pts3d.shape[:3]
-    shapes = {
+    edges = arrays["edges"]
+    count, height, width = arrays["pts3d"].shape[:3]
+    for name, shape in {
         "edges": (count, 2),
         "pts3d": (count, height, width, 3),
         "conf": (count, height, width),
         "pts3d_in_other_view": (count, height, width, 3),
         "conf2": (count, height, width),
-    }
-    for name, shape in shapes.items():
+    }.items():
         if arrays[name].shape != shape:
             raise InputError(f"{source}: {name} has shape {arrays[name].shape}, pts3d asks for {shape}")
-    if count == 0:
-        raise InputError(f"{source}: no pair in it; predict at least one")
-    if edges.dtype.kind not in "iu":
-        raise InputError(f"{source}: edges must be integers, they are {edges.dtype}")
     images = tuple(str(name) for name in arrays.get("images", ()))
-    image_count = len(images) or int(edges.max()) + 1
-    if edges.min() < 0 or edges.max() >= image_count or (edges[:, 0] == edges[:, 1]).any():
-        raise InputError(f"{source}: edges must join two of the {image_count} images, counted from 0")
+    image_count = _check_edges(edges, len(images), source)
     for name in ("pts3d", "conf", "pts3d_in_other_view", "conf2"):
-        # One edge at a time: a mask of the whole would cost as much memory again as a quarter of the file.
-        for edge, values in enumerate(arrays[name]):
-            _release(arrays[name])
-            if not np.isfinite(values).all():
-                raise InputError(
-                    f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"
-                )
-            if name in ("conf", "conf2") and values.min() < 0:
-                raise InputError(
-                    f"{source}: {name}[{edge}] is negative somewhere; a confidence is at least 0"
-                )
+        _check_values(name, arrays[name], source)
     intrinsics, grid = camera_of_arrays(arrays, (width, height), source)
     colors = arrays.get("colors")
     if colors is not None and (colors.shape != (image_count, height, width, 3) or colors.dtype != np.uint8):
@@ -207,6 +190,31 @@ def pairs_from_arrays(arrays: dict[str, ndarray], source: str) -> PairPrediction
         grid=grid,
         is_metric=bool(arrays.get("is_metric", False)),
     )
+
+
+def _check_edges(edges: ndarray, names: int, source: str) -> int:
+    """The number of images: `names`, or where that is 0 as many as the edges count; InputError for wrong edges."""
+    if len(edges) == 0:
+        raise InputError(f"{source}: no pair in it; predict at least one")
+    if edges.dtype.kind not in "iu":
+        raise InputError(f"{source}: edges must be integers, they are {edges.dtype}")
+    images = names or int(edges.max()) + 1
+    if edges.min() < 0 or edges.max() >= images or (edges[:, 0] == edges[:, 1]).any():
+        raise InputError(f"{source}: edges must join two of the {images} images, counted from 0")
+    return images
+
+
+def _check_values(name: str, array: ndarray, source: str) -> None:
+    """InputError for points or confidences of a pair that are not finite, or confidences below 0."""
+    # One edge at a time: a mask of the whole would cost as much memory again as a quarter of the file.
+    for edge, values in enumerate(array):
+        _release(array)
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"{source}: {name}[{edge}] is not finite everywhere; put 0 there, with confidence 0"
+            )
+        if name in ("conf", "conf2") and values.min() < 0:
+            raise InputError(f"{source}: {name}[{edge}] is negative somewhere; a confidence is at least 0")
 
 
 def camera_of_arrays(

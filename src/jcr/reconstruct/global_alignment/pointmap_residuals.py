@@ -1,4 +1,4 @@
-"""How far pairwise pointmaps are from a reconstruction, and how far to believe each of them.
+"""How far pairwise pointmaps are from a reconstruction, and how each of them is weighted.
 
 A predicted point errs differently *across* its line of sight (where in the observer's image it appears) and
 *along* it (how far it is): networks know directions several times better than distances, and their errors in
@@ -9,7 +9,7 @@ distance are smooth, so that a thousand pixels do not average them out. Each res
 (x the modelled point seen from the observer, x̂ its direction; q the predicted point, n its direction, both
 rotated into the recon axes), and the two parts are weighted by variances measured on the residuals themselves:
 per pointmap by their median, and per kind of view by how far neighbouring residuals go together. Pairs that
-contradict the others get large variances and so lose their say.
+contradict the others get large variances and so little weight.
 """
 
 from dataclasses import dataclass, fields
@@ -27,7 +27,7 @@ LEAST_NOISE = np.float32(1e-4)
 """No network comes near it; far below it the rounding of float32 sums would be taken for evidence."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class State:
     """All that alignment estimates."""
 
@@ -51,7 +51,7 @@ class Noise:
     along_inflation: Float[ndarray, " k"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Residuals:
     """The two parts of the residuals of one image's pointmaps, and the geometry they hang on (recon axes)."""
 
@@ -109,7 +109,7 @@ def agreement(r: Residuals, noise: Noise) -> Float[ndarray, "k m"]:
 
 def measure_noise(images: list[ImageObservations], misfit: list[Residuals]) -> list[Noise]:
     """Noise of every pointmap, per image: spreads of its own, but at least a third of what is usual for its
-    kind of view (no pair shall win all say by a lucky fit), and the inflations of its kind."""
+    kind of view (no pair shall outweigh all others by a lucky fit), and the inflations of its kind."""
     own = [_own_noise(o, r) for o, r in zip(images, misfit, strict=True)]
     second = np.concatenate([o.second for o in images])
     usual = np.ones((2, len(fields(Noise))), np.float32)

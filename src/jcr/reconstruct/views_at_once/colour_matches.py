@@ -1,9 +1,9 @@
 """Correspondences between views by colour, starting where predicted pointmaps and cameras put them.
 
-A pointmap says where each pixel of a view lies in another, to a few pixels. The other view is drawn as it would look
+A pointmap gives where each pixel of a view lies in another, to a few pixels. The other view is drawn as it would look
 from the first by that, which undoes rotation, scale and slant, and what is left over is the optical flow between the
 two (Lucas and Kanade, 1981; OpenCV's pyramid). That is exact to a fraction of a pixel of the camera's own images,
-whatever the resolution of the network, and independent of what it believes.
+whatever the resolution of the network, and independent of its predictions.
 """
 
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ PATCH_RADIUS = 5
 STEP_RADIUS, LARGEST_STEP = 5, 0.04
 """Pixels around a keypoint within which depth must not change by more than this share."""
 LARGEST_STD_PX = 0.1
-"""One sigma of a match, across the direction in which its window holds it least."""
+"""One sigma of a match, across the direction in which its window fixes it least."""
 LARGEST_GAP = 0.15
 """By how much the distance of a point from the other camera may differ from that view's own depth, in logarithms."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Cameras and a depth per pixel of each image, as believed so far."""
+    """Cameras and a depth per pixel of each image, as estimated so far."""
 
     pinhole: Intrinsics
     recon_from_camera: Float[ndarray, "n 4 4"]
@@ -65,7 +65,7 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
     starts, points, views, pixels = [], [], [], []
     total = 0
     for n in range(count):
-        known = (_smooth_surface(geometry.depth[n]) & _held_both_ways(gray[n])).astype(np.uint8)
+        known = (_smooth_surface(geometry.depth[n]) & _textured_both_ways(gray[n])).astype(np.uint8)
         corners = cv2.goodFeaturesToTrack(gray[n], keypoints, 0.005, width / 80, mask=known)
         if corners is None:
             continue
@@ -75,7 +75,7 @@ def colour_matches(gray: UInt8[ndarray, "n h w"], geometry: Geometry, keypoints:
         for m in range(count):
             if m == n or _apart_deg(geometry, n, m) > WIDEST_DEG:
                 continue
-            good, there = _matched(gray[n], gray[m], corners, x_in_recon, geometry, n, m)
+            good, there = _locate_corners(gray[n], gray[m], corners, x_in_recon, geometry, n, m)
             points.append(total + np.flatnonzero(good))
             views.append(np.full(good.sum(), m))
             pixels.append(there[good])
@@ -96,8 +96,8 @@ def _smooth_surface(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return (nearest > 0) & (farthest < (1 + LARGEST_STEP) * nearest)
 
 
-def _held_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Where a window's content holds it in all directions: along a straight edge a match stays where it was predicted.
+def _textured_both_ways(gray: UInt8[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Where a window's content fixes it in all directions: along a straight edge a match stays where it was predicted.
 
     The variance of the flow is the noise's over the smaller eigenvalue of the gradients' summed products (the
     structure tensor), whose share of noise is taken off.
@@ -123,7 +123,7 @@ def _apart_deg(geometry: Geometry, n: int, m: int) -> float:
     return float(np.degrees(np.arccos(np.clip(first @ second, -1, 1))))
 
 
-def _matched(
+def _locate_corners(
     start: UInt8[ndarray, "h w"],
     end: UInt8[ndarray, "h w"],
     corners: Float[ndarray, "k 2"],
@@ -168,13 +168,7 @@ def _flow(
 ) -> tuple[Float[ndarray, "k 2"], UInt8[ndarray, "k 1"]]:
     """Where points of one image are in the other, which looks nearly like it; and whether that was found."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        one,
-        other,
-        at,
-        at.copy(),
-        winSize=WINDOW,
-        maxLevel=LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        one, other, at, at.copy(), winSize=WINDOW, maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     return moved, found
 

@@ -36,7 +36,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a model says of the views."""
+    """The output of a model for the views."""
 
     grid: ImageGrid
     """Where its pixels lie in the images that it was shown."""

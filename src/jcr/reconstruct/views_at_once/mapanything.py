@@ -61,7 +61,7 @@ def predict(model: Model, views: Views, device: str = "cpu") -> Predicted:
             view["camera_poses"] = torch.from_numpy(pose).float().to(device)[None]
             view["is_metric_scale"] = torch.tensor([True], device=device)
     with torch.inference_mode():
-        # Masked points would be zeros without a say; the mask is used on the confidence instead.
+        # The mask is applied to the confidence: masked points would be zeros.
         answers = model.infer(shown, use_amp=device != "cpu", apply_mask=False)
     count, height, width = colors.shape[:3]
     points = np.empty((count, height, width, 3), np.float32)

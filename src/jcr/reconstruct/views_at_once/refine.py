@@ -33,12 +33,12 @@ LEAST_MATCHES = 25
 LARGEST_PX = 4.0
 """Reprojection error beyond which a match is none, in units of the median."""
 BEND_STD = 0.03
-"""Prior of the logarithm of a depth correction's uneven part, which is zero where no match says otherwise."""
+"""Prior of the logarithm of a depth correction's uneven part, which is zero where no match is near."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Refined:
-    """What became of a prediction."""
+    """A prediction after adjustment to the images' matches."""
 
     recon_from_camera: Float[ndarray, "n 4 4"]
     """The first camera is where it was."""
@@ -56,7 +56,7 @@ class Refined:
 def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) -> Refined | None:
     """Cameras, depth and tracks; None where too few matches are found.
 
-    `images` are those of the capture without distortion, in full size; `pinhole` is theirs, held where `images` knows
+    `images` are those of the capture without distortion, in full size; `pinhole` is theirs, fixed where `images` has
     it, else a first value of the focal length.
     """
     poses = predicted.recon_from_camera
@@ -72,7 +72,7 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
         tracks = _tracks(colour_matches(gray, geometry, KEYPOINTS // len(gray)), geometry)
         if np.bincount(tracks.image, minlength=len(gray)).min() < LEAST_MATCHES:
             return None
-        adjusted = _adjusted(tracks, geometry, hold=images.pinhole is not None)
+        adjusted = adjust_matches(tracks, geometry, fixed=images.pinhole is not None)
         if len(adjusted.tracks.image) == 0:
             return None
         poses, camera = adjusted.shown.scene.world_from_rig, adjusted.shown.scene.cameras[0]
@@ -82,12 +82,12 @@ def refine(predicted: Predicted, images: PreparedImages, pinhole: Intrinsics) ->
     assert adjusted is not None
     tracks = adjusted.tracks
     return Refined(
-        poses,
-        factor,
-        replace(tracks, x_px=_capture_px(images, work.original_from_grid(tracks.x_px))),
-        pinhole if images.pinhole is not None else work.original_intrinsics(camera),
-        CameraEvidence(poses, adjusted.shown.rig_covariance()),
-        adjusted.error_px / float(work.scale.mean()),
+        recon_from_camera=poses,
+        depth_factor=factor,
+        tracks=replace(tracks, x_px=_capture_px(images, work.original_from_grid(tracks.x_px))),
+        pinhole=pinhole if images.pinhole is not None else work.original_intrinsics(camera),
+        evidence=CameraEvidence(poses, adjusted.shown.rig_covariance()),
+        error_px=adjusted.error_px / float(work.scale.mean()),
     )
 
 
@@ -148,11 +148,11 @@ def _tracks(matches: Matches, geometry: Geometry) -> Tracks:
     )
 
 
-def _adjusted(tracks: Tracks, geometry: Geometry, hold: bool) -> _Adjusted:
-    """Cameras and points adjusted, and the focal length unless it is held; matches far from their points left out, and
+def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted:
+    """Cameras and points adjusted, and the focal length unless it is fixed; matches far from their points left out, and
     points that fewer than two views are left to see."""
     images, camera = len(geometry.recon_from_camera), geometry.pinhole
-    prior = prior_of(camera, HELD if hold else {"f": ESTIMATED["f"]})
+    prior = prior_of(camera, HELD if fixed else {"f": ESTIMATED["f"]})
     shown = adjust_images(
         Scene(
             world_from_rig=geometry.recon_from_camera,

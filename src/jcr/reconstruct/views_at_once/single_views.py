@@ -15,6 +15,7 @@ from jcr.camera import project, rays, unproject
 from jcr.errors import InputError
 from jcr.geometry import apply
 from jcr.progress import Progress, silent
+from jcr.reconstruct.hub import Weights
 from jcr.reconstruct.preprocess import ImageGrid, prepare_images, resize_and_crop
 from jcr.reconstruct.views_at_once.interface import Predict, Views
 from jcr.reconstruct.views_at_once.refine import depth_changes, smooth_factor
@@ -25,20 +26,18 @@ LEAST_POINTS = 5
 """Of structure from motion, in a view; with fewer its depth has the unit of the others."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SingleViewsOptions:
     """One model, and where the cameras come from."""
 
-    backend: str
     load: Callable[[Path, str], Predict]
-    weights: Path
-    licence: str
+    weights: Weights
     cameras: Callable[[Capture, Progress | None], Reconstruction]
     """Cameras and tracks of the images that it can place; its pointmaps are not used."""
     device: str = "cpu"
 
 
-def reconstruct(
+def reconstruct_single_views(
     capture: Capture,
     options: SingleViewsOptions,
     progress: Progress | None = None,
@@ -50,7 +49,7 @@ def reconstruct(
     or damaged.
     """
     report = progress or silent
-    predict = predict or loaded(options.load, options.weights, options.device)
+    predict = predict or loaded(options.load, options.weights.path, options.device)
     sparse = options.cameras(capture, progress)
     placed = replace(
         capture,
@@ -59,23 +58,23 @@ def reconstruct(
         intrinsics=sparse.intrinsics,
     )
     images = prepare_images(placed, lambda size: ImageGrid(size, size, (0, 0), size))
-    assert images.pinhole is not None and images.lens is not None  # structure from motion found them
+    assert (
+        images.pinhole is not None and images.intrinsics_of_capture is not None
+    )  # structure from motion found them
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 1.0)
     grid, there = predicted.grid, predicted.confidence > 0
-    undistorted = project(images.pinhole, unproject(images.lens, sparse.tracks.x_px))
+    undistorted = project(images.pinhole, unproject(images.intrinsics_of_capture, sparse.tracks.x_px))
     tracks = replace(sparse.tracks, x_px=grid.grid_from_original(undistorted))
     depth = np.where(there, predicted.x_in_camera[..., 2], 0)
     changes = np.array(depth_changes(tracks, sparse.recon_from_camera, depth))
     few = np.bincount(tracks.image, minlength=len(depth)) < LEAST_POINTS
     if few.all():
-        raise InputError(
-            f"--backend {options.backend}: structure from motion gave too few points; take another"
-        )
+        raise InputError("--backend moge: structure from motion gave too few points; take another")
     typical = float(np.median(changes[~few, 0]))
     changes[few] = [typical, 0, 0, 0, 0, 0]
-    # The model's metre: what it says of most views, before each is fitted.
+    # The model's metre: the median over the views, before each is fitted.
     unit = float(np.exp(-typical))
     factor = unit * np.stack([smooth_factor(change, *depth.shape[1:]) for change in changes])
     poses = sparse.recon_from_camera.copy()
@@ -92,7 +91,7 @@ def reconstruct(
             colors=np.stack([resize_and_crop(image, grid) for image in images.colors]),
         ),
         tracks=replace(sparse.tracks, points_in_recon=unit * sparse.tracks.points_in_recon),
-        backend=options.backend,
+        backend="moge",
         is_metric=predicted.is_metric,
-        notes=(f"weights {options.weights.name}: {options.licence}", *sparse.notes),
+        notes=(options.weights.note, *sparse.notes),
     )

@@ -1,7 +1,7 @@
-"""The back ends of any-view models: one pass, held against the robot's motion, refined by the images' colours.
+"""The back ends of any-view models: one pass, compared with the robot's motion, refined by the images' colours.
 
-What such a model believes is no measurement: it invents geometry where it sees none, and its metre on a table is often
-wrong by tens of percent. So its confidences weigh points within an image and nothing else. What flows on is camera poses
+A prediction is no measurement: models invent geometry where they see none, and their metre on a table is often wrong by
+tens of percent. So its confidences weigh points within an image and nothing else. What flows on is camera poses
 with a joint covariance that the images' own matches give (refine.py), the robot gives the scale, and the model's metre
 is a check of it. What is kept, of the prediction, its refinement, and a second pass that is shown the poses of the
 first calibration, is what predicts images left out best.
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from jcr.camera import project, rays, unproject
@@ -23,9 +23,9 @@ from jcr.geometry import apply, inverse, rotation_angle
 from jcr.handeye.solve import solve_hand_eye
 from jcr.memory import ALLOWANCE, GB, announce, require, resident
 from jcr.progress import Progress, silent
-from jcr.reconstruct.pointmaps import fit_pinhole, reconstruction_from_pointmaps
+from jcr.reconstruct.hub import Weights
+from jcr.reconstruct.pointmaps import PosedPointmaps, fit_pinhole, reconstruction_from_pointmaps
 from jcr.reconstruct.preprocess import ImageGrid, PreparedImages, prepare_images, resize_and_crop
-from jcr.reconstruct.views_at_once.cost import Cost
 from jcr.reconstruct.views_at_once.interface import Predict, Predicted, Views
 from jcr.reconstruct.views_at_once.refine import Refined, refine
 from jcr.records import CameraEvidence, Capture, HandEye, Intrinsics, Pointmaps, Reconstruction, Tracks
@@ -44,6 +44,34 @@ CLEARLY = 0.95
 
 
 @dataclass(frozen=True)
+class Cost:
+    """Linear in the number of views for memory, quadratic for time: attention over all views at once."""
+
+    base_gb: float
+    """Weights, in main memory, and what their library takes."""
+    view_gb: float
+    """Of each view."""
+    view_s: float
+    """Of each view on one core of a desktop's processor."""
+    pair_s: float
+    """Of each pair of views, likewise."""
+
+    def bytes(self, views: int) -> float:
+        """Peak of main memory on a CPU, over what the program takes without it."""
+        return GB * (self.base_gb + self.view_gb * views)
+
+    def seconds(self, views: int) -> float:
+        """On one core of a CPU."""
+        return self.view_s * views + self.pair_s * views * (views - 1) / 2
+
+    def sentence(self, views: int, device: str) -> str:
+        """For the line that announces the work."""
+        if device != "cpu":
+            return f", and {self.bytes(views) / GB:.1f} GB of the GPU's"
+        return f", and about {self.seconds(views):.0f} s on one core"
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewsOptions:
     """One model and where it runs."""
 
@@ -51,14 +79,13 @@ class ViewsOptions:
     """For the record: its row of the table of back ends."""
     load: Callable[[Path, str], Predict]
     """Of the folder of its weights, and the device."""
-    weights: Path
-    licence: str
+    weights: Weights
     cost: Cost
     takes_poses: bool = False
     device: str = "cpu"
     memory_gb: float = 8.0
     refined: bool = True
-    """Whether matches by colour may replace what the model says of the cameras."""
+    """Whether matches by colour may replace the predicted cameras."""
 
 
 @dataclass(frozen=True)
@@ -84,16 +111,17 @@ class _Candidate:
     @property
     def leave_one_out_m(self) -> float:
         """The leave-one-out error as one length; infinite where there are too few to leave one out."""
-        held_out = self.hand_eye.held_out
-        return float("inf") if held_out is None else held_out.length_m
+        error = self.hand_eye.held_out
+        return float("inf") if error is None else error.length_m
 
-    def told(self) -> str:
-        held_out = self.hand_eye.held_out
-        error = "" if held_out is None else f" {held_out.translation_mm:.2g} mm, {held_out.rotation_deg:.2g}°"
-        return f"{self.name}{error}"
+    def error_in_words(self) -> str:
+        error = self.hand_eye.held_out
+        if error is None:
+            return self.name
+        return f"{self.name} {error.translation_mm:.2g} mm, {error.rotation_deg:.2g}°"
 
 
-def reconstruct(
+def reconstruct_views_at_once(
     capture: Capture, options: ViewsOptions, progress: Progress | None = None, predict: Predict | None = None
 ) -> Reconstruction:
     """Camera poses with their covariance, pointmaps and tracks; in the model's own unit.
@@ -104,7 +132,7 @@ def reconstruct(
     report = progress or silent
     _require_memory(capture, options)
     images = prepare_images(capture, lambda size: ImageGrid(size, size, (0, 0), size))
-    predict = predict or loaded(options.load, options.weights, options.device)
+    predict = predict or loaded(options.load, options.weights.path, options.device)
     report("reconstruct", 0.0)
     predicted = with_known_rays(predict(Views(images.colors, images.pinhole)), images)
     report("reconstruct", 0.5)
@@ -113,7 +141,7 @@ def reconstruct(
             f"--backend {options.backend} sees one view at a time and gives no cameras; choose another"
         )
     pinhole = images.pinhole or _own_pinhole(predicted, options.backend)
-    chosen, notes, warnings = _refined(capture, images, predicted, pinhole, options)
+    chosen, notes, warnings = _predicted_or_refined(capture, images, predicted, pinhole, options)
     if options.takes_poses and chosen.hand_eye.converged:
         chosen, note = _second_pass(capture, images, chosen, pinhole, predict)
         notes = (*notes, note)
@@ -122,7 +150,7 @@ def reconstruct(
 
 
 def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> Predict:
-    """A model that says nothing on stdout, which is for the command's result; packages print there."""
+    """A model that prints nothing on stdout, which is for the command's result; packages print there."""
     with redirect_stdout(sys.stderr):
         predict = load(weights, device)
 
@@ -136,15 +164,12 @@ def loaded(load: Callable[[Path, str], Predict], weights: Path, device: str) -> 
 def _require_memory(capture: Capture, options: ViewsOptions) -> None:
     """Say what it will take, before it is begun."""
     width, height = capture.image_size
-    pictures = len(capture) * width * height * (3 + 4)
+    colors = len(capture) * width * height * (3 + 4)
     needed = (
-        resident()
-        + ALLOWANCE
-        + pictures
-        + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
+        resident() + ALLOWANCE + colors + (options.cost.bytes(len(capture)) if options.device == "cpu" else 0)
     )
     require(int(needed), options.memory_gb * GB, f"--backend {options.backend} with {len(capture)} images")
-    announce(int(needed), options.memory_gb * GB, options.cost.told(len(capture), options.device))
+    announce(int(needed), options.memory_gb * GB, options.cost.sentence(len(capture), options.device))
 
 
 def with_known_rays(predicted: Predicted, images: PreparedImages) -> Predicted:
@@ -167,7 +192,7 @@ def _own_pinhole(predicted: Predicted, backend: str) -> Intrinsics:
     return predicted.grid.original_intrinsics(found)
 
 
-def _refined(
+def _predicted_or_refined(
     capture: Capture, images: PreparedImages, predicted: Predicted, pinhole: Intrinsics, options: ViewsOptions
 ) -> tuple[_Candidate, tuple[str, ...], tuple[str, ...]]:
     """The prediction or its refinement, whichever predicts images left out better; notes; and warnings."""
@@ -186,7 +211,7 @@ def _refined(
         else (as_predicted, adjusted)
     )
     note = (
-        f"leave-one-out error of the cameras {kept.told()} ({left.told()}): the former were kept; "
+        f"leave-one-out error of the cameras {kept.error_in_words()} ({left.error_in_words()}): the former were kept; "
         f"{len(refined.tracks.image)} matches by colour, {refined.error_px:.2f} px"
     )
     return kept, (note,), _contradicted(capture, kept, pinhole)
@@ -203,7 +228,7 @@ def _candidate(
 
 
 def _contradicted(capture: Capture, candidate: _Candidate, pinhole: Intrinsics) -> tuple[str, ...]:
-    """Views whose rotation, or whose matches by epipolar geometry through the hand-eye transform, the robot denies."""
+    """Views whose rotations, or whose matches by epipolar geometry with the hand-eye transform, contradict the robot."""
     camera, gripper = candidate.poses, capture.base_from_gripper
     apart = _angle_differences_deg(camera, gripper)
     named = {}
@@ -239,20 +264,16 @@ def epipolar_px(
     tracks: Tracks,
     capture: Capture,
     pinhole: Intrinsics,
-    trusted: Bool[ndarray, " n"],
+    inliers: Bool[ndarray, " n"],
 ) -> Float[ndarray, " n"]:
-    """Per view the median distance, in pixels, of matches with trusted views from the epipolar lines of their keypoints.
+    """Per view the median distance, in pixels, of matches with inlier views from the epipolar lines of their keypoints.
 
     Lines are drawn by cameras that the robot and a hand-eye transform give, without distortion. Zero where a view has
     no match.
     """
-    lens = capture.intrinsics or pinhole
-    direction = unproject(lens, tracks.x_px)
-    first = np.full(len(tracks.points_in_recon), -1)
-    first[tracks.point[::-1]] = np.arange(len(tracks.point))[::-1]
-    start = first[tracks.point]
-    others = np.flatnonzero(start != np.arange(len(start)))
-    start = start[others]
+    intrinsics = capture.intrinsics or pinhole
+    direction = unproject(intrinsics, tracks.x_px)
+    start, others = _keypoints_and_matches(tracks)
     between = inverse(base_from_camera[tracks.image[others]]) @ base_from_camera[tracks.image[start]]
     normal = np.cross(between[:, :3, 3], np.einsum("kij,kj->ki", between[:, :3, :3], direction[start]))
     line = normal / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
@@ -260,9 +281,19 @@ def epipolar_px(
     views = tracks.image[start], tracks.image[others]
     medians = []
     for k in range(len(base_from_camera)):
-        mine = ((views[0] == k) & trusted[views[1]]) | ((views[1] == k) & trusted[views[0]])
+        mine = ((views[0] == k) & inliers[views[1]]) | ((views[1] == k) & inliers[views[0]])
         medians.append(float(np.median(distance[mine])) if mine.any() else 0.0)
     return np.array(medians)
+
+
+def _keypoints_and_matches(tracks: Tracks) -> tuple[Int[ndarray, " k"], Int[ndarray, " k"]]:
+    """Rows of `tracks`: of each match the keypoint, which its point has as its first row, and the match itself."""
+    _, first = np.unique(tracks.point, return_index=True)
+    first_of = np.full(len(tracks.points_in_recon), -1)
+    first_of[tracks.point[first]] = first
+    start = first_of[tracks.point]
+    others = np.flatnonzero(start != np.arange(len(start)))
+    return start[others], others
 
 
 def _second_pass(
@@ -270,7 +301,7 @@ def _second_pass(
 ) -> tuple[_Candidate, str]:
     """The model once more, shown where the robot and the first pass's hand-eye transform put the cameras.
 
-    Its pointmaps are kept where they predict views left out better; of the cameras it says what it was shown, so that
+    Its pointmaps are kept where they predict views left out better; its cameras only repeat what it was shown, so that
     those of the first pass stay, for the robot's poses must not count twice.
     """
     base_from_camera = capture.base_from_gripper @ first.hand_eye.gripper_from_camera
@@ -323,25 +354,21 @@ def transfer_px(
     A view left out has the camera that the robot's motion from the keypoint's view gives, with the hand-eye transform;
     neither its depth nor its predicted camera is used.
     """
-    grid, lens = predicted.grid, capture.intrinsics or pinhole
-    first = np.full(len(tracks.points_in_recon), -1)
-    first[tracks.point[::-1]] = np.arange(len(tracks.point))[::-1]
-    start = first[tracks.point]
-    others = np.flatnonzero(start != np.arange(len(start)))
-    start = start[others]
-    undistorted = project(images.pinhole or pinhole, unproject(lens, tracks.x_px[start]))
+    grid, intrinsics = predicted.grid, capture.intrinsics or pinhole
+    start, others = _keypoints_and_matches(tracks)
+    undistorted = project(images.pinhole or pinhole, unproject(intrinsics, tracks.x_px[start]))
     column, row = np.rint(grid.grid_from_original(undistorted)).astype(int).T
     column, row = np.clip(column, 0, grid.size[0] - 1), np.clip(row, 0, grid.size[1] - 1)
     view = tracks.image[start]
     z = hand_eye.scale * x_in_camera[view, row, column, 2]
     base_from_camera = capture.base_from_gripper @ hand_eye.gripper_from_camera
     between = inverse(base_from_camera[tracks.image[others]]) @ base_from_camera[view]
-    x = z[:, None] * unproject(lens, tracks.x_px[start])
+    x = z[:, None] * unproject(intrinsics, tracks.x_px[start])
     there = np.einsum("kij,kj->ki", between[:, :3, :3], x) + between[:, :3, 3]
     good = (z > 0) & (there[:, 2] > 0)
     if not good.any():
         return float("inf")
-    off = project(lens, there[good]) - tracks.x_px[others][good]
+    off = project(intrinsics, there[good]) - tracks.x_px[others][good]
     return float(np.median(np.linalg.norm(off, axis=1)))
 
 
@@ -354,34 +381,24 @@ def _record(
     warnings: tuple[str, ...],
 ) -> Reconstruction:
     """As a reconstruction, with the evidence of the images alone."""
-    predicted, refined = chosen.predicted, chosen.refined
-    grid = predicted.grid
-    pinhole = images.pinhole
-    points = chosen.points
+    predicted, refined, poses, points = chosen.predicted, chosen.refined, chosen.poses, chosen.points
+    grid, pinhole = predicted.grid, images.pinhole
     if pinhole is None and refined is not None:
         pinhole = refined.pinhole
         points = points[..., 2:] * rays(grid.grid_intrinsics(pinhole)).astype(np.float32)
-    shown = PreparedImages(
-        np.stack([resize_and_crop(image, grid) for image in images.colors]),
-        grid,
-        images.lens,
-        pinhole,
-        images.warnings,
+    in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)])
+    maps = PosedPointmaps(
+        np.arange(len(capture)),
+        poses,
+        np.where((predicted.confidence > 0)[..., None], in_recon.astype(np.float32), 0),
+        predicted.confidence,
     )
-    poses = chosen.poses
-    in_recon = np.stack([apply(pose, mine) for pose, mine in zip(poses, points, strict=True)]).astype(
-        np.float32
-    )
-    there = predicted.confidence > 0
-    x_in_recon = np.where(there[..., None], in_recon, 0)
-    notes = (f"weights {options.weights.name}: {options.licence}", *notes)
+    colors = np.stack([resize_and_crop(image, grid) for image in images.colors])
+    notes = (options.weights.note, *notes)
     if refined is None:
         made = reconstruction_from_pointmaps(
-            shown,
-            np.arange(len(capture)),
-            poses,
-            x_in_recon,
-            predicted.confidence,
+            replace(images, colors=colors, grid=grid, pinhole=pinhole),
+            maps,
             source=options.backend,
             backend=options.backend,
             is_metric=predicted.is_metric,
@@ -390,14 +407,14 @@ def _record(
         )
         return replace(made, evidence=predicted_evidence(predicted))
     return Reconstruction(
-        image_index=np.arange(len(capture)),
+        image_index=maps.image_index,
         recon_from_camera=poses,
-        intrinsics=images.lens or refined.pinhole,
+        intrinsics=images.intrinsics_of_capture or refined.pinhole,
         pointmaps=Pointmaps(
             intrinsics=grid.grid_intrinsics(pinhole or refined.pinhole),
-            points_in_recon=x_in_recon,
+            points_in_recon=maps.points_in_recon,
             confidence=predicted.confidence,
-            colors=shown.colors,
+            colors=colors,
         ),
         tracks=refined.tracks,
         backend=options.backend,
@@ -423,9 +440,7 @@ def predicted_evidence(predicted: Predicted) -> CameraEvidence:
     by_first = np.tile(np.eye(6), (count, 1, 1))
     arm = poses[:, :3, 3] - poses[0, :3, 3]
     for axis in range(3):
-        turn = np.zeros(3)
-        turn[axis] = 1
-        by_first[:, :3, 3 + axis] = np.cross(turn, arm)
+        by_first[:, :3, 3 + axis] = np.cross(np.eye(3)[axis], arm)
     for n in range(count):
         for m in range(count):
             covariance[n, :, m] = by_first[n] @ np.diag(single) @ by_first[m].T

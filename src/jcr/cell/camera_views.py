@@ -1,0 +1,93 @@
+"""What the images of one further camera share with the images of known pose, before it is placed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.camera import usable_lens
+from jcr.cell.found import CameraFound
+from jcr.cell.localise import Shared, distance
+from jcr.records import CellCamera, Finding, Intrinsics, Kind, Mend
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """What the images of one camera share with the images of known pose, in the order of its images."""
+
+    camera: CellCamera
+    shared: tuple[Shared | None, ...]
+    counts: tuple[int, ...]
+    """Points."""
+    reasons: tuple[str | None, ...]
+    """Why each is not used."""
+
+    @staticmethod
+    def of(camera: CellCamera, found: Sequence[Shared | int]) -> "CameraViews":
+        """Of what localised() said of each image."""
+        return CameraViews(
+            camera,
+            tuple(one if isinstance(one, Shared) else None for one in found),
+            tuple(len(one.x_px) if isinstance(one, Shared) else one for one in found),
+            tuple(
+                None if isinstance(one, Shared) else f"shares {one} points with the mapped scene"
+                for one in found
+            ),
+        )
+
+    @staticmethod
+    def nothing_of(camera: CellCamera) -> "CameraViews":
+        """Before anything is looked at."""
+        count = len(camera.images)
+        return CameraViews(camera, (None,) * count, (0,) * count, (None,) * count)
+
+    @property
+    def rows(self) -> Int[ndarray, " k"]:
+        """Images that were localised."""
+        return np.flatnonzero([one is not None for one in self.shared])
+
+    @property
+    def places(self) -> Float[ndarray, "k 4 4"]:
+        """Of these."""
+        return np.stack([one.recon_from_camera for one in self.shared if one is not None])
+
+    @property
+    def distance(self) -> float:
+        """Of the scene."""
+        return float(np.median([distance(one) for one in self.shared if one is not None]))
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Given, or as the image with most points has it."""
+        intrinsics, _ = usable_lens(self.camera.intrinsics)
+        best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
+        return intrinsics or best.intrinsics
+
+    @property
+    def agrees_with_given(self) -> bool:
+        """Whether all places were found with intrinsics that were given, and none with a focal length of its own."""
+        intrinsics, _ = usable_lens(self.camera.intrinsics)
+        return all(one is None or one.intrinsics == intrinsics for one in self.shared)
+
+    def without(self, reasons: Mapping[int, str]) -> "CameraViews":
+        """With why some images are not used."""
+        return replace(self, reasons=tuple(reasons.get(k, before) for k, before in enumerate(self.reasons)))
+
+    def refused(
+        self,
+        kind: Kind,
+        mend: Mend = "none",
+        images: tuple[str, ...] = (),
+        value: float | None = None,
+        **details: float | str,
+    ) -> CameraFound:
+        """The camera is not placed, for this finding."""
+        why = Finding.of(kind, "rejects", mend, *images, value=value, **details)
+        return self.not_placed(why)
+
+    def not_placed(self, *why: Finding) -> CameraFound:
+        """The camera with why it is not placed."""
+        reasons = [reason or "the camera was not placed" for reason in self.reasons]
+        return CameraFound.not_placed(self.camera, why, self.counts, reasons)

@@ -1,0 +1,201 @@
+"""Which images of a cell move as one: those of the capture's own camera, of cameras on its gripper, and of other arms.
+
+A camera whose images contradict how it is mounted is refused here, before anything is adjusted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from jcr.adjust.robots import ArmPoses
+from jcr.calibration.options import CalibrateOptions
+from jcr.calibration.robot_errors import robot_errors
+from jcr.cell.camera_views import CameraViews
+from jcr.cell.found import CameraFound
+from jcr.cell.localise import Shared
+from jcr.geometry import inverse, motion_length, step_between
+from jcr.handeye.bent import bends
+from jcr.handeye.solve import solve_hand_eye
+from jcr.handeye.systematic import smooth_errors
+from jcr.records import BENT, Capture, CellCamera, Finding, HandEye, Kind
+
+SAME_PLACE = (0.02, np.radians(2.0))
+"""m, rad: images of one fixed camera, or places of a camera on its gripper, differ by no more."""
+SAME_PLACE_OF_UNKNOWN = (0.2, np.radians(6.0))
+"""Of the distance of the scene, rad: the same where a focal length estimated from one image is in it."""
+AT_A_FRAME = (0.01, np.radians(1.0))
+"""m, rad: nearer than this to where the wrist camera was, a fixed camera is likely to be that camera."""
+LEAST_POSES = 3
+"""Of another arm, or of another camera on the gripper: images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Member:
+    """A camera with the images that are used."""
+
+    seen: CameraViews
+    rig: Int[ndarray, " k"]
+    """Of each image; -1 where it is not used."""
+    rig_from_camera: Float[ndarray, "4 4"] | None
+    """Where it is not the rig's first camera."""
+    arm: int | None
+    """Place of its arm among the ties; None: fixed."""
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def camera(self) -> CellCamera:
+        return self.seen.camera
+
+    @property
+    def used(self) -> list[tuple[int, Shared]]:
+        """The images that are used, with their numbers."""
+        return [(k, one) for k, one in enumerate(self.seen.shared) if one is not None and self.rig[k] >= 0]
+
+
+class Rigs:
+    """What moves as one: the capture's own camera at each used image, then what other cameras add."""
+
+    def __init__(
+        self, capture: Capture, hand_eye: HandEye, own: Float[ndarray, "m 4 4"], rows: Int[ndarray, " m"]
+    ) -> None:
+        self._capture, self._hand_eye, self._rows = capture, hand_eye, rows
+        self.poses = list(own)
+        self.arms: list[str] = []
+        self._of_arms: list[tuple[Int[ndarray, " n"], Float[ndarray, "n 4 4"], HandEye]] = []
+
+    def add(self, seen: CameraViews) -> Member | CameraFound:
+        """The camera's images among the rigs; or why it cannot be placed."""
+        if not len(seen.rows):
+            most = int(np.argmax(seen.counts))
+            best, count = seen.camera.images[most], float(seen.counts[most])
+            return seen.refused(Kind.FEW_POINTS_SHARED, "images", (best,), count)
+        if seen.camera.arm is not None:
+            return self._on_other_arm(seen, seen.camera.arm)
+        return self._on_same_gripper(seen) if seen.camera.mount == "gripper" else self._fixed(seen)
+
+    def _fixed(self, seen: CameraViews) -> Member | CameraFound:
+        places = seen.places
+        names = [seen.camera.images[k] for k in seen.rows]
+        apart = step_between(places[:, None], places[None])
+        metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
+        most_m, most_rad = SAME_PLACE
+        if not seen.agrees_with_given:
+            most_m, most_rad = SAME_PLACE_OF_UNKNOWN[0] * seen.distance, SAME_PLACE_OF_UNKNOWN[1]
+        if metres.max() > most_m or radians.max() > most_rad:
+            a, b = np.unravel_index((metres / most_m + radians / most_rad).argmax(), metres.shape)
+            apart_m, apart_rad = float(metres[a, b]), float(radians[a, b])
+            return seen.refused(Kind.NOT_FIXED, "mount", (names[a], names[b]), apart_m, rotation=apart_rad)
+        middle = int(metres.sum(1).argmin())
+        rig = np.full(len(seen.shared), -1)
+        rig[seen.rows] = len(self.poses)
+        self.poses.append(places[middle])
+        return Member(
+            seen=seen, rig=rig, rig_from_camera=None, arm=None, findings=self._at_own_camera(places[middle])
+        )
+
+    def _at_own_camera(self, place: Float[ndarray, "4 4"]) -> tuple[Finding, ...]:
+        """That a camera stands where the capture's own camera was at an image."""
+        off = step_between(np.stack(self.poses[: len(self._rows)]), place)
+        near = np.flatnonzero(
+            (np.linalg.norm(off[:, :3], axis=1) < AT_A_FRAME[0])
+            & (np.linalg.norm(off[:, 3:], axis=1) < AT_A_FRAME[1])
+        )
+        if not len(near):
+            return ()
+        return (
+            Finding.of(
+                Kind.AT_ANOTHER_CAMERA,
+                "warns",
+                "mount",
+                self._capture.images[self._rows[near[0]]],
+                camera=self._capture.camera_name,
+            ),
+        )
+
+    def _on_same_gripper(self, seen: CameraViews) -> Member | CameraFound:
+        assert seen.camera.frame is not None
+        rig, unused = np.full(len(seen.shared), -1), dict[int, str]()
+        for k in seen.rows.tolist():
+            frame = int(seen.camera.frame[k])
+            at = np.flatnonzero(self._rows == frame)
+            if len(at):
+                rig[k] = at[0]
+            else:
+                unused[k] = f"{self._capture.images[frame]}, taken with it, is not used"
+        seen = seen.without(unused)
+        taken = np.flatnonzero(rig >= 0)
+        if not len(taken):
+            return seen.refused(Kind.NO_COMMON_POSE, "images")
+        wrist = np.stack(self.poses)[rig[taken]]
+        if not _differ(wrist):
+            names = tuple(seen.camera.images[k] for k in taken)
+            return seen.refused(Kind.ONE_GRIPPER_POSE, "images", names)
+        on_rig = inverse(wrist) @ seen.places[np.isin(seen.rows, taken)]
+        between = np.asarray(motion_length(inverse(on_rig)[:, None] @ on_rig[None]))
+        middle = int(np.median(between, axis=1).argmin())
+        off = step_between(on_rig[middle], on_rig)
+        astray = (np.linalg.norm(off[:, :3], axis=1) > SAME_PLACE[0]) | (
+            np.linalg.norm(off[:, 3:], axis=1) > SAME_PLACE[1]
+        )
+        if astray.mean() > 0.4:
+            most_m = float(np.linalg.norm(off[:, :3], axis=1).max())
+            return seen.refused(Kind.NOT_RIGID, "mount", value=most_m, camera=self._capture.camera_name)
+        rig[taken[astray]] = -1
+        why = "its place on the gripper is not that of its other images"
+        seen = seen.without(dict.fromkeys(taken[astray].tolist(), why))
+        return Member(seen=seen, rig=rig, rig_from_camera=on_rig[middle], arm=0)
+
+    def _on_other_arm(self, seen: CameraViews, arm: str) -> Member | CameraFound:
+        assert seen.camera.base_from_gripper is not None
+        if arm in self.arms:
+            return seen.refused(Kind.SECOND_ON_ARM, arm=arm)
+        if len(seen.rows) < LEAST_POSES:
+            return seen.refused(
+                Kind.FEW_LOCALISED, "images", value=float(len(seen.rows)), needed=float(LEAST_POSES)
+            )
+        places, gripper = seen.places, seen.camera.base_from_gripper[seen.rows]
+        std = max(float(np.sqrt(self._hand_eye.covariance[6, 6])), 1e-4)
+        found = solve_hand_eye(gripper, places, scale=1.0, scale_std=std)
+        if not found.converged:
+            return seen.not_placed(*found.findings)
+        rig = np.full(len(seen.shared), -1)
+        used = np.flatnonzero(found.inliers)
+        rig[seen.rows[used]] = len(self.poses) + np.arange(len(used))
+        why = {int(seen.rows[k]): str(found.images.reasons[k]) for k in np.flatnonzero(~found.inliers)}
+        self.poses += list(places[used])
+        self.arms.append(arm)
+        self._of_arms.append((rig[seen.rows[used]], gripper[used], found))
+        return Member(seen=seen.without(why), rig=rig, rig_from_camera=None, arm=len(self.arms))
+
+    def arm_poses(self, options: CalibrateOptions) -> list[ArmPoses]:
+        """The arms, the capture's own first."""
+        robot = robot_errors(self._capture, options).of(self._rows)
+        hand_eye = self._hand_eye
+        poses = self._capture.base_from_gripper[self._rows]
+        bent = [one.kind for one in hand_eye.findings if one.kind in BENT]
+        first = ArmPoses(
+            rigs=np.arange(len(self._rows)),
+            base_from_gripper=poses,
+            bent=bends(bent, poses) if bent else None,
+            systematic=robot.systematic,
+            start=(hand_eye.gripper_from_camera, hand_eye.base_from_recon),
+        )
+        others = [
+            ArmPoses(
+                rigs=rigs,
+                base_from_gripper=gripper,
+                systematic=smooth_errors(gripper),
+                start=(found.gripper_from_camera, found.base_from_recon),
+            )
+            for rigs, gripper, found in self._of_arms
+        ]
+        return [first, *others]
+
+
+def _differ(places: Float[ndarray, "k 4 4"]) -> bool:
+    """Whether two of them are farther apart than SAME_PLACE."""
+    apart = step_between(places[:, None], places[None])
+    metres, radians = (np.linalg.norm(apart[..., part], axis=-1) for part in (slice(0, 3), slice(3, 6)))
+    return bool((metres > SAME_PLACE[0]).any() or (radians > SAME_PLACE[1]).any())

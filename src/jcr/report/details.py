@@ -1,0 +1,96 @@
+"""The last section: times, intrinsics, options and versions, for who looks for a number."""
+
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from jcr.calibration.calibration_json import CalibrationFile
+from jcr.calibration.words import attempt_in_words, budget_in_words
+from jcr.extras import is_installed
+from jcr.records import COEFFICIENTS
+from jcr.report.render import Section
+from jcr.rounding import significant
+
+Options = Mapping[str, Mapping[str, Any]]
+"""A stage's name, and its options by name."""
+PACKAGES = ("numpy", "scipy", "torch", "pycolmap")
+
+
+def details_section(
+    calibration: CalibrationFile, options: Options, map_history: Mapping[str, str] | None = None
+) -> Section:
+    """Blocks of names and values."""
+    uncertainty = calibration.uncertainty
+    budget = None if uncertainty is None else uncertainty.budget
+    blocks: dict[str, Mapping[str, str]] = {
+        "Time": _times(calibration),
+        "Intrinsics": _intrinsics(calibration),
+        "Uncertainty, 1 σ per axis": {} if budget is None else budget_in_words(budget),
+        "Depth camera": _depth_camera(calibration),
+        "Robot": _robot(calibration),
+        "Map": map_history or {},
+    }
+    for stage, chosen in options.items():
+        blocks[f"Options: {stage}"] = {name: _value(value) for name, value in chosen.items()}
+    versions = {"jcr": calibration.version, "python": platform.python_version()}
+    blocks["Versions"] = versions | {name: metadata.version(name) for name in PACKAGES if is_installed(name)}
+    return Section("details", {"blocks": {title: rows for title, rows in blocks.items() if rows}})
+
+
+def _times(calibration: CalibrationFile) -> dict[str, str]:
+    timings = calibration.timings_s
+    rows = {stage: f"{seconds:.1f} s" for stage, seconds in timings.items()}
+    rows["together"] = f"{sum(timings.values()):.1f} s"
+    if calibration.gripper_from_camera is not None:  # else the failure lists them
+        for k, attempt in enumerate(calibration.attempts, start=1):
+            rows[f"attempt {k}"] = attempt_in_words(attempt, len(calibration.images))
+    return rows
+
+
+def _intrinsics(calibration: CalibrationFile) -> dict[str, str]:
+    if (found := calibration.intrinsics) is None:
+        return {}
+    return {
+        "size": f"{found.width} × {found.height} px",
+        "focal length": f"{found.fx:.2f}, {found.fy:.2f}{_plus_minus(found.std, 0)} px",
+        "principal point": f"{found.cx:.2f}, {found.cy:.2f}{_plus_minus(found.std, 2)} px",
+        " ".join(COEFFICIENTS[found.model]): ", ".join(f"{k:.5g}" for k in found.distortion),
+    }
+
+
+def _plus_minus(std: list[float] | None, first: int) -> str:
+    return "" if std is None else f" ± {significant(max(std[first : first + 2]))}"
+
+
+def _depth_camera(calibration: CalibrationFile) -> dict[str, str]:
+    if (check := calibration.depth_check) is None:
+        return {}
+    noise_mm = {z: significant(1e3 * float(check.std_m(np.array(z)))) for z in check.distances_m}
+    return {
+        "scale error, compared with the robot": f"{check.off_percent:+.2f} ± {check.std_percent:.2g} %",
+        **{f"noise at {z:.2f} m, 1 σ": f"{value} mm" for z, value in noise_mm.items()},
+        "looked at": f"{check.features} features of {check.images} images",
+    }
+
+
+def _robot(calibration: CalibrationFile) -> dict[str, str]:
+    """What the poses show of the robot itself."""
+    items = {}
+    if (errors := calibration.robot_errors) is not None and errors.p is not None:
+        items["errors shared by neighbouring poses"] = (
+            f"{errors.translation_mm:.2g} mm {errors.rotation_deg:.2g}° per axis (p = {errors.p:.2g})"
+        )
+        for k, joint in enumerate(errors.joints or [], start=1):
+            items[f"joint {k} off by"] = f"{joint.offset_deg:+.3f} ± {joint.std_deg:.3f}°"
+    if (angles := calibration.angle_ratio) is not None:
+        items["camera angles over gripper angles"] = f"{angles.ratio:.4f} ± {angles.std:.4f} (1 is right)"
+    return items
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return "unset"
+    return str(list(value) if isinstance(value, tuple) else value)

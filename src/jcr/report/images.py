@@ -1,0 +1,132 @@
+"""The section that goes through the images: what each shows, and how well its features fit."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jcr.camera import is_distorted, project, resized, undistortion, unproject, without_distortion
+from jcr.capture.images import read_image
+from jcr.records import Capture, ImageVerdict, Intrinsics
+from jcr.report.features import reprojections_px
+from jcr.report.raster import image_url
+from jcr.report.render import Section
+from jcr.results import RunResult
+from jcr.rounding import significant
+
+LARGEST, SMALLEST, PIXELS = 1024, 160, 6e6
+"""Pixels across of the images, and of all together at most, which is about a megabyte; they open large."""
+MARKS, MAGNIFIED = 120, 20
+"""Features drawn over each image, and how many times their reprojection errors are drawn longer."""
+GRID = 17
+"""Points to a side at which the pixels of an image's file are given; between them they are interpolated."""
+
+
+def shown_names(images: Sequence[ImageVerdict]) -> list[str]:
+    """File names without their folders, unless two of them would then be the same."""
+    short = [Path(image.image).name for image in images]
+    return short if len(set(short)) == len(short) else [image.image for image in images]
+
+
+def image_numbers(image: ImageVerdict) -> str:
+    """Residuals and median reprojection error of one image, as far as there are any."""
+    parts = [
+        (image.translation_residual_mm, " mm"),
+        (image.rotation_residual_deg, "°"),
+        (image.reprojection_px, " px"),
+    ]
+    return " · ".join(f"{significant(value)}{unit}" for value, unit in parts if value is not None)
+
+
+def images_section(result: RunResult) -> Section:
+    """Every image with its numbers, and why it was rejected if it was."""
+    images, marks = result.calibration.images, _reprojections(result)
+    urls = thumbnails(result.capture, result.intrinsics)
+    cards = [
+        {
+            "path": image.image,
+            "name": name,
+            "url": url,
+            "numbers": image_numbers(image),
+            "rejected": None if image.used else image.reason or "no reason given",
+            "marks": marks.get(k),
+        }
+        for k, (image, name, url) in enumerate(zip(images, shown_names(images), urls, strict=True))
+    ]
+    return _section(cards, result.capture, result.intrinsics)
+
+
+def images_alone_section(capture: Capture) -> Section:
+    """The images of a run that found nothing in them."""
+    cards = [
+        {"path": name, "name": name, "url": url, "numbers": "", "rejected": None, "marks": None}
+        for name, url in zip(capture.images, thumbnails(capture, capture.intrinsics), strict=True)
+    ]
+    return _section(cards, capture, None)
+
+
+def _section(cards: Sequence[dict[str, Any]], capture: Capture, intrinsics: Intrinsics | None) -> Section:
+    """`intrinsics` are those of a calibration; None where there is none."""
+    width, height = capture.image_size
+    content = {
+        "cards": cards,
+        "is_calibrated": intrinsics is not None,
+        "rejected": sum(card["rejected"] is not None for card in cards),
+        "magnified": MAGNIFIED,
+        "size": (width, height) if intrinsics is None else (intrinsics.width, intrinsics.height),
+        "pixels": pixels_of_file(intrinsics or capture.intrinsics, capture.image_size),
+    }
+    return Section("images", content)
+
+
+def pixels_of_file(intrinsics: Intrinsics | None, size: tuple[int, int]) -> dict[str, list[list[float]]]:
+    """x and y, in the image file, of a grid of points over an image as it is shown, which is undistorted."""
+    u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in size)
+    shown = np.stack(np.meshgrid(u, v), axis=-1)
+    if intrinsics is not None and is_distorted(intrinsics):
+        shown = project(intrinsics, unproject(without_distortion(intrinsics), shown))
+    x, y = np.moveaxis(shown.round(1), -1, 0).tolist()
+    return {"x": x, "y": y}
+
+
+def _reprojections(result: RunResult) -> dict[int, str]:
+    """Per image of the capture a drawing over it, as an SVG path: some features, and where their 3D points fall."""
+    tracks, intrinsics = result.reconstruction.tracks, result.intrinsics
+    if len(tracks.image) == 0:
+        return {}
+    errors, straight = reprojections_px(result.reconstruction), without_distortion(intrinsics)
+    drawings, draw = {}, np.random.default_rng(0)
+    for k, row in enumerate(result.image_index):
+        seen = np.flatnonzero(tracks.image == k)
+        if len(seen) == 0:
+            continue
+        seen = draw.permutation(seen)[:MARKS]
+        at = project(straight, unproject(intrinsics, tracks.x_px[seen])) + 0.5
+        drawings[int(row)] = "".join(
+            f"M{x:.0f} {y:.0f}l{dx:.0f} {dy:.0f}"
+            for (x, y), (dx, dy) in zip(at, MAGNIFIED * errors[seen], strict=True)
+        )
+    return drawings
+
+
+def thumbnails(capture: Capture, intrinsics: Intrinsics | None) -> list[str]:
+    """Every image as a JPEG of the size that its number allows; undistorted, as the 3D view shows it."""
+    shape = capture.image_size[1] / capture.image_size[0]
+    width = min(LARGEST, capture.image_size[0], int(np.sqrt(PIXELS / len(capture) / shape)))
+    width = max(width, SMALLEST)
+
+    size = width, round(width * shape)
+    undistort = None
+    if intrinsics is not None and is_distorted(intrinsics):
+        small = resized(intrinsics, *size)
+        undistort = undistortion(small, without_distortion(small))
+
+    def thumbnail(name: str) -> str:
+        pixels = cv2.resize(read_image(capture.folder / name), size, interpolation=cv2.INTER_AREA)
+        return image_url(pixels if undistort is None else undistort(pixels), "JPEG")
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(thumbnail, capture.images))
