@@ -190,7 +190,14 @@ def a_hand_eye(met: bool) -> HandEye:
     rng = np.random.default_rng(0)
     poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
     found = jcr.solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
-    required = Requirement(*REQUIRED, True, 500.0, 1.0 if met else 3.0, 0.1)
+    required = Requirement(
+        translation_mm=REQUIRED[0],
+        rotation_deg=REQUIRED[1],
+        asked=True,
+        distance_mm=500.0,
+        reached_mm=1.0 if met else 3.0,
+        reached_deg=0.1,
+    )
     return replace(found, plan=Plan(requirement=required))
 
 

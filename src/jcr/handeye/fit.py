@@ -111,12 +111,12 @@ def fit_poses(problem: PoseProblem, start: Unknowns, averaged: bool = True) -> P
         unknowns, covariance, budget = after(unknowns, found.step), found.covariance, found.budget
     metres, radians, systematic = np.sqrt(equations.variances(log_sizes)).tolist()
     noise = RobotNoise(
-        metres,
-        radians,
-        exceeds((metres, radians), problem.noise),
-        problem.noise,
-        systematic,
-        equations.systematic_left(log_sizes),
+        translation=metres,
+        rotation=radians,
+        estimated=exceeds((metres, radians), problem.noise),
+        given=problem.noise,
+        systematic=systematic,
+        systematic_left=equations.systematic_left(log_sizes),
     )
     leave_one_out, leave_one_out_covariance = _leave_one_out(problem, linear, solution, noise)
     return PoseFit(
