@@ -101,7 +101,7 @@ def _kind(headline: str, found: Coverage, wanted: tuple[float, float]) -> str:
 
 
 def _tiles(found: Coverage, wanted: tuple[float, float]) -> list[Tile]:
-    tiles: list[Tile] = [("images", str(found.pictures), "", False)]
+    tiles: list[Tile] = [("images", str(found.images), "", False)]
     if (now := found.now) is None:
         return tiles
     mm, deg = now.reached("seen")
