@@ -52,7 +52,7 @@ def run(out: Path | None = None) -> str:
     """Markdown: shares of table and objects covered; density.png in `out` shows the clouds from above."""
     with tempfile.TemporaryDirectory() as folder:
         made = simulate(
-            Path(folder) / "capture", SimulateOptions("light8", images=IMAGES, seed=SEED, **WEBCAM)
+            Path(folder) / "capture", SimulateOptions(scene="light8", images=IMAGES, seed=SEED, **WEBCAM)
         )
         capture = read_capture(made)
         sparse, swept = _clouds(

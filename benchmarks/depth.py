@@ -33,7 +33,7 @@ SEES = 0.003
 """m. An image sees a place that lies so little behind what it shows there."""
 SCENES = {
     "textured table": ("colmap", SimulateOptions()),
-    "plain table, webcam": ("colmap", SimulateOptions("light8", **WEBCAM)),
+    "plain table, webcam": ("colmap", SimulateOptions(scene="light8", **WEBCAM)),
     "everything plain": ("direct", SimulateOptions(seed=1, texture=False)),
 }
 

@@ -73,7 +73,8 @@ def run(long: bool = False) -> str:
             for seed in SEEDS:
                 place = Path(folder) / f"{table}{seed}"
                 simulate(
-                    place, SimulateOptions("measuring", images=IMAGES, seed=seed, texture=texture, **WEBCAM)
+                    place,
+                    SimulateOptions(scene="measuring", images=IMAGES, seed=seed, texture=texture, **WEBCAM),
                 )
                 shutil.copytree(place / "truth" / "labels", place / "labels")
                 capture, truth = read_capture(place), read_truth(place)

@@ -170,7 +170,7 @@ def _capture_cells(scene: SceneName, seed: int) -> dict[Row, Cell]:
     cells: dict[Row, Cell] = {}
     with tempfile.TemporaryDirectory() as folder:
         made = simulate(
-            Path(folder) / "capture", SimulateOptions(scene, images=max(COUNTS), seed=seed, **WEBCAM)
+            Path(folder) / "capture", SimulateOptions(scene=scene, images=max(COUNTS), seed=seed, **WEBCAM)
         )
         whole, truth = read_capture(made), read_truth(made)
         predictions = pairs_of_capture(made, errors=PUBLISHED, seed=seed)[0]

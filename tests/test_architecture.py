@@ -148,8 +148,6 @@ PUBLIC = "jcr"
 """The package itself names what the modules below it offer, and they ask it for the version: no circle of ideas."""
 KNOWN_CIRCLES = [
     {"jcr.records.assessed", "jcr.records.calibration", "jcr.records.words"},
-    {"jcr.calibration.calibration_json", "jcr.calibration.uncertainty_json", "jcr.calibration.words"},
-    {"jcr.live.camera", "jcr.live.realsense"},
 ]
 """Modules whose imports of one another are not yet undone; the list only shrinks."""
 

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr import attempts
 from jcr.calibration import stage as calibration_stage
-from jcr.calibration.checks import convention
+from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
 from jcr.errors import InputError, NotTrustedError
@@ -37,7 +37,7 @@ GARBAGE = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch):
     """The search for other readings of the poses takes seconds and is tested elsewhere, and there are no images."""
-    monkeypatch.setattr(convention, "better_reading", lambda *_: None)
+    monkeypatch.setattr(capture_checks, "better_reading", lambda *_: None)
     monkeypatch.setattr(attempts, "view_findings", lambda _: ())
 
 

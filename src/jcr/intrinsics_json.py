@@ -38,7 +38,8 @@ class IntrinsicsJson(Part):
     def record(self) -> Intrinsics:
         """Without what a file says beside it."""
         given: dict[str, Any] = {name: getattr(self, name) for name in IntrinsicsJson.model_fields}
-        return Intrinsics(**given | {"distortion": coefficients_of(self.distortion)})
+        given["distortion"] = coefficients_of(self.distortion)
+        return Intrinsics(**given)
 
 
 class IntrinsicsAndStd(IntrinsicsJson):

@@ -18,11 +18,10 @@ from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
 from jcr.errors import NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
-from jcr.match.verify import read_keypoints
+from jcr.match.sift import SiftFeatures
 from jcr.progress import silent
 from jcr.reconstruct.colmap import ColmapOptions, reconstruct
-from jcr.reconstruct.sfm import extract, log_level
-from jcr.records import Capture, Intrinsics, Reconstruction
+from jcr.records import Capture, Reconstruction
 
 pytestmark = pytest.mark.slow
 
@@ -190,7 +189,7 @@ def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_pa
     assert "0 of 4 images" in message and "0 features" in message and "textured objects" in message
 
 
-def test_features_of_reduced_images_are_at_the_truth_on_average(tmp_path: Path):
+def test_features_of_reduced_images_are_at_the_truth_on_average():
     rng = np.random.default_rng(0)
     height, width = 450, 600
     true = np.stack(np.meshgrid(np.arange(50, 560, 50.0), np.arange(50, 410, 50.0)), -1).reshape(-1, 2)
@@ -202,10 +201,7 @@ def test_features_of_reduced_images_are_at_the_truth_on_average(tmp_path: Path):
     ):
         image += sign * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
     pixels = np.repeat(np.rint(image).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    camera = Intrinsics(500.0, 500.0, 299.5, 224.5, width, height)
-    with log_level(False):
-        extract(tmp_path / "database.db", [pixels], [camera], True, 400, silent)
-        (found,) = read_keypoints(tmp_path / "database.db", 1)
+    (found,) = SiftFeatures([pixels], (400, 300), 1, silent).x_px
     x_px = (found + 0.5) * 1.5 - 0.5
     nearest = true[np.linalg.norm(x_px[:, None] - true, axis=2).argmin(1)]
     missed = (x_px - nearest)[np.linalg.norm(x_px - nearest, axis=1) < 2]

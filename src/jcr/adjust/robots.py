@@ -257,10 +257,10 @@ def equations_of(placed: Placed, given: Given) -> tuple[Equations, Region]:
     equations = Equations(
         residual=poses.residual - pose_by_pose(poses.by_rig, rigs.step[:, None])[:, 0],
         jacobian=np.concatenate([poses.jacobian, by_free], axis=1),
-        prior_information=block_diag(weak_prior(len(given.arms)), (of_free + of_free.T) / 2),
+        prior_information=np.asarray(block_diag(weak_prior(len(given.arms)), (of_free + of_free.T) / 2)),
         prior_gradient=np.r_[np.zeros(robots), images.gradient[free] - coupling.T @ rigs.step],
         known=(known + known.T) / 2,
-        systematic=region.left(block_diag(*(arm.systematic for arm in given.arms))),
+        systematic=region.left(np.asarray(block_diag(*(arm.systematic for arm in given.arms)))),
         given=given.noise,
         bent=_bent(given.arms, region),
     )

@@ -80,6 +80,8 @@ def not_exact_enough(required: Requirement, systematic: bool) -> Finding | None:
         "rejects" if required.asked else "warns",
         mend,
         value=1e-3 * required.reached_mm,
+        std=None,
+        p=None,
         **numbers,
     )
 

@@ -84,7 +84,7 @@ class CameraViews:
         **details: float | str,
     ) -> CameraFound:
         """The camera is not placed, for this finding."""
-        why = Finding.of(kind, "rejects", mend, *images, value=value, **details)
+        why = Finding.of(kind, "rejects", mend, *images, value=value, std=None, p=None, **details)
         return self.not_placed(why)
 
     def not_placed(self, *why: Finding) -> CameraFound:

@@ -20,9 +20,10 @@ from numpy import ndarray
 
 from jcr.camera import project, unproject
 from jcr.geometry import apply, inverse, step_between, transform
+from jcr.match.sift import matches
 from jcr.match.verify import HALF_PIXEL
 from jcr.match.weights import LIGHTERGLUE, XFEAT
-from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, matches, triangulated
+from jcr.reconstruct.relocate import GATE_PX, MIN_POINTS, Features, features, triangulated
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
 

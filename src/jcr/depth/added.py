@@ -72,6 +72,7 @@ def extend(
         changing=True,
         memory_gb=memory_gb,
     )
+    assert found.reason is not None and found.depth_std is not None
     points, confidence = found.points_in_recon[-new:], found.confidence[-new:]
     for name, of_image in zip(added.images, confidence, strict=True):
         if (of_image > 0).mean() < LEAST_SHARE:

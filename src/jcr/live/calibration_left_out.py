@@ -107,7 +107,7 @@ def _seen_from(case: Case, found: Adjusted, seen: Tracks) -> Float[ndarray, "4 4
     )
     if not is_found or inliers is None or len(inliers) < LEAST_POINTS:
         return None
-    some = inliers[:, 0]
+    some = np.asarray(inliers[:, 0], dtype=int)
     turn, shift = cv2.solvePnPRefineLM(at[some], rays[some], pinhole, None, turn, shift)
     return inverse(transform(rotation_exp(turn[:, 0]), shift[:, 0]))
 

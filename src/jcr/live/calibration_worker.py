@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
     from jcr.results import RunResult
 
-    Heard = Callable[[Progress | RunResult | Failed | Exception], None]
+    Heard = Callable[["Progress | RunResult | Failed | Exception"], None]
 
 LONGEST_S = 60.0
 """That the end of a capture waits for the calibration of its last images."""

@@ -4,7 +4,9 @@ The networks are not made for images that are rotated against each other.
 """
 
 import math
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
@@ -17,8 +19,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from jcr.match import aliked, weights, xfeat
-from jcr.match.gate import by_quarters
+from jcr.match.gate import Key, by_quarters
 from jcr.match.lightglue import LightGlue
+from jcr.progress import Progress, silent, steps
 
 LONG_SIDE_PX = 1024
 """Larger images are reduced to this."""
@@ -48,8 +51,16 @@ class LearnedFeatures:
     has keypoints of its own, and `x_px` grows as angles are asked for.
     """
 
-    def __init__(self, kind: Literal["xfeat", "aliked"], images: Sequence[UInt8[ndarray, "h w 3"]]) -> None:
-        self._kind, self._images = kind, list(images)
+    minds_roll = True
+    every_pair = 12
+
+    def __init__(
+        self,
+        kind: Literal["xfeat", "aliked"],
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        report: Progress = silent,
+    ) -> None:
+        self._kind, self._images, self._report = kind, list(images), report
         self._network, self._matcher = _networks(kind)
         self._sets: dict[tuple[int, int], _Set] = {}
         self.x_px: list[Float[ndarray, "_ 2"]] = [np.zeros((0, 2)) for _ in images]
@@ -63,17 +74,29 @@ class LearnedFeatures:
 
     def match(self, i: int, j: int, roll_i: float, roll_j: float) -> Int[ndarray, "m 2"]:
         """Rows of the keypoints of images i and j that match, the images rotated by these angles (rad) before."""
-        first, second = self._found(i, roll_i), self._found(j, roll_j)
-        with _one_thread():
-            early = self._kind == "aliked"  # XFeat's matcher was trained without
-            rows, _ = self._matcher(
-                first.x_px, second.x_px, first.descriptor, second.descriptor, first.size, second.size, early
-            )
+        return self.matches([(i, j)], np.array([[roll_i, roll_j]]))[0]
+
+    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
+        """The same of many pairs, on all cores."""
+        with _one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = [
+                (self._found(i, float(roll_i)), self._found(j, float(roll_j)))
+                for (i, j), (roll_i, roll_j) in zip(pairs, rolls, strict=True)
+            ]
+            rows = pool.map(lambda both: self._matched(*both), found)
+            return [of for _, of in zip(steps(self._report, "matching", pairs), rows, strict=True)]
+
+    def _matched(self, first: _Set, second: _Set) -> Int[ndarray, "m 2"]:
+        early = self._kind == "aliked"  # XFeat's matcher was trained without
+        rows, _ = self._matcher(
+            first.x_px, second.x_px, first.descriptor, second.descriptor, first.size, second.size, early
+        )
         return rows.numpy() + [first.start, second.start]
 
     def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
         """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
-        found = self._found(row, roll)
+        with _one_thread():
+            found = self._found(row, roll)
         return found.start, found.descriptor.numpy()
 
     def _found(self, row: int, roll: float) -> _Set:
@@ -82,11 +105,10 @@ class LearnedFeatures:
         if key not in self._sets:
             pixels, given_from_turned = _prepared(self._images[row], roll)
             count = KEYPOINTS[self._kind]
-            with _one_thread():
-                if isinstance(self._network, xfeat.XFeat):
-                    x_px, descriptor = xfeat.detect(self._network, pixels, count)
-                else:
-                    x_px, descriptor = aliked.detect(self._network, pixels, count)
+            if isinstance(self._network, xfeat.XFeat):
+                x_px, descriptor = xfeat.detect(self._network, pixels, count)
+            else:
+                x_px, descriptor = aliked.detect(self._network, pixels, count)
             given = _mapped(x_px.double().numpy(), given_from_turned)
             height, width = self._images[row].shape[:2]
             inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in what fills the corners

@@ -13,9 +13,9 @@ from jcr.match.gate import Gate, Key
 from jcr.match.verify import View
 from jcr.records import Intrinsics
 
-NEIGHBOURS = 8
-"""Of an image, by the way between grippers, before X is known."""
-PARTNERS = 10
+FIRST_NEIGHBOURS, NEIGHBOURS = 4, 8
+"""Of an image, by the way between grippers: from which X is sought, and where these do not show it."""
+PARTNERS = 8
 """Of an image, by what both see, once X is known."""
 WIDEST = math.radians(60)
 """Between two viewing directions: nothing matches beyond."""
@@ -28,14 +28,12 @@ def all_pairs(n: int) -> list[Key]:
     return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
-def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int = NEIGHBOURS) -> list[Key]:
+def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
     """The nearest neighbours of every image by the gripper's way; in proportion to n."""
     return _best(-np.asarray(motion_length(motion)), neighbours)
 
 
-def seen_in_common(
-    view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], upright: Float[ndarray, " n"]
-) -> list[Key]:
+def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """The partners of every image with which it shares most of the scene, by X and the points seen so far."""
     x = translation_of_x(found, motion)
     if x is None:

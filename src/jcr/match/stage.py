@@ -6,9 +6,8 @@ are guessed.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
@@ -21,15 +20,14 @@ from jcr.match import gate as robot
 from jcr.match.epipolar import translation_of_x
 from jcr.match.focal import focal_by_robot
 from jcr.match.gate import Gate, Key, Pair
+from jcr.match.matchers import Matcher
 from jcr.match.moved import in_words as moved_in_words
 from jcr.match.moved import moved_things, second_motions
-from jcr.match.pairs import all_pairs, near_pairs, seen_in_common
+from jcr.match.pairs import FIRST_NEIGHBOURS, NEIGHBOURS, all_pairs, near_pairs, seen_in_common
 from jcr.match.still import hidden, still_cells
 from jcr.match.still import in_words as still_in_words
-from jcr.match.verify import View, pair_of
+from jcr.match.verify import Geometries, View, pair_of
 from jcr.records import Intrinsics
-
-Geometries = dict[Key, pycolmap.TwoViewGeometry]
 
 WORTH_SAYING = 0.1
 """Share of the matched pairs: a few wrong ones are left out of every set."""
@@ -40,43 +38,6 @@ STILL = (5e-3, math.radians(1))
 GUESSED_AT_ONCE = 6
 """Pairs whose rotations by 90° are guessed before the robot is asked again."""
 GUESSED_AT_MOST = 30
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """Features of a capture's images, of any kind."""
-
-    @property
-    def x_px(self) -> Sequence[Float[ndarray, "_ 2"]]:
-        """Keypoints at the working size; pixel centres are whole numbers."""
-        ...
-
-    @property
-    def minds_roll(self) -> bool:
-        """Whether images must be rotated upright for it."""
-        ...
-
-    @property
-    def raw(self) -> Mapping[Key, Int[ndarray, "_ 2"]]:
-        """All matches of the pairs that were tried last, right or wrong."""
-        ...
-
-    def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
-        """The geometry of some of a pair's matches; None where too few agree on one."""
-        ...
-
-    @property
-    def every_pair(self) -> int:
-        """Captures of up to this many images have all pairs matched; of more, pairs grow in proportion to the images."""
-        ...
-
-    def descriptors(self, row: int, roll: float) -> tuple[int, Float[ndarray, "k d"]]:
-        """Row of the first keypoint of an image rotated by an angle (rad), and the unit descriptors from there on."""
-        ...
-
-    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        """Verified two-view geometries of pairs, their images rotated (rad) before."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -137,9 +98,8 @@ class _Search:
         if not todo:
             return
         found = self.matcher.geometries(todo, np.array(turns))
-        self.view = View.of(
-            self.matcher.x_px, self.view.lens
-        )  # an image that is turned brings keypoints of its own
+        if self.matcher.minds_roll:  # an image that is rotated brings keypoints of its own
+            self.view = View.of(self.matcher.x_px, self.view.lens)
         for key, geometry in found.items():
             clean = self._seen(key, geometry)
             if clean is None:
@@ -243,9 +203,9 @@ def match_with_robot(
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
     search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
-    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion)
-    first = [key for key in everything if not matcher.minds_roll or angle[key] < AS_TAKEN]
-    search.match(first)
+    everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
+    first = near_pairs(motion, FIRST_NEIGHBOURS)
+    search.match([key for key in first if not matcher.minds_roll or angle[key] < AS_TAKEN])
     search.hide_still_parts()
     report(0.3)
     found = _with_lens(search, lens)
@@ -259,13 +219,12 @@ def match_with_robot(
         notes = _beside(search, found, names, original)
         return Matched(search.geometries, None, search.view.lens, None, search.still, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
-    if matcher.minds_roll:
-        search.match(everything, upright)
+    search.match(seen_in_common(search.view, found, motion) or everything, upright)
     found = search.gate(found)
     report(0.8)
-    if n > matcher.every_pair:
-        search.match(seen_in_common(search.view, found, motion, upright), upright)
-        found = search.gate(found)
+    lonely = _without_partners(found, n)
+    search.match([key for key in everything if lonely & set(key)], upright)
+    found = search.gate(found)
     found = search.second_motions_confirmed(found)
     stale = _contradicted_by_all(found, motion)
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
@@ -278,6 +237,12 @@ def match_with_robot(
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
     return Matched(kept, found, search.view.lens, upright, search.still, notes, warnings)
+
+
+def _without_partners(found: Gate, count: int) -> set[int]:
+    """Images that fewer than two confirmed pairs tie to others."""
+    rows = [row for pair in found.confirmed for row in pair.key]
+    return set(np.flatnonzero(np.bincount(rows, minlength=count) < 2).tolist())
 
 
 def _with_lens(search: _Search, guess: Intrinsics) -> Gate:

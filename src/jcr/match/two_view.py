@@ -15,6 +15,8 @@ from numpy import ndarray
 from jcr.geometry import rotation_exp, skew
 
 STEPS = 8
+SETTLED = 1e-5
+"""rad; of a step, a hundredth of the standard deviation of the surest reading."""
 LEAST_SIGMA_PX = 0.3
 """Of a match; no detector is better over a whole image."""
 LARGEST_SIGMA_PX = 3.0
@@ -161,7 +163,7 @@ def _refined(
             damping *= 10
             continue
         (rotation, direction), residual, damping = moved, tried, damping / 10
-        if np.abs(step).max() < 1e-6:
+        if np.abs(step).max() < SETTLED:
             break
     # Matches of one detector share errors with their neighbours: no more than a hundred count as independent.
     independent = min(len(ray_i), 100) / len(ray_i)

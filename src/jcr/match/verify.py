@@ -15,16 +15,22 @@ from jcr.match.gate import Key, Pair
 from jcr.match.two_view import readings
 from jcr.records import Intrinsics
 
+Geometries = dict[Key, pycolmap.TwoViewGeometry]
+
 MIN_INLIERS = 25
 """With COLMAP's 15, a view of a board was registered by the wrong squares, 30 cm from its place."""
 STATIONARY_PX = 4.0
 """Matches that keep their pixel while the gripper moves: fingers, or text drawn into the images."""
 
 
-def verification(seed: int, known: bool = False) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's options for every pair; `known`: the intrinsics are no guess."""
+def _verification(seed: int, known: bool, matches: int) -> pycolmap.TwoViewGeometryOptions:
+    """COLMAP's options for a pair of so many matches; `known`: the intrinsics are no guess."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
+    # With COLMAP's own (0.25, 3, 0.999, 10000) it takes four times as long and finds 1 % more inliers.
+    options.ransac.min_inlier_ratio = max(0.25, MIN_INLIERS / matches)
+    options.ransac.dyn_num_trials_multiplier = 1.0
+    options.ransac.confidence, options.ransac.max_num_trials = 0.99, 2000
     options.min_num_inliers = MIN_INLIERS
     # The gripper's fingers, or text drawn into the pictures, keep their pixels while the scene moves.
     options.filter_stationary_matches = True
@@ -83,7 +89,7 @@ def matched(
         camera,
         x_px[j] + HALF_PIXEL,
         rows.astype(np.uint32),
-        verification(seed, known),
+        _verification(seed, known, len(rows)),
     )
     return found if len(found.inlier_matches) >= MIN_INLIERS else None
 
@@ -116,23 +122,14 @@ def _between_centres(fundamental: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"
     return move.T @ fundamental @ move
 
 
-def read_keypoints(database: Path, count: int) -> list[Float[ndarray, "_ 2"]]:
-    """Of every image in a database; pixel centres are whole numbers."""
-    with closing(pycolmap.Database.open(database)) as db:
-        return [
-            np.asarray(db.read_keypoints(row + 1)[:, :2], dtype=float) - HALF_PIXEL for row in range(count)
-        ]
-
-
 def write_keypoints(database: Path, x_px: Sequence[Float[ndarray, "_ 2"]]) -> None:
-    """Into a database that has the images already; of those that it had, the first stay what they were."""
+    """Into a database that has the images already."""
     with closing(pycolmap.Database.open(database)) as db:
         for row, x in enumerate(x_px):
-            write = db.update_keypoints if db.exists_keypoints(row + 1) else db.write_keypoints
-            write(row + 1, (x + HALF_PIXEL).astype(np.float32))
+            db.write_keypoints(row + 1, (x + HALF_PIXEL).astype(np.float32))
 
 
-def read_geometries(database: Path) -> dict[Key, pycolmap.TwoViewGeometry]:
+def read_geometries(database: Path) -> Geometries:
     """Of all pairs of images in a database that were verified, by rows."""
     with closing(pycolmap.Database.open(database)) as db:
         ids, geometries = db.read_two_view_geometries()
@@ -144,7 +141,7 @@ def read_geometries(database: Path) -> dict[Key, pycolmap.TwoViewGeometry]:
     return found
 
 
-def write_geometries(database: Path, geometries: dict[Key, pycolmap.TwoViewGeometry]) -> None:
+def write_geometries(database: Path, geometries: Geometries) -> None:
     """These and no others."""
     with closing(pycolmap.Database.open(database)) as db:
         db.clear_two_view_geometries()

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from PIL import ExifTags, Image
 
@@ -13,9 +12,6 @@ from jcr.match.matchers import FeatureName
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Intrinsics, Reconstruction
-
-if TYPE_CHECKING:
-    from jcr.reconstruct.sfm import Kept
 
 _FILM_DIAGONAL_MM = 43.27
 """Of the 36 x 24 mm frame that EXIF's equivalent focal length refers to."""
@@ -50,7 +46,9 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
-    from jcr.reconstruct.sfm import BYTES_OF_FEATURES, structure_from_motion
+    from jcr.match.kept import KeptFeatures
+    from jcr.match.sift import BYTES_OF_FEATURES
+    from jcr.reconstruct.sfm import structure_from_motion
 
     options = options or ColmapOptions()
     report = progress or silent
@@ -64,15 +62,11 @@ def reconstruct(
             images,
             lenses,
             is_known,
-            options.working_size_px,
-            options.seed,
-            options.verbose,
+            options,
             report,
-            options.memory_gb,
-            options.features,
             capture.base_from_gripper if options.robot_checks else None,
             capture.images,
-            _kept(capture, options),
+            KeptFeatures.of(capture) if options.features == "sift" else None,
         )
     except NotTrustedError as error:
         raise error.with_more(*warnings) from None
@@ -80,18 +74,6 @@ def reconstruct(
     if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
         notes += (f"{len(registered)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings))
-
-
-def _kept(capture: Capture, options: ColmapOptions) -> "Kept | None":
-    """The features of a capture that was calibrated while it was taken; None where there are none."""
-    from jcr.reconstruct.kept_features import SEED, KeptFeatures, file_digest
-
-    if options.features != "sift" or options.seed != SEED:
-        return None
-    kept = KeptFeatures.of(capture.folder)
-    if not kept.row_of:
-        return None
-    return kept, kept.rows(file_digest(capture.folder / name) for name in capture.images)
 
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:

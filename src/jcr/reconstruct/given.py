@@ -18,10 +18,13 @@ from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
+from jcr.match.matchers import Matcher
+from jcr.match.pairs import all_pairs
+from jcr.match.verify import write_geometries, write_keypoints
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.sfm import extract, log_level, match, tracks_of
+from jcr.reconstruct.sfm import enter, log_level, sift_features, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 MIN_POINTS = 50
@@ -100,11 +103,13 @@ def _triangulated(
     """Points of matched features, with intrinsics and cameras fixed."""
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = extract(
-            database, images, [intrinsics], True, options.working_size_px, report, options.memory_gb
-        )
+        cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
+        found = sift_features(images, cameras[0], options.memory_gb, report)
+        matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
         report("matching", 0.0)
-        match(database, options.seed)
+        pairs = all_pairs(len(images))
+        write_keypoints(database, matcher.x_px)
+        write_geometries(database, matcher.geometries(pairs, np.zeros((len(pairs), 2))))
         model = pycolmap.Reconstruction()
         model.add_camera_with_trivial_rig(cameras[0])
         with closing(pycolmap.Database.open(database)) as db:

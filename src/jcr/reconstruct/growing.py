@@ -22,30 +22,28 @@ from jcr.capture.images import read_image
 from jcr.handeye.closed_form import motions
 from jcr.match import gate as robot
 from jcr.match.gate import Gate, Key, Pair
-from jcr.match.matchers import SiftMatcher
-from jcr.match.pairs import near_pairs, seen_in_common
-from jcr.match.stage import Geometries
+from jcr.match.kept import KeepingMatcher, KeptFeatures, file_digest
+from jcr.match.pairs import NEIGHBOURS, near_pairs, seen_in_common
 from jcr.match.still import hidden
-from jcr.match.verify import View, pair_of
+from jcr.match.verify import Geometries, View, pair_of, write_geometries, write_keypoints
 from jcr.progress import silent
 from jcr.reconstruct.colmap import ColmapOptions, starting_intrinsics
-from jcr.reconstruct.kept_features import SEED, KeptFeatures, file_digest
 from jcr.reconstruct.placed import poses_of
 from jcr.reconstruct.sfm import (
     adjust_robustly,
-    enter_pixels,
-    extract,
-    extract_images,
+    enter,
     lens_of,
     log_level,
     map_incrementally,
     matched_pairs,
     pipeline_options,
+    sift_features,
     tracks_of,
-    working_image,
 )
-from jcr.records import Capture, Intrinsics, Reconstruction
+from jcr.records import Capture, Reconstruction
 
+OPTIONS = ColmapOptions()
+"""As of a calibration that is given none: it finds the features and pairs of the same working size and seed."""
 FEW = 5
 """Images up to which all are mapped again with each: the first pair may have been an unlucky one."""
 AGAIN = 1.3
@@ -58,56 +56,41 @@ LEAST_AGAINST = 3
 """Pairs of an image that contradict its gripper rotation, and none that confirms it: the pose may be wrong."""
 
 
-class _KeepingMatcher(SiftMatcher):
-    """SIFT whose matches and geometries are also kept in the folder of the capture."""
-
-    def __init__(self, database: Path, kept: KeptFeatures, rows: Sequence[int | None]) -> None:
-        super().__init__(database, len(rows), SEED)
-        self._work, self._kept, self._rows = database, kept, rows
-
-    def geometries(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> Geometries:
-        found = super().geometries(pairs, rolls)
-        self._kept.keep_pairs(self._work, self._rows, pairs)
-        return found
-
-
 class Growing:
     """Cameras and tracks of the images of a capture that is being taken; features are kept in the capture's folder."""
 
     def __init__(self, capture: Capture) -> None:
-        """Map all images that the capture has, from features and matches that its folder keeps where there are some."""
+        """Map all images that the capture has, from features and pairs that its folder keeps where there are some."""
         self._temporary = tempfile.TemporaryDirectory(prefix="jcr-growing-")
         self._database = Path(self._temporary.name) / "database.db"
         self._capture = capture
         self._rows = list(range(len(capture)))
-        lenses, self._known, _ = starting_intrinsics(capture)
-        self._lens, self._kept = lenses[0], KeptFeatures.of(capture.folder)
+        self._lenses, self._known, _ = starting_intrinsics(capture)
+        self._kept = KeptFeatures.growing(capture.folder)
         with log_level(False):
-            self._map_all(lenses)
+            self._map_all()
 
-    def _map_all(self, lenses: list[Intrinsics]) -> None:
-        capture = self._capture
+    def _map_all(self) -> None:
+        capture, known = self._capture, self._known
         images = [read_image(capture.folder / name) for name in capture.images]
-        digests = [file_digest(capture.folder / name) for name in capture.images]
-        size_px, kept = ColmapOptions().working_size_px, (self._kept, self._kept.rows(digests))
-        cameras = extract(self._database, images, lenses, self._known, size_px, silent, kept=kept)
-        self._camera = cameras[0]
-        self._keep_images(enumerate(digests))
-        self._kept_rows = self._kept.rows(digests)
-        matcher = self._matcher()
+        self._kept.digests.extend(file_digest(capture.folder / name) for name in capture.images)
+        cameras = enter(self._database, len(capture), self._lenses, known, OPTIONS.working_size_px)
+        self._features = sift_features(images, cameras[0], OPTIONS.memory_gb, silent, self._kept)
+        self._matcher = KeepingMatcher(self._features, cameras[0], known, OPTIONS.seed, self._kept)
         poses = capture.base_from_gripper
         matched = matched_pairs(
-            self._database, matcher, poses, self._lens, cameras, self._known, capture.images, silent
+            self._database, self._matcher, poses, self._lenses[0], cameras, known, capture.images, silent
         )
         self._gate, self._still = matched.gate or Gate((), (), (), None), matched.still
-        self._view = View.of(matcher.x_px, matched.lens)
+        self._view = View.of(self._matcher.x_px, matched.lens)
+        self._geometries: Geometries = dict(matched.geometries)
         self._matched_with = {row: 0 for row in self._rows}
-        for key in matched.geometries:
+        for key in self._geometries:
             self._count_match(key)
-        self._model = map_incrementally(self._database, len(capture), cameras, self._known, SEED, silent)
+        self._model = map_incrementally(self._database, len(capture), cameras, known, OPTIONS.seed, silent)
         self._mapped_of = self._adjusted_of = len(capture)
         if self._model is not None:
-            adjust_robustly(self._model, hold_lens=self._known)
+            adjust_robustly(self._model, hold_lens=known)
 
     @property
     def is_to_be_mapped_again(self) -> bool:
@@ -136,18 +119,14 @@ class Growing:
         row = len(self._view.x_px)
         self._rows.append(row)
         self._matched_with[row] = 0
+        self._kept.digests.append(file_digest(capture.folder / capture.images[-1]))
+        self._features.add(image)
+        self._matcher.images_added()
+        x_px = self._matcher.x_px[row]
+        rays = unproject(self._view.lens, x_px)[:, :2]
+        self._view = View([*self._view.x_px, x_px], self._view.lens, [*self._view.rays, rays])
         with log_level(False):
-            size = self._camera.width, self._camera.height
-            name = enter_pixels(self._database, row, working_image(image, size))
-            extract_images(self._database, [name], self._camera, silent)
-            digest = file_digest(capture.folder / capture.images[-1])
-            self._keep_images([(row, digest)])
-            self._kept_rows.append(self._kept.row_of[digest])
-            matcher = self._matcher()
-            x_px = matcher.x_px[row]
-            rays = unproject(self._view.lens, x_px)[:, :2]
-            self._view = View([*self._view.x_px, x_px], self._view.lens, [*self._view.rays, rays])
-            self._match(matcher, row)
+            self._match(row)
             if self._model is not None:
                 self._register([row, *self._left_out(row)])
 
@@ -155,10 +134,7 @@ class Growing:
         """Take an image out of the map; the capture is that without it from the next `add` on."""
         row = self._rows.pop(place)
         self._gate = replace(self._gate, confirmed=tuple(p for p in self._gate.confirmed if row not in p.key))
-        with closing(pycolmap.Database.open(self._database)) as db:
-            for other in self._rows:
-                if db.exists_two_view_geometry(row + 1, other + 1):
-                    db.delete_two_view_geometry(row + 1, other + 1)
+        self._geometries = {key: found for key, found in self._geometries.items() if row not in key}
         if self._model is not None and row + 1 in self._model.reg_image_ids():
             self._model.deregister_frame(self._model.image(row + 1).frame_id)
 
@@ -168,7 +144,7 @@ class Growing:
         if self._model is None or len(places) < 2:
             return None
         rows = [self._rows[place] for place in places]
-        lens = self._lens if self._known else lens_of(self._model.camera(1), self._lens)
+        lens = self._lenses[0] if self._known else lens_of(self._model.camera(1), self._lenses[0])
         return Reconstruction(
             image_index=np.array(places),
             recon_from_camera=poses_of(self._model, rows),
@@ -181,14 +157,6 @@ class Growing:
         """Remove the working files."""
         self._temporary.cleanup()
 
-    def _keep_images(self, digests: "Sequence[tuple[int, str]] | enumerate[str]") -> None:
-        for row, digest in digests:
-            if digest not in self._kept.row_of:
-                self._kept = self._kept.with_image(self._database, row, digest)
-
-    def _matcher(self) -> SiftMatcher:
-        return _KeepingMatcher(self._database, self._kept, self._kept_rows)
-
     def _motion(self) -> Float[ndarray, "r r 4 4"]:
         """Between the grippers of all rows; of images that were removed, the identity's."""
         poses = np.tile(np.eye(4), (len(self._view.x_px), 1, 1))
@@ -197,49 +165,42 @@ class Growing:
 
     def _partners(self, row: int, motion: Float[ndarray, "r r 4 4"]) -> list[Key]:
         """Pairs of a new image: with all of few images, of many with those near it and those that see the same."""
-        if len(self._rows) <= SiftMatcher.every_pair:
+        if len(self._rows) <= self._matcher.every_pair:
             return [(other, row) for other in self._rows if other != row]
         rows = np.array(self._rows)
-        near = near_pairs(motion[np.ix_(rows, rows)])
+        near = near_pairs(motion[np.ix_(rows, rows)], NEIGHBOURS)
         pairs = {(int(rows[i]), int(rows[j])) for i, j in near}
         if self._gate.of_x is not None:
-            upright = np.zeros(len(motion))
-            pairs |= set(seen_in_common(self._view, self._gate, motion, upright))
+            pairs |= set(seen_in_common(self._view, self._gate, motion))
         return sorted(key for key in pairs if row in key and set(key) <= set(self._rows))
 
-    def _match(self, matcher: SiftMatcher, row: int) -> None:
-        """Geometries of a new image's pairs, those that the robot contradicts taken out of the database."""
+    def _match(self, row: int) -> None:
+        """Geometries of a new image's pairs, without those that the robot contradicts."""
         motion = self._motion()
         todo = self._partners(row, motion)
-        found = matcher.geometries(todo, np.zeros((len(todo), 2)))
-        found = {key: self._moving(matcher, key, geometry) for key, geometry in found.items()}
+        found = self._matcher.geometries(todo, np.zeros((len(todo), 2)))
+        found = {key: self._moving(key, geometry) for key, geometry in found.items()}
         sound = {key: geometry for key, geometry in found.items() if geometry is not None}
         pairs = [pair_of(self._view, *key, geometry) for key, geometry in sound.items()]
         systematic = robot.SYSTEMATIC if self._known else robot.SYSTEMATIC_OF_GUESS
         judged = robot.judge(pairs, motion, systematic, self._gate.of_x)
         self._gate = replace(self._gate, confirmed=(*self._gate.confirmed, *judged.confirmed))
         believed = {pair.key for pair in self._believed(judged)}
-        with closing(pycolmap.Database.open(self._database)) as db:
-            for i, j in todo:
-                if db.exists_two_view_geometry(i + 1, j + 1):
-                    db.delete_two_view_geometry(i + 1, j + 1)
-            for i, j in sorted(believed):
-                db.write_two_view_geometry(i + 1, j + 1, sound[i, j])
-                self._count_match((i, j))
+        for key in sorted(believed):
+            self._geometries[key] = sound[key]
+            self._count_match(key)
 
     def _believed(self, judged: Gate) -> tuple[Pair, ...]:
         if not judged.confirmed and len(judged.contradicted) >= LEAST_AGAINST:
-            return (
-                judged.contradicted
-            )  # its gripper pose is in doubt, not its matches; the calibration will tell
+            # Its gripper pose is in doubt, not its matches: the calibration decides.
+            return judged.contradicted
         return judged.confirmed if self._known else (*judged.confirmed, *judged.undecided)
 
-    def _moving(
-        self, matcher: SiftMatcher, key: Key, geometry: pycolmap.TwoViewGeometry
-    ) -> pycolmap.TwoViewGeometry | None:
+    def _moving(self, key: Key, geometry: pycolmap.TwoViewGeometry) -> pycolmap.TwoViewGeometry | None:
         """The geometry, verified again where some of its matches lie in parts that do not move with the scene."""
         if self._still is None:
             return geometry
+        matcher = self._matcher
         raw, inside = matcher.raw[key], np.asarray(geometry.inlier_matches, dtype=int).reshape(-1, 2)
         is_still = [
             hidden(matcher.x_px[key[0]][rows[:, 0]], self._still)
@@ -261,9 +222,13 @@ class Growing:
     def _register(self, rows: Sequence[int]) -> None:
         """Register images, triangulate what they see, adjust what is near them, and now and then everything."""
         assert self._model is not None
-        options = pipeline_options(self._known, SEED)
+        options = pipeline_options(self._known, OPTIONS.seed)
         mapping, triangulation = options.get_mapper(), options.get_triangulation()
         mapping.abs_pose_min_num_inliers = LEAST_INLIERS
+        self._database.unlink()
+        enter(self._database, len(self._view.x_px), self._lenses, self._known, OPTIONS.working_size_px)
+        write_keypoints(self._database, self._view.x_px)
+        write_geometries(self._database, self._geometries)
         with closing(pycolmap.Database.open(self._database)) as db:
             cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
         mapper = pycolmap.IncrementalMapper(cache)

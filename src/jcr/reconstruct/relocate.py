@@ -15,12 +15,10 @@ from numpy import ndarray
 from jcr.camera import NORMALIZED, by_point, project, resized, unproject
 from jcr.geometry import across_lines, inverse, retract, rotation_exp, skew, transform
 from jcr.least_squares import minimise
+from jcr.match.sift import detect, grey_of, matches
 from jcr.records import Intrinsics, Reconstruction
 
 WORKING_SIZE_PX = 1600
-FEATURES = 4000
-RATIO = 0.8
-"""A match must be so much nearer than the second nearest (Lowe 2004)."""
 GATE_PX = 3.0
 """Reprojection error beyond which an observation is a mismatch."""
 MIN_PARALLAX = np.radians(1.5)
@@ -76,18 +74,11 @@ def features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> Features:
     """SIFT of an image of these intrinsics, reduced to WORKING_SIZE_PX."""
     scale = min(1.0, WORKING_SIZE_PX / max(lens.width, lens.height))
     size = round(lens.width * scale), round(lens.height * scale)
-    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-    # Without the precise upscaling every point is off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
-    points, descriptors = sift.detectAndCompute(grey, None)
-    if not points:
-        return Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    # Hellinger's distance in place of Euclid's (Arandjelović and Zisserman 2012).
-    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    at_work = resized(lens, *size)
-    found = np.array([point.pt for point in points])
+    found, descriptors = detect(grey_of(image, size))
     to_original = np.array([lens.width / size[0], lens.height / size[1]])
-    return Features((found + 0.5) * to_original - 0.5, unproject(at_work, found)[:, :2], root)
+    return Features(
+        (found + 0.5) * to_original - 0.5, unproject(resized(lens, *size), found)[:, :2], descriptors
+    )
 
 
 def _located(
@@ -112,21 +103,6 @@ def _located(
     start = inverse(transform(rotation_exp(turn[:, 0]), shift[:, 0]))
     agree = np.asarray(inliers, int)[:, 0]
     return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
-
-
-def matches(
-    mine: Float32[ndarray, "k 128"], theirs: Float32[ndarray, "l 128"]
-) -> tuple[Int[ndarray, " c"], Int[ndarray, " c"]]:
-    """Pairs that are each other's nearest and clearly nearer than the next."""
-    if len(mine) < 2 or len(theirs) < 2:
-        return np.zeros(0, int), np.zeros(0, int)
-    likeness = mine @ theirs.T
-    best = likeness.argmax(1)
-    mutual = likeness.argmax(0)[best] == np.arange(len(mine))
-    two = np.partition(likeness, -2, axis=1)[:, -2:].clip(max=1.0)
-    distance = np.sqrt(2 - 2 * two)
-    kept = np.flatnonzero(mutual & (distance[:, 1] < RATIO * distance[:, 0]))
-    return kept, best[kept]
 
 
 def triangulated(

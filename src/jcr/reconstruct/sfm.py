@@ -16,25 +16,24 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float, UInt8
 from numpy import ndarray
-from PIL import Image
 
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
-from jcr.capture.images import encode_png
 from jcr.errors import NotTrustedError
 from jcr.geometry import inverse
 from jcr.match.guided import guided
-from jcr.match.matchers import FeatureName, LearnedMatcher, SiftMatcher
+from jcr.match.kept import KeepingMatcher, KeptFeatures
+from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
-from jcr.match.stage import Matched, Matcher, match_with_robot
-from jcr.match.verify import View, read_geometries, verification, write_geometries
+from jcr.match.sift import BYTES_OF_FEATURES, SiftFeatures, grey_of
+from jcr.match.stage import Matched, match_with_robot
+from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
 from jcr.memory import GB, give_back, resident
-from jcr.progress import Progress, steps
-from jcr.reconstruct.kept_features import KeptFeatures, enter_image, image_name, new_database
+from jcr.progress import Progress
+from jcr.reconstruct.colmap import ColmapOptions
 from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
@@ -47,10 +46,6 @@ from jcr.reconstruct.placed import (
 )
 from jcr.records import Intrinsics, Reconstruction, Tracks
 
-BYTES_OF_FEATURES = 330
-"""Per pixel of the image that a thread works on; measured 301 to 328, for the image is doubled first."""
-Kept = tuple[KeptFeatures, Sequence[int | None]]
-"""Features that were found before, and the row there of each image."""
 _MIN_REGISTERED = 3
 _GUIDED_PARTNERS = 6
 """Images with which one that was left out is matched along epipolar lines."""
@@ -69,41 +64,32 @@ def structure_from_motion(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     lenses: Sequence[Intrinsics],
     known: bool,
-    working_size_px: int,
-    seed: int,
-    verbose: bool,
+    options: ColmapOptions,
     report: Progress,
-    memory_gb: float = 8.0,
-    features: FeatureName = "sift",
     base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
     names: Sequence[str] = (),
-    kept: Kept | None = None,
+    kept: KeptFeatures | None = None,
 ) -> Reconstruction:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
-    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. `kept`
-    are SIFT features and matches of the same images that need not be found again.
+    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. SIFT
+    features and pairs that are `kept` are not found again.
 
     A `known` intrinsics are the only ones of `lenses`, do not fold over, and are held; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
     than three images register.
     """
-    with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+    seed = options.seed
+    with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        if features == "sift":
-            cameras = extract(database, images, lenses, known, working_size_px, report, memory_gb, kept)
-            matcher: Matcher = SiftMatcher(database, len(images), seed)
-        else:
-            cameras, _ = _enter(database, images, lenses, known, working_size_px)
-            matcher = LearnedMatcher(
-                features, images, database, cameras[0], at_work(lenses[0], cameras[0]), known, seed, report
-            )
+        cameras = enter(database, len(images), lenses, known, options.working_size_px)
+        matcher = matcher_of(options, images, cameras[0], known, report, kept)
         matched = matched_pairs(
             database, matcher, base_from_gripper, lenses[0], cameras, known, names, report
         )
         model = map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
-            model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
+            model, matched = _placed(database, model, matcher, matched, base_from_gripper, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
         adjust_robustly(model, hold_lens=known)
@@ -131,92 +117,63 @@ def structure_from_motion(
     )
 
 
-def extract(
-    database: Path,
-    images: Sequence[UInt8[ndarray, "h w 3"]],
-    lenses: Sequence[Intrinsics],
-    known: bool,
-    working_size_px: int,
-    report: Progress,
-    memory_gb: float = 8.0,
-    kept: Kept | None = None,
+def enter(
+    database: Path, count: int, lenses: Sequence[Intrinsics], known: bool, working_size_px: int
 ) -> list[pycolmap.Camera]:
-    """Features of every image, at the working size, in a new database; and the intrinsics as COLMAP's cameras.
-
-    Those that are kept, and their matches, are copied. As many threads are used as the budget, a peak resident set, has
-    room for.
-    """
-    cameras, names = _enter(database, images, lenses, known, working_size_px)
-    if kept is not None:
-        there = kept[0].copy_into(database, cameras[0], kept[1])
-        names = [name for row, name in enumerate(names) if row not in there]
-    extract_images(database, names, cameras[0], report, memory_gb)
-    return cameras
-
-
-def extract_images(
-    database: Path, names: Sequence[str], camera: pycolmap.Camera, report: Progress, memory_gb: float = 8.0
-) -> None:
-    """Features of images that a database has, and whose files lie beside it."""
-    size = camera.width, camera.height
-    cpu = pycolmap.Device.cpu
-    cores = os.cpu_count() or 1
-    extraction = pycolmap.FeatureExtractionOptions()
-    give_back()
-    room = memory_gb * GB - resident()
-    extraction.num_threads = max(1, min(cores, int(room // (size[0] * size[1] * BYTES_OF_FEATURES))))
-    at_once = 4 * cores  # fewer would leave threads idle at every end
-    for start in steps(report, "features", range(0, len(names), at_once)):
-        few = names[start : start + at_once]
-        pycolmap.extract_features(
-            database,
-            database.parent,
-            few,
-            pycolmap.CameraMode.SINGLE,
-            extraction_options=extraction,
-            device=cpu,
-        )
-    give_back()
-
-
-def _enter(
-    database: Path,
-    images: Sequence[UInt8[ndarray, "h w 3"]],
-    lenses: Sequence[Intrinsics],
-    known: bool,
-    working_size_px: int,
-) -> tuple[list[pycolmap.Camera], list[str]]:
-    """A new database of grey images at the working size; the intrinsics as COLMAP's cameras, and the images' names."""
+    """A new database of `count` images without features; the intrinsics, at the working size, as COLMAP's cameras."""
     width, height = lenses[0].width, lenses[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
     cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
-    new_database(database, cameras[0])
-    # Images are entered beforehand: extraction threads would number them in the order in which they finish.
-    names = [enter_pixels(database, row, working_image(pixels, size)) for row, pixels in enumerate(images)]
-    return cameras, names
-
-
-def enter_pixels(database: Path, row: int, grey: UInt8[ndarray, "h w"]) -> str:
-    """Enter an image of the working size before its features, and write it as a file beside the database; its name."""
     with closing(pycolmap.Database.open(database)) as db:
-        name = enter_image(db, row)
-    (database.parent / name).write_bytes(encode_png(grey))
-    return name
+        db.write_camera(cameras[0], use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(cameras[0].sensor_id)
+        db.write_rig(rig, use_rig_id=True)
+        for row in range(count):
+            image = pycolmap.Image(name=f"{row:05d}", camera_id=1, image_id=row + 1)
+            db.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=row + 1, rig_id=1)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+    return cameras
 
 
-def working_image(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[ndarray, "h2 w2"]:
-    """An image as features are found in it, of this width and height.
+def matcher_of(
+    options: ColmapOptions,
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    known: bool,
+    report: Progress,
+    kept: KeptFeatures | None = None,
+) -> Matcher:
+    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched."""
+    if options.features == "sift":
+        found = sift_features(images, camera, options.memory_gb, report, kept)
+        if kept is None:
+            return Matcher(found, np.ones(2), camera, known, options.seed)
+        return KeepingMatcher(found, camera, known, options.seed, kept)
+    from jcr.match.learned import LearnedFeatures
 
-    Areas share the pixels at their borders; Pillow's BOX gives those to one, and moves 2400 px by 0.25 px.
-    """
-    grey = np.asarray(Image.fromarray(pixels).convert("L"))
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    height, width = images[0].shape[:2]
+    scale = np.array([camera.width / width, camera.height / height])
+    return Matcher(LearnedFeatures(options.features, images, report), scale, camera, known, options.seed)
 
 
-def match(database: Path, seed: int) -> None:
-    """All pairs of the images in a database, by images alone."""
-    pycolmap.match_exhaustive(database, verification_options=verification(seed), device=pycolmap.Device.cpu)
+def sift_features(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    memory_gb: float,
+    report: Progress,
+    kept: KeptFeatures | None = None,
+) -> SiftFeatures:
+    """SIFT of images at the size of a camera, by as many threads as the budget, a peak resident set, has room for."""
+    give_back()
+    size = camera.width, camera.height
+    at_once = int((memory_gb * GB - resident()) // (size[0] * size[1] * BYTES_OF_FEATURES))
+    found = SiftFeatures(images, size, max(1, min(os.cpu_count() or 1, at_once)), report, kept)
+    give_back()
+    return found
 
 
 def matched_pairs(
@@ -231,7 +188,7 @@ def matched_pairs(
 ) -> Matched:
     """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
-    working = at_work(lens, cameras[0])
+    working = resized(lens, cameras[0].width, cameras[0].height)
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
@@ -246,16 +203,12 @@ def matched_pairs(
             (lens.width, lens.height),
             lambda fraction: report("matching", fraction),
         )
+    write_keypoints(database, matcher.x_px)
     write_geometries(database, matched.geometries)
     if not known and matched.lens != working:
         cameras.insert(0, camera_of(matched.lens, known))
     report("matching", 1.0)
     return matched
-
-
-def at_work(lens: Intrinsics, camera: pycolmap.Camera) -> Intrinsics:
-    """The intrinsics of the images at the working size."""
-    return resized(lens, camera.width, camera.height)
 
 
 def map_incrementally(
@@ -298,8 +251,6 @@ def _placed(
     matcher: Matcher,
     matched: Matched,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    known: bool,
-    seed: int,
     names: Sequence[str],
 ) -> tuple[pycolmap.Reconstruction, Matched]:
     """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
@@ -309,12 +260,10 @@ def _placed(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
-    lens = matched.lens if known else lens_of(camera, matched.lens)
-    _match_guided(
-        database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left, known, seed
-    )
+    lens = matched.lens if matcher.known else lens_of(camera, matched.lens)
+    _match_guided(database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left)
     poses = dict(zip(rows, poses_of(model, rows), strict=True))
-    apart = _second_model(database, left, camera, known, seed)
+    apart = _second_model(database, left, camera, matcher.known, matcher.seed)
     together = joined(apart, predicted) if apart is not None else {}
     for row in left:
         if (pose := resectioned(database, model, row, predicted[row])) is not None:
@@ -351,8 +300,6 @@ def _match_guided(
     matched: Matched,
     predicted: Float[ndarray, "n 4 4"],
     left: Sequence[int],
-    known: bool,
-    seed: int,
 ) -> None:
     """Further verified pairs of images that are not mapped, along predicted epipolar lines, into the database."""
     found = read_geometries(database)
@@ -365,7 +312,7 @@ def _match_guided(
             if (i, j) in found:
                 continue
             i_from_j = inverse(predicted[i]) @ predicted[j]
-            geometry = guided(matcher, view, camera, i, j, i_from_j, upright, _PREDICTED_STD, seed, known)
+            geometry = guided(matcher, view, camera, (i, j), i_from_j, upright, _PREDICTED_STD)
             if geometry is not None:
                 found[i, j] = geometry
     write_geometries(database, found)
@@ -381,7 +328,7 @@ def _second_model(
     with closing(pycolmap.Database.open(database)) as db:
         db.update_camera(camera)
     pipeline = pipeline_options(known, seed)
-    pipeline.image_names = [image_name(row) for row in left]
+    pipeline.image_names = [f"{row:05d}" for row in left]
     pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
     pipeline.mapper.abs_pose_min_num_inliers = 15
     models = pycolmap.incremental_mapping(database, database.parent, database.parent, pipeline)
@@ -394,7 +341,9 @@ def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOpti
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
     pipeline.min_model_size = 2
-    pipeline.multiple_models = pipeline.extract_colors = False
+    pipeline.extract_colors = False
+    # A first pair may bend unknown intrinsics until no third image fits: others are tried, the largest model counts.
+    pipeline.multiple_models, pipeline.max_num_models = not known, 3
     pipeline.random_seed = mapper.random_seed = pipeline.triangulation.random_seed = seed
     pipeline.num_threads = mapper.num_threads = 1  # sums over threads differ in the last bits
     pipeline.ba_global_function_tolerance = pipeline.ba_local_function_tolerance = _ENOUGH
@@ -456,7 +405,7 @@ def _align_observations(
     camera, image_ids = model.camera(1), sorted(model.reg_image_ids())
     size = camera.width, camera.height
     poses = poses_of(model, [image_id - 1 for image_id in image_ids])
-    greys = np.stack([working_image(images[image_id - 1], size) for image_id in image_ids])
+    greys = np.stack([grey_of(images[image_id - 1], size) for image_id in image_ids])
     aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
