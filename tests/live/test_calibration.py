@@ -25,6 +25,7 @@ from jcr.live.calibration_progress import LeftOut, Progress, Reached
 from jcr.live.camera import Camera, Frame
 from jcr.live.collect import CollectOptions, collect
 from jcr.live.folder import LiveFolder
+from jcr.reconstruct.colmap import reconstruct
 from jcr.records import HandEye, Kind, Plan, Requirement
 
 REQUIRED = (2.0, 0.3)
@@ -98,13 +99,15 @@ def test_the_end_is_the_batch_calibration_without_finding_features_again(
     with closing(LiveCalibration(folder)) as live:
         result = live.finish()
     batch = jcr.load_run(done)
-    assert not found and result.verdict == batch.verdict
-    assert np.array_equal(result.gripper_from_camera, batch.gripper_from_camera)
-    assert np.array_equal(result.covariance, batch.covariance)
+    assert not found and result.verdict == batch.verdict and batch.covariance is not None
+    # The files round.
+    assert np.allclose(result.gripper_from_camera, batch.gripper_from_camera, rtol=0, atol=1e-7)
+    assert np.allclose(result.covariance, batch.covariance, rtol=1e-4, atol=0)
     # A batch reads what is kept, and writes nothing there; what is damaged is found again.
     assert kept == {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
     next((folder / "live" / "features").glob("image-*")).write_bytes(b"damaged")
-    assert jcr.reconstruct(folder).tracks.x_px.tobytes() == batch.reconstruction.tracks.x_px.tobytes()
+    again = reconstruct(jcr.read_capture(folder))
+    assert np.array_equal(again.recon_from_camera, result.reconstruction.recon_from_camera)
     assert found == ["detect"]
 
 

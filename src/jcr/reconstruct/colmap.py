@@ -1,16 +1,16 @@
 """The COLMAP back end: structure from motion; no network, no weights."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from PIL import ExifTags, Image
 
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
-from jcr.match.matchers import FeatureName
 from jcr.memory import plan
 from jcr.progress import Progress, silent
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
@@ -18,24 +18,6 @@ _FILM_DIAGONAL_MM = 43.27
 _START_FOCALS = (0.8, 0.5, 1.2)
 """In long sides, for a camera without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapOptions:
-    """Structure from motion without a network."""
-
-    working_size_px: int = 1600
-    """Images whose long side is larger are reduced to this before features are extracted."""
-    seed: int = 0
-    """Same seed, same result, bit for bit."""
-    verbose: bool = False
-    """Let COLMAP's own log through."""
-    features: FeatureName = "sift"
-    """What is matched between images."""
-    robot_checks: bool = True
-    """Let the gripper poses check the matches; off, images alone decide."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process, the program itself included."""
 
 
 def reconstruct(

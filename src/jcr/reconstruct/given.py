@@ -23,7 +23,7 @@ from jcr.match.pairs import all_pairs
 from jcr.match.verify import write_geometries, write_keypoints
 from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.colmap import ColmapOptions
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.sfm import enter, log_level, sift_features, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 

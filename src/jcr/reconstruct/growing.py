@@ -27,7 +27,8 @@ from jcr.match.pairs import NEIGHBOURS, near_pairs, seen_in_common
 from jcr.match.still import hidden
 from jcr.match.verify import Geometries, View, pair_of, write_geometries, write_keypoints
 from jcr.progress import silent
-from jcr.reconstruct.colmap import ColmapOptions, starting_intrinsics
+from jcr.reconstruct.colmap import starting_intrinsics
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.placed import poses_of
 from jcr.reconstruct.sfm import (
     adjust_robustly,

@@ -33,7 +33,7 @@ from jcr.match.stage import Matched, match_with_robot
 from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress
-from jcr.reconstruct.colmap import ColmapOptions
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
