@@ -26,7 +26,6 @@ from jcr.records import (
     Verdict,
     verdict_of,
 )
-from jcr.records.notebook import hand_eye_table
 from jcr.represent.options import CloudOptions, MapOptions
 from jcr.run_folder import MadeWith, RunFolder
 from jcr.segment.options import SegmentOptions
@@ -187,7 +186,7 @@ class RunResult:
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
-        return hand_eye_table(self.hand_eye, str(self.out / "report.html"))
+        return self.hand_eye.as_html(str(self.out / "report.html"))
 
 
 @dataclass(frozen=True)

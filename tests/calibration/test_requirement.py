@@ -22,7 +22,6 @@ from jcr.cli.result import show, show_calibration
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.records import Finding, HandEye, Kind, PosePairs
-from jcr.records.notebook import hand_eye_table
 from jcr.records.words import sentence
 from jcr.report.html import poses_report_html
 from jcr.results import PosesResult, RunOptions
@@ -179,12 +178,12 @@ def test_one_notion_of_accepted_in_python_notebook_and_compare(
     for k, (asked, verdict) in enumerate(verdicts.items()):
         hand_eye = calibrate_poses(given, CalibrateOptions(require=asked))
         assert hand_eye.verdict == verdict and hand_eye.is_sound
-        assert f"gripper_from_camera, {verdict}" in hand_eye_table(hand_eye, "")
+        assert f"gripper_from_camera, {verdict}" in hand_eye.as_html()
         write_calibration(tmp_path / f"{k}.json", page(given, hand_eye)[0])
     # By default it is a wish: it warns, in the notebook too.
     poor = calibrate_poses(PosePairs(given.source, given.images[:4], *_first(given, 4), False))
     assert poor.verdict == "accepted with warnings"
-    table = hand_eye_table(poor, "")
+    table = poor.as_html()
     assert "accepted with warnings: " in table and "not as exact as needed" in table
     assert dispatch(["compare", str(tmp_path / "0.json"), str(tmp_path / "1.json")]) == 0
     assert not capsys.readouterr().err

@@ -16,7 +16,7 @@ from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.handeye.known_scale import fit_known_scale
 from jcr.handeye.robots import error_std, forward_kinematics
 from jcr.records import Intrinsics
-from jcr.simulate.bent_arm import BentArm, bend, error_names
+from jcr.simulate.bent_arm import BentArm, ErrorSizes, bend, error_names
 from jcr.simulate.capture import SimulateOptions, simulate
 from jcr.simulate.robots import (
     about_posture,

@@ -104,7 +104,7 @@ def columns_of_arm(arm: int) -> Int[ndarray, "12"]:
 
 
 def weak_prior(arms: int = 1) -> Float[ndarray, "u u"]:
-    """Information that keeps finite what the motions cannot see of the unknowns of so many arms."""
+    """Information that keeps finite what the motions cannot see of the unknowns of that number of arms."""
     std = np.full(12 * arms + 1, np.inf)
     for arm in range(arms):
         std[columns_of_arm(arm)[:6]] = PRIOR_STD[:6]

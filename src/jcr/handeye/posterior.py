@@ -1,4 +1,4 @@
-"""The unknowns averaged over the sizes of the errors, with a covariance that holds what it states, and its causes.
+"""The unknowns averaged over the sizes of the errors, with a calibrated covariance, and its causes.
 
 Cov = E[C] + Var[θ̂] over the sizes (components.py). A mixture has longer tails than a normal distribution of its
 covariance: the covariance is scaled until its 99 % ellipsoid holds 99 %, for an accepted answer that is many standard

@@ -24,7 +24,7 @@ STATIONARY_PX = 4.0
 
 
 def _verification(seed: int, known: bool, matches: int) -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's options for a pair of so many matches; `known`: the intrinsics are no guess."""
+    """COLMAP's options for a pair of that number of matches; `known`: the intrinsics are no guess."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     # With COLMAP's own (0.25, 3, 0.999, 10000) it takes four times as long and finds 1 % more inliers.

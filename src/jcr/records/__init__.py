@@ -24,14 +24,12 @@ from jcr.records.calibration import (
     Observability,
     PaperResiduals,
     Plan,
-    Requirement,
     RobotExamined,
     RobotNoise,
     ScaleCheck,
     ScaleEvidence,
     SceneUncertainty,
     Seen,
-    Where,
     WithGivenIntrinsics,
 )
 from jcr.records.capture import (
@@ -72,6 +70,7 @@ from jcr.records.reconstruction import (
     Reconstruction,
     Tracks,
 )
+from jcr.records.requirement import Requirement, Where
 
 __all__ = [
     "AngleRatio",

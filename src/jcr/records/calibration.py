@@ -1,7 +1,6 @@
 """Where the camera sits on the gripper, how well that is known, and what was found on the way."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +9,8 @@ from numpy import ndarray
 from jcr.records.assessed import Assessed
 from jcr.records.capture import Intrinsics
 from jcr.records.findings import Finding, Kind, verdict_of
-from jcr.records.notebook import hand_eye_table
+from jcr.records.notebook import table
+from jcr.records.requirement import Requirement
 from jcr.records.words import remedy, unobservable
 
 
@@ -253,33 +253,6 @@ class WithGivenIntrinsics:
     """How far apart the two pairs place a point at the centre of the image, at the same distance."""
 
 
-Where = Literal["seen", "camera", "scene"]
-"""What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Requirement:
-    """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
-
-    translation_mm: float
-    rotation_deg: float
-    asked: bool
-    """By the user; else the default, for grasping."""
-    distance_mm: float
-    """From the camera to the point that the translation is of; 0: the camera itself."""
-    reached_mm: float
-    reached_deg: float
-    more_images: int | None = None
-    """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
-    at: Where = "camera"
-    """What the millimetres and degrees are of."""
-
-    @property
-    def met(self) -> bool:
-        """Whether 95 % of the errors are within what is required."""
-        return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
     """What the intrinsics leave of the distortion: polynomials over the image (adjust/model_error.py), in widths of
@@ -489,7 +462,26 @@ class HandEye(Assessed):
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
-        return hand_eye_table(self)
+        return self.as_html()
+
+    def as_html(self, note: str = "") -> str:
+        """The transform with its standard deviations, the verdict and what warns, as a table, and a note below."""
+        from jcr.geometry import rotation_log  # SciPy, which help need not wait for
+
+        std = np.sqrt(np.diag(self.covariance))
+        mm = 1e3 * self.gripper_from_camera[:3, 3]
+        degrees = np.degrees(rotation_log(self.gripper_from_camera[:3, :3]))
+        used = f"{int(self.inliers.sum())} of {len(self.inliers)} poses used"
+        rows = [("", "translation", "rotation vector")] + [
+            (
+                axis,
+                f"{mm[k]:.2f} ± {1e3 * std[k]:.2f} mm",
+                f"{degrees[k]:.3f} ± {np.degrees(std[3 + k]):.3f}°",
+            )
+            for k, axis in enumerate("xyz")
+        ]
+        verdict = ": ".join(filter(None, (self.verdict, "; ".join(self.warnings))))
+        return table(f"gripper_from_camera, {verdict}; {used}", rows, f"1σ, gripper axes. {note}")
 
 
 @dataclass(frozen=True, kw_only=True)

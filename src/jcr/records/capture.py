@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.records.notebook import capture_table
+from jcr.records.notebook import table
 
 LensModel = Literal["pinhole", "rational", "fisheye"]
 COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
@@ -123,7 +123,20 @@ class Capture:
 
     def _repr_html_(self) -> str:
         """A table, for notebooks."""
-        return capture_table(self)
+        width, height = self.image_size
+        centres = self.base_from_gripper[:, :3, 3]
+        camera = "to be estimated"
+        if (given := self.intrinsics) is not None:
+            camera = f"{given.model}, fx {given.fx:.1f}, fy {given.fy:.1f}, cx {given.cx:.1f}, cy {given.cy:.1f} px"
+        rows = [
+            ("images", f"{len(self)} of {width} x {height} px"),
+            ("intrinsics", camera),
+            ("gripper positions", " x ".join(f"{side:.3f}" for side in np.ptp(centres, axis=0)) + " m"),
+            ("robot", self.robot or str(self.urdf or "not named")),
+            ("joint angles", "none" if self.joints is None else f"{self.joints.shape[1]} a pose"),
+            ("further cameras", ", ".join(camera.name for camera in self.others) or "none"),
+        ]
+        return table(f"capture {self.source or self.folder}", rows, "; ".join(self.notes))
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,14 @@ Beside the records, for `warnings` of a calibration are these sentences. Nothing
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
 from jcr.records.findings import Finding, Kind
+from jcr.records.requirement import Requirement
 from jcr.rounding import significant
-
-if TYPE_CHECKING:
-    from jcr.records.calibration import Requirement
 
 SHORT = "not as exact as needed"
 SURE = 4.0
@@ -61,7 +59,7 @@ def warnings_of(findings: Iterable[Finding]) -> tuple[str, ...]:
     return tuple(sentence(finding) for finding in findings if finding.severity != "informs")
 
 
-def reached_in_words(required: "Requirement") -> str:
+def reached_in_words(required: Requirement) -> str:
     """What 95 % of the errors stay below, and whether that is what was asked."""
     return _reached(vars(required))
 

@@ -1,0 +1,30 @@
+"""What accuracy is required of a calibration, and what it reaches."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Where = Literal["seen", "camera", "scene"]
+"""What an accuracy is of: a point that the camera sees, the camera on the gripper, the mapped scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """How exact a calibration must be, and how exact it is; 95 % of errors are smaller."""
+
+    translation_mm: float
+    rotation_deg: float
+    asked: bool
+    """By the user; else the default, for grasping."""
+    distance_mm: float
+    """From the camera to the point that the translation is of; 0: the camera itself."""
+    reached_mm: float
+    reached_deg: float
+    more_images: int | None = None
+    """At the poses proposed, that would reach it; 0 where it is, None where no reasonable number does."""
+    at: Where = "camera"
+    """What the millimetres and degrees are of."""
+
+    @property
+    def met(self) -> bool:
+        """Whether 95 % of the errors are within what is required."""
+        return self.reached_mm <= self.translation_mm and self.reached_deg <= self.rotation_deg
