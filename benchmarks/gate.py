@@ -17,7 +17,8 @@ from jcr.calibration.stage import calibrate
 from jcr.errors import NotTrustedError
 from jcr.geometry import Transforms, inverse, rotation_exp, transform
 from jcr.match.matchers import FeatureName
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.render import render

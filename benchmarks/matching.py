@@ -16,7 +16,8 @@ from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import rotation_between_deg, rotation_log
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct import marker
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import HandEye
 
 WAYS: tuple[tuple[FeatureName, bool], ...] = (

@@ -302,6 +302,13 @@ BENCHES = {
         True,
         measures=(*WHOLE, "src/jcr/cli", "src/jcr/live"),
     ),
+    "live": Bench(
+        "Calibrated while capturing",
+        HONEST,
+        "images until 2 mm and 0.3° are claimed and confirmed, at proposed poses, varied ones, random ones and a grid",
+        measures=(*SOLVER, *FEATURES, "src/jcr/reconstruct/growing.py", "src/jcr/live", "src/jcr/simulate"),
+        long="ten scenes instead of one, and up to 40 images instead of 24",
+    ),
     "batch": Bench(
         "Many captures",
         TIME,

@@ -17,8 +17,8 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import Transforms, fit_similarity, rotation_between_deg, rotation_log, scale_translation
 from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
-from jcr.reconstruct.colmap import ColmapOptions
 from jcr.reconstruct.colmap import reconstruct as reconstruct_with_colmap
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.global_alignment.pairs import PairPredictions, write_pairs
 from jcr.records import Capture, Reconstruction
 from jcr.simulate.capture import SimulateOptions, simulate

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from jcr.handeye.fit import Cues
     from jcr.handeye.robots import Arm
     from jcr.handeye.solve import solve_hand_eye
+    from jcr.live.calibration import LiveCalibration
+    from jcr.live.calibration_progress import Progress
     from jcr.pipeline import add_camera, build_map, calibrate, measure, run
     from jcr.reconstruct.backends import ReconstructOptions
     from jcr.records import (
@@ -96,6 +98,8 @@ _MODULE_OF = {
     "export_run": "jcr.export.formats",
     "read_capture": "jcr.capture.read",
     "solve_hand_eye": "jcr.handeye.solve",
+    "LiveCalibration": "jcr.live.calibration",
+    "Progress": "jcr.live.calibration_progress",
     "run": "jcr.pipeline",
     "add_camera": "jcr.pipeline",
     "calibrate": "jcr.pipeline",
@@ -122,12 +126,14 @@ __all__ = [
     "HandEye",
     "InputError",
     "Intrinsics",
+    "LiveCalibration",
     "MapOptions",
     "Measured",
     "NotTrustedError",
     "Observability",
     "PointCloud",
     "PosePairs",
+    "Progress",
     "ReadOptions",
     "ReconstructOptions",
     "Reconstruction",

@@ -40,7 +40,8 @@ from jcr.handeye.residuals import angle_ratio
 from jcr.handeye.solve import SCALE_STD, solve_hand_eye
 from jcr.progress import Progress
 from jcr.reconstruct.board_in_view import proposed
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import (
     Capture,
     Finding,

@@ -20,7 +20,8 @@ from jcr.errors import NotTrustedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.match.sift import SiftFeatures
 from jcr.progress import silent
-from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+from jcr.reconstruct.colmap import reconstruct
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Reconstruction
 
 pytestmark = pytest.mark.slow

@@ -142,14 +142,14 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     return replace(kept, image=row[kept.image])
 
 
-def some_of_many(tracks: Tracks) -> Tracks:
-    """All observations, or where there are more than are adjusted those of a random choice of the points."""
-    if len(tracks.image) <= MOST_OBSERVATIONS:
+def some_of_many(tracks: Tracks, most: int = MOST_OBSERVATIONS) -> Tracks:
+    """All observations, or where there are more than `most` those of a random choice of the points."""
+    if len(tracks.image) <= most:
         return tracks
     count = np.bincount(tracks.point, minlength=len(tracks.points_in_recon))
     order = np.random.default_rng(0).permutation(len(count))
     chosen = np.zeros(len(count), bool)
-    chosen[order[np.cumsum(count[order]) <= MOST_OBSERVATIONS]] = True
+    chosen[order[np.cumsum(count[order]) <= most]] = True
     return of_points(tracks, chosen)
 
 

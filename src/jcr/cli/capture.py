@@ -1,7 +1,9 @@
 """`jcr capture`: takes a capture live, image by image, with advice on the next pose."""
 
 import os
+import queue
 import sys
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
-from jcr.cli.output import Output
+from jcr.cli.output import Output, warn
+from jcr.errors import InputError, NotTrustedError
 from jcr.handeye.arms import CHOICES, ROBOT_NAMES, RobotName
 from jcr.live.camera import CameraOptions
 from jcr.live.collect import CollectOptions
@@ -19,18 +22,27 @@ if TYPE_CHECKING:
 
     from jcr.live.arm_words import ArmWords
     from jcr.live.asks import Answer, Ask
+    from jcr.live.calibration import LiveCalibration
+    from jcr.live.calibration_keys import Typed
     from jcr.live.folder import LiveFolder
+    from jcr.results import RunResult
+
+LEAST_IMAGES = 3
+"""Of a calibration."""
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Take a capture live, with a camera and the gripper poses of a robot, and see what is still missing.
 
-    An image is taken when the arm rests, and kept if it is sharp and nothing moves; OUT/live.html shows the images,
-    what they cover and the pose that would help most. After Ctrl-C the same command resumes.
+    An image is taken when the arm rests, and kept if it is sharp and nothing moves. The calibration is made meanwhile:
+    after each image it is printed how exact it is, what is wrong, and the pose that helps most. OUT/result is the
+    calibration of all images. After Ctrl-C the same command resumes. Typed on the terminal, retake, remove and finish
+    take an image again, take one out, and end.
 
     examples:
       jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --robot ur5e
+      jcr capture captures/table --camera 0 --poses ur:192.168.0.2 --require 2 0.3 --until-accurate
       jcr capture captures/table --camera realsense --poses franka:172.16.0.2
       jcr capture captures/table --camera 2 --camera-size 1920 1080 --focus 30 --poses xarm:192.168.1.203
       jcr capture captures/table --camera rtsp://192.168.0.9/stream --poses tcp
@@ -66,28 +78,90 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
-    """Collect until there are enough images."""
+    """Collect until there are enough images, or the calibration is as accurate as required."""
     from jcr.live.collect import collect
     from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
+    from jcr.run_folder import held
 
+    options = arguments.collect
+    if options.until_accurate and options.require is None:
+        raise InputError("--until-accurate: needs --require MM DEG, the accuracy that is meant")
     answers: list[Answer] = []
+    typed: queue.SimpleQueue[Typed] = queue.SimpleQueue()
 
     def tell(answer: "Answer", lines: list[str]) -> None:
         answers.append(answer)
         _say("\n".join(lines))
 
-    lens = _lens(arguments.intrinsics_from)
-    with opened(arguments.camera, arguments.optics) as camera:
-        live = LiveFolder(arguments.out, lens or camera.intrinsics, arguments.robot)
+    given = _intrinsics(arguments.intrinsics_from)
+    with held(arguments.out), opened(arguments.camera, arguments.optics) as camera:
+        live = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
         _say(f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
-        collect(live, camera, _asks(arguments), arguments.collect, tell, _words(arguments, live))
-    more = "" if len(live.names) >= 3 else "; three or more are needed, the same command resumes"
-    arguments.output.result(
-        f"{len(live.names)} images in {arguments.out}{more}; next: jcr check {arguments.out}\n",
-        {"capture": str(arguments.out), "images": live.names, "answers": answers},
-    )
-    return 0
+        calibration = _calibration(live, options)
+        asks = _asks(arguments, _lines(arguments, typed))
+        try:
+            result = collect(live, camera, asks, options, tell, _words(arguments, live), calibration, typed)
+            if result is None and len(live.names) >= LEAST_IMAGES:
+                result = _finished(calibration)
+        finally:
+            calibration.close()
+    is_proven = calibration.progress.is_accurate
+    return _report(arguments, live, answers, result, is_proven)
+
+
+def _calibration(live: "LiveFolder", options: CollectOptions) -> "LiveCalibration":
+    from jcr.calibration.options import CalibrateOptions
+    from jcr.live.calibration import LiveCalibration
+
+    return LiveCalibration(live, options=CalibrateOptions(require=options.require), reach=options.reach_m)
+
+
+def _finished(calibration: "LiveCalibration") -> "RunResult | None":
+    """The calibration of all images; None, and a line that says why, where there is none."""
+    try:
+        return calibration.finish()
+    except NotTrustedError as error:
+        warn(f"no calibration: {error}")
+        return None
+
+
+def _report(
+    arguments: Arguments,
+    live: "LiveFolder",
+    answers: "list[Answer]",
+    result: "RunResult | None",
+    is_proven: bool,
+) -> int:
+    """Print what was taken and how exact its calibration is; 3 where that is not what `--until-accurate` waits for."""
+    from jcr.records.words import reached_in_words, sentence
+
+    out, images = arguments.out, len(live.names)
+    more = "" if images >= LEAST_IMAGES else "; three or more are needed, the same command resumes"
+    text = f"{images} images in {out}{more}; next: jcr {'run' if result else 'check'} {out}\n"
+    required = None if result is None else result.hand_eye.requirement
+    if result is not None and required is not None:
+        rejected = [sentence(one) for one in result.hand_eye.findings if one.severity == "rejects"][:1]
+        verdict = "; ".join([result.verdict, *rejected])
+        text = f"{result.out}: {verdict}\n{reached_in_words(required)}\n{text}"
+    facts = {"capture": str(out), "images": live.names, "answers": answers}
+    facts["result"] = None if result is None else str(result.out)
+    facts["verdict"] = None if result is None else result.verdict
+    arguments.output.result(text, facts)
+    is_accurate = result is not None and result.converged and required is not None and required.met
+    return 3 if arguments.collect.until_accurate and not (is_accurate and is_proven) else 0
+
+
+def _lines(arguments: Arguments, typed: "queue.SimpleQueue[Typed]") -> "Iterator[str]":
+    """What is typed, without commands; where poses come from elsewhere, a thread of its own reads these."""
+    from jcr.live.calibration_keys import HELP, without_commands
+
+    lines = without_commands(sys.stdin, typed.put)
+    if sys.stdin.isatty():
+        _say(HELP)
+    if arguments.poses != "typed":
+        threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
+    return lines
 
 
 def _say(text: str) -> None:
@@ -95,8 +169,7 @@ def _say(text: str) -> None:
     sys.stderr.flush()
 
 
-def _asks(arguments: Arguments) -> "Iterator[Ask]":
-    from jcr.errors import InputError
+def _asks(arguments: Arguments, lines: "Iterator[str]") -> "Iterator[Ask]":
     from jcr.live import franka, ur, xarm
     from jcr.live.line_server import Listen, bound, served_poses
     from jcr.live.rest import asks_at_rest
@@ -104,7 +177,7 @@ def _asks(arguments: Arguments) -> "Iterator[Ask]":
 
     kind, _, address = arguments.poses.partition(":")
     if kind == "typed" and not address:
-        yield from typed_poses(sys.stdin, _say, arguments.pose_convention, arguments.pose_units)
+        yield from typed_poses(lines, _say, arguments.pose_convention, arguments.pose_units)
     elif kind == "tcp" and not address:
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
@@ -141,22 +214,19 @@ def _words(arguments: Arguments, live: "LiveFolder") -> "ArmWords":
 
 
 def _address(text: str, port: int, option: str) -> tuple[str, int]:
-    from jcr.errors import InputError
-
     host, _, number = text.rpartition(":") if ":" in text else (text, "", str(port))
     if not host or not number.isdigit() or not int(number) < 65536:
         raise InputError(f"{option}{text}: no address; write HOST:PORT such as 127.0.0.1:{port}")
     return host, int(number)
 
 
-def _lens(file: Path | None) -> dict[str, Any] | None:
+def _intrinsics(file: Path | None) -> dict[str, Any] | None:
     from jcr.capture.plain_files import read_json
-    from jcr.errors import InputError
 
     if file is None:
         return None
     content = read_json(file)
-    lens = content.get("intrinsics") if isinstance(content, dict) else None
-    if not isinstance(lens, dict):
+    given = content.get("intrinsics") if isinstance(content, dict) else None
+    if not isinstance(given, dict):
         raise InputError(f'--intrinsics-from {file}: holds no "intrinsics"; name a capture.json with some')
-    return {key: lens[key] for key in ("model", "fx", "fy", "cx", "cy", "distortion") if key in lens}
+    return {key: given[key] for key in ("model", "fx", "fy", "cx", "cy", "distortion") if key in given}

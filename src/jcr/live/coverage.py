@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.foreseen import ForeseenCamera
 from jcr.calibration.expected import (
     FEWEST,
     Ahead,
@@ -16,7 +15,6 @@ from jcr.calibration.expected import (
     typical_camera,
 )
 from jcr.calibration.robot_errors import RobotErrors, errors_of, of_poses
-from jcr.capture.camera_json import read_intrinsics
 from jcr.errors import InputError
 from jcr.handeye.observability import observability
 from jcr.live.arm_words import ArmWords, Path, joints_at, pose_lines
@@ -59,12 +57,14 @@ def coverage(
 ) -> Coverage:
     """What the gripper poses in the folder will show, whatever is in the images; `before` is what earlier ones did."""
     words = words or ArmWords()
-    if len(live.poses) < 2:
-        return Coverage(images=len(live.poses), unseen=(), expected=(), words=words)
-    poses, joints = np.stack(live.poses), live.all_joints()
-    assumptions, robot = assumed(poses, _camera(live)), _errors(poses, words, joints)
+    if len(places := live.places()) < 2:
+        return Coverage(images=len(places), unseen=(), expected=(), words=words)
+    capture = live.capture()
+    poses, joints = capture.base_from_gripper, capture.joints
+    camera = typical_camera(capture.intrinsics, capture.image_size)
+    assumptions, robot = assumed(poses, camera), _errors(poses, words, joints)
     proposed = Ahead.of(assumptions, poses, robot, ALTERNATIVES if words.arm else 1, reach)
-    row, next_joints = _reachable(proposed.added, Path(poses, joints), words)
+    row, next_joints = reachable(proposed.added, Path(poses, joints), words)
     chosen = replace(proposed, added=proposed.added[row : row + 1])
     known = () if before is None else before.expected
     rows = [np.arange(count) for count in range(FEWEST + len(known), len(poses) + 1)]
@@ -76,14 +76,9 @@ def coverage(
         expected=(*known, *more),
         next_pose=next_pose,
         next_joints=next_joints,
-        like=live.names[next_pose.like],
+        like=capture.images[next_pose.like],
         words=words,
     )
-
-
-def _camera(live: LiveFolder) -> ForeseenCamera:
-    assert live.size is not None
-    return typical_camera(read_intrinsics(live.lens, live.size, live.folder), live.size)
 
 
 def _errors(
@@ -96,7 +91,7 @@ def _errors(
         return errors_of(poses)
 
 
-def _reachable(
+def reachable(
     proposed: Float[ndarray, "c 4 4"], path: Path, words: ArmWords
 ) -> tuple[int, Float[ndarray, " dof"] | None]:
     """The first proposal that the arm reaches within its joint limits, and the angles; else the first, without."""

@@ -27,6 +27,8 @@ class Picture:
     grid: Float32[ndarray, "gh gw"]
     sharpness: float
     depth_mm: UInt16[ndarray, "h w"] | None = None
+    time_s: float | None = None
+    """On the camera's clock."""
 
 
 def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> Picture | str:
@@ -55,7 +57,7 @@ def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> 
         elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
             reason = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
         else:
-            return Picture(frame.image, now, sharpness, frame.depth_mm)
+            return Picture(frame.image, now, sharpness, frame.depth_mm, frame.time_s)
         if frame.time_s > end:
             return reason
 

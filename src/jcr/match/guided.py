@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.geometry import rotation_angle, skew
+from jcr.match.gate import Key
 from jcr.match.matchers import Matcher
 from jcr.match.verify import View, matched, pair_of
 
@@ -30,23 +31,21 @@ def guided(
     matcher: Matcher,
     view: View,
     camera: pycolmap.Camera,
-    i: int,
-    j: int,
+    key: Key,
     i_from_j: Float[ndarray, "4 4"],
     upright: Float[ndarray, " n"],
     std_rad: float,
-    seed: int,
-    known: bool,
 ) -> pycolmap.TwoViewGeometry | None:
     """The verified geometry of what matches along predicted epipolar lines; None where that is too little.
 
     `std_rad` is the uncertainty of the predicted directions.
     """
-    (start_i, of_i), (start_j, of_j) = (matcher.descriptors(k, float(upright[k])) for k in (i, j))
+    i, j = key
+    (start_i, of_i), (start_j, of_j) = (matcher.descriptors(k, float(upright[k])) for k in key)
     at = [slice(start, start + len(of)) for start, of in ((start_i, of_i), (start_j, of_j))]
-    some = View.of([view.x_px[k][rows] for k, rows in zip((i, j), at, strict=True)], view.lens)
+    some = View.of([view.x_px[k][rows] for k, rows in zip(key, at, strict=True)], view.lens)
     rows = guided_rows(some, 0, 1, of_i, of_j, i_from_j, band_px(view.lens.fx, std_rad)) + [start_i, start_j]
-    found = matched(view.x_px, camera, i, j, rows, seed, known)
+    found = matched(view.x_px, camera, i, j, rows, matcher.seed, matcher.known)
     if found is None or len(found.inlier_matches) < LEAST_RIGHT * len(rows):
         return None
     pair = pair_of(view, i, j, found)

@@ -49,7 +49,7 @@ class Matcher:
     ) -> None:
         """`camera` is at the working size, `scale` its pixels per pixel of the features, `known` as of `matched`."""
         self._features, self._scale = features, scale
-        self._camera, self._known, self._seed = camera, known, seed
+        self._camera, self.known, self.seed = camera, known, seed
         self.minds_roll, self.every_pair = features.minds_roll, features.every_pair
         self.descriptors = features.descriptors
         self.raw: dict[Key, Int[ndarray, "_ 2"]] = {}
@@ -67,7 +67,7 @@ class Matcher:
 
     def verified(self, key: Key, rows: Int[ndarray, "m 2"]) -> pycolmap.TwoViewGeometry | None:
         """The geometry of some of a pair's matches; None where too few agree on one."""
-        return matched(self.x_px, self._camera, *key, rows, self._seed, self._known)
+        return matched(self.x_px, self._camera, *key, rows, self.seed, self.known)
 
     def _at_work(self) -> list[Float[ndarray, "_ 2"]]:
         return [(x + 0.5) * self._scale - 0.5 for x in self._features.x_px]

@@ -36,9 +36,7 @@ def near_pairs(motion: Float[ndarray, "n n 4 4"], neighbours: int) -> list[Key]:
     return _best(-np.asarray(motion_length(motion)), neighbours)
 
 
-def seen_in_common(
-    view: View, found: Gate, motion: Float[ndarray, "n n 4 4"], upright: Float[ndarray, " n"]
-) -> list[Key]:
+def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -> list[Key]:
     """The partners of every image with which it shares most of the scene, by X and the points seen so far."""
     x = translation_of_x(found, motion)
     if x is None:

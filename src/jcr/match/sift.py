@@ -14,6 +14,7 @@ from numpy import ndarray
 from PIL import Image
 
 from jcr.match.gate import Key
+from jcr.match.kept import KeptFeatures, Sift
 from jcr.progress import Progress, steps
 
 KEYPOINTS = 2000
@@ -37,7 +38,7 @@ def grey_of(pixels: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[nda
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def detect(grey: UInt8[ndarray, "h w"]) -> tuple[Float[ndarray, "k 2"], Float32[ndarray, "k 128"]]:
+def detect(grey: UInt8[ndarray, "h w"]) -> Sift:
     """Keypoints (px; pixel centres are whole numbers) and their descriptors, of unit length."""
     # Without the precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
@@ -76,16 +77,39 @@ class SiftFeatures:
     every_pair = 24
 
     def __init__(
-        self, images: Sequence[UInt8[ndarray, "h w 3"]], size: tuple[int, int], threads: int, report: Progress
+        self,
+        images: Sequence[UInt8[ndarray, "h w 3"]],
+        size: tuple[int, int],
+        threads: int,
+        report: Progress,
+        kept: KeptFeatures | None = None,
     ) -> None:
+        """Features that are kept are not found again."""
         self.x_px: list[Float[ndarray, "_ 2"]] = []
         """Keypoints of every image, in pixels of images of `size`."""
         self._descriptors: list[Float32[ndarray, "_ 128"]] = []
+        self._size, self._kept = size, kept
         with ThreadPoolExecutor(threads) as pool:
-            found = pool.map(lambda image: detect(grey_of(image, size)), images)
-            for _, (x_px, descriptors) in zip(steps(report, "features", images), found, strict=True):
-                self.x_px.append(x_px)
-                self._descriptors.append(descriptors)
+            found = pool.map(self._of_image, range(len(images)), images)
+            for _, one in zip(steps(report, "features", images), found, strict=True):
+                self._append(one)
+
+    def add(self, image: UInt8[ndarray, "h w 3"]) -> None:
+        """Find the features of one more image."""
+        self._append(self._of_image(len(self.x_px), image))
+
+    def _append(self, found: Sift) -> None:
+        self.x_px.append(found[0])
+        self._descriptors.append(found[1])
+
+    def _of_image(self, row: int, image: UInt8[ndarray, "h w 3"]) -> Sift:
+        kept = self._kept
+        if kept is not None and (there := kept.features(row, self._size)) is not None:
+            return there
+        found = detect(grey_of(image, self._size))
+        if kept is not None and kept.is_written:
+            kept.keep_features(row, self._size, found)
+        return found
 
     def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
         """Rows of the keypoints that match, of each pair; the rotations of the images (rad) change nothing."""

@@ -52,6 +52,8 @@ class Matched:
     """At the working size: given, or as the robot and the images have it."""
     upright: Float[ndarray, " n"] | None = None
     """Angles (rad) by which the images were rotated, once X's rotation was known."""
+    still: Bool[ndarray, "r c"] | None = None
+    """Parts of the image that do not move with the scene, as match.still has them; None where there are none."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     """As those of records.Reconstruction."""
@@ -215,9 +217,9 @@ def match_with_robot(
         found = _with_lens(search, lens)
     if found.of_x is None:
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.lens, None, notes)
+        return Matched(search.geometries, None, search.view.lens, None, search.still, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
-    search.match(seen_in_common(search.view, found, motion, upright) or everything, upright)
+    search.match(seen_in_common(search.view, found, motion) or everything, upright)
     found = search.gate(found)
     report(0.8)
     lonely = _without_partners(found, n)
@@ -234,7 +236,7 @@ def match_with_robot(
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.lens, upright, notes, warnings)
+    return Matched(kept, found, search.view.lens, upright, search.still, notes, warnings)
 
 
 def _without_partners(found: Gate, count: int) -> set[int]:

@@ -22,7 +22,8 @@ INSTALL_DA3 = "pip install omegaconf addict einops && pip install --no-deps dept
 
 
 def _colmap(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import ColmapOptions, reconstruct
+    from jcr.reconstruct.colmap import reconstruct
+    from jcr.reconstruct.colmap_options import ColmapOptions
 
     features = "sift" if options.features == "auto" else options.features
     if features != "sift":
@@ -106,7 +107,7 @@ def _predictions(
 
 
 def _given(capture: Capture, options: "ReconstructOptions", progress: Progress | None) -> Reconstruction:
-    from jcr.reconstruct.colmap import ColmapOptions
+    from jcr.reconstruct.colmap_options import ColmapOptions
     from jcr.reconstruct.given import reconstruct_given
 
     if options.cameras is None:

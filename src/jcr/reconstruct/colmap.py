@@ -1,16 +1,16 @@
 """The COLMAP back end: structure from motion; no network, no weights."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from PIL import ExifTags, Image
 
 from jcr.camera import usable_lens
 from jcr.capture.images import read_image
 from jcr.errors import NotTrustedError
-from jcr.match.matchers import FeatureName
 from jcr.memory import plan
 from jcr.progress import Progress, silent
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.records import Capture, Intrinsics, Reconstruction
 
 _FILM_DIAGONAL_MM = 43.27
@@ -18,24 +18,6 @@ _FILM_DIAGONAL_MM = 43.27
 _START_FOCALS = (0.8, 0.5, 1.2)
 """In long sides, for a camera without known intrinsics. COLMAP's 1.2 alone fails on two of three real wrist
 cameras (true values 0.5 to 0.7); from 0.8 all three converge."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapOptions:
-    """Structure from motion without a network."""
-
-    working_size_px: int = 1600
-    """Images whose long side is larger are reduced to this before features are extracted."""
-    seed: int = 0
-    """Same seed, same result, bit for bit."""
-    verbose: bool = False
-    """Let COLMAP's own log through."""
-    features: FeatureName = "sift"
-    """What is matched between images."""
-    robot_checks: bool = True
-    """Let the gripper poses check the matches; off, images alone decide."""
-    memory_gb: float = 8.0
-    """Peak resident set of the process, the program itself included."""
 
 
 def reconstruct(
@@ -46,6 +28,7 @@ def reconstruct(
     Known intrinsics are held, unknown ones are estimated. Raises NotTrustedError when fewer than three images
     register: how many did, the likely reason, and what to do instead.
     """
+    from jcr.match.kept import KeptFeatures
     from jcr.match.sift import BYTES_OF_FEATURES
     from jcr.reconstruct.sfm import structure_from_motion
 
@@ -55,21 +38,17 @@ def reconstruct(
     working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
     plan(len(capture), (width, height), options.memory_gb, features=working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, warnings = usable_lens(capture.intrinsics)
-    lenses = [given] if given else _guessed_lenses(capture)
+    lenses, is_known, warnings = starting_intrinsics(capture)
     try:
         sparse = structure_from_motion(
             images,
             lenses,
-            given is not None,
-            options.working_size_px,
-            options.seed,
-            options.verbose,
+            is_known,
+            options,
             report,
-            options.memory_gb,
-            options.features,
             capture.base_from_gripper if options.robot_checks else None,
             capture.images,
+            KeptFeatures.of(capture) if options.features == "sift" else None,
         )
     except NotTrustedError as error:
         raise error.with_more(*warnings) from None
@@ -77,6 +56,12 @@ def reconstruct(
     if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
         notes += (f"{len(registered)} of {len(capture)} images registered; not {', '.join(missing)}",)
     return replace(sparse, notes=notes, warnings=(*warnings, *sparse.warnings))
+
+
+def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
+    """The intrinsics from which the mapping starts, tried in turn; whether they are known; and warnings about them."""
+    given, warnings = usable_lens(capture.intrinsics)
+    return [given] if given else _guessed_lenses(capture), given is not None, warnings
 
 
 def _guessed_lenses(capture: Capture) -> list[Intrinsics]:

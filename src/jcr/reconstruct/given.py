@@ -18,12 +18,13 @@ from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
 from jcr.errors import InputError, NotTrustedError
 from jcr.geometry import inverse
+from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
 from jcr.match.verify import write_geometries, write_keypoints
 from jcr.memory import plan
 from jcr.progress import Progress, silent
-from jcr.reconstruct.colmap import ColmapOptions
-from jcr.reconstruct.sfm import enter, log_level, matcher_of, tracks_of
+from jcr.reconstruct.colmap_options import ColmapOptions
+from jcr.reconstruct.sfm import enter, log_level, sift_features, tracks_of
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 MIN_POINTS = 50
@@ -103,7 +104,8 @@ def _triangulated(
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
         cameras = enter(database, len(images), [intrinsics], True, options.working_size_px)
-        matcher = matcher_of("sift", images, cameras[0], True, options.seed, report, options.memory_gb)
+        found = sift_features(images, cameras[0], options.memory_gb, report)
+        matcher = Matcher(found, np.ones(2), cameras[0], True, options.seed)
         report("matching", 0.0)
         pairs = all_pairs(len(images))
         write_keypoints(database, matcher.x_px)

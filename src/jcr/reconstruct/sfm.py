@@ -23,15 +23,17 @@ from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
 from jcr.errors import NotTrustedError
-from jcr.geometry import inverse, transform
+from jcr.geometry import inverse
 from jcr.match.guided import guided
-from jcr.match.matchers import FeatureName, Features, Matcher
+from jcr.match.kept import KeepingMatcher, KeptFeatures
+from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
 from jcr.match.sift import BYTES_OF_FEATURES, SiftFeatures, grey_of
 from jcr.match.stage import Matched, match_with_robot
 from jcr.match.verify import View, read_geometries, write_geometries, write_keypoints
 from jcr.memory import GB, give_back, resident
 from jcr.progress import Progress
+from jcr.reconstruct.colmap_options import ColmapOptions
 from jcr.reconstruct.least_squares_matching import align_tracks
 from jcr.reconstruct.placed import (
     LEAST_SHARED,
@@ -62,52 +64,51 @@ def structure_from_motion(
     images: Sequence[UInt8[ndarray, "h w 3"]],
     lenses: Sequence[Intrinsics],
     known: bool,
-    working_size_px: int,
-    seed: int,
-    verbose: bool,
+    options: ColmapOptions,
     report: Progress,
-    memory_gb: float = 8.0,
-    features: FeatureName = "sift",
     base_from_gripper: Float[ndarray, "n 4 4"] | None = None,
     names: Sequence[str] = (),
+    kept: KeptFeatures | None = None,
 ) -> Reconstruction:
     """Camera poses and tracks of images of one camera; the same, bit for bit, for the same seed.
 
-    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes.
+    With gripper poses the robot checks the matches (`match.stage`); `names` are those of the images, for notes. SIFT
+    features and pairs that are `kept` are not found again.
 
     A `known` intrinsics are the only ones of `lenses`, do not fold over, and are held; unknown ones are starting
     points, tried in turn, for a focal length and two radial coefficients. Raises NotTrustedError when fewer
     than three images register.
     """
-    with log_level(verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
+    seed = options.seed
+    with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = enter(database, len(images), lenses, known, working_size_px)
-        matcher = matcher_of(features, images, cameras[0], known, seed, report, memory_gb)
-        matched = _matched(database, matcher, base_from_gripper, lenses[0], cameras, known, names, report)
-        model = _map_incrementally(database, len(images), cameras, known, seed, report)
+        cameras = enter(database, len(images), lenses, known, options.working_size_px)
+        matcher = matcher_of(options, images, cameras[0], known, report, kept)
+        matched = matched_pairs(
+            database, matcher, base_from_gripper, lenses[0], cameras, known, names, report
+        )
+        model = map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
-            model, matched = _placed(database, model, matcher, matched, base_from_gripper, known, seed, names)
+            model, matched = _placed(database, model, matcher, matched, base_from_gripper, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
-        _adjust_robustly(model, hold_lens=known)
+        adjust_robustly(model, hold_lens=known)
         std_px = _align_observations(
-            model, images, lenses[0] if known else _lens_of(model.camera(1), lenses[0])
+            model, images, lenses[0] if known else lens_of(model.camera(1), lenses[0])
         )
-        _adjust_robustly(model, hold_lens=known)
-        lens, notes = (lenses[0] if known else _lens_of(model.camera(1), lenses[0])), list(matched.notes)
+        adjust_robustly(model, hold_lens=known)
+        lens, notes = (lenses[0] if known else lens_of(model.camera(1), lenses[0])), list(matched.notes)
         if not known and fold_distance_px(lens) is not None:
             notes.append("the views do not determine the distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
-            _adjust_robustly(model, hold_lens=True)
-            lens = _lens_of(model.camera(1), lens)
+            adjust_robustly(model, hold_lens=True)
+            lens = lens_of(model.camera(1), lens)
     report("mapping", 1.0)
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    motions = [model.image(row + 1).cam_from_world() for row in rows]
-    camera_from_recon = np.stack([transform(m.rotation.matrix(), m.translation) for m in motions])
     tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
     return Reconstruction(
         image_index=np.array(rows),
-        recon_from_camera=inverse(camera_from_recon),
+        recon_from_camera=poses_of(model, rows),
         intrinsics=lens,
         tracks=replace(tracks, std_px=std_px),
         backend="colmap",
@@ -139,33 +140,43 @@ def enter(
 
 
 def matcher_of(
-    features: FeatureName,
+    options: ColmapOptions,
     images: Sequence[UInt8[ndarray, "h w 3"]],
     camera: pycolmap.Camera,
     known: bool,
-    seed: int,
     report: Progress,
-    memory_gb: float = 8.0,
+    kept: KeptFeatures | None = None,
 ) -> Matcher:
-    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched.
-
-    As many threads find SIFT's as the budget, a peak resident set, has room for.
-    """
-    if features == "sift":
-        give_back()
-        size = camera.width, camera.height
-        at_once = int((memory_gb * GB - resident()) // (size[0] * size[1] * BYTES_OF_FEATURES))
-        found: Features = SiftFeatures(images, size, max(1, min(os.cpu_count() or 1, at_once)), report)
-        give_back()
-        return Matcher(found, np.ones(2), camera, known, seed)
+    """The matcher of some kind of features; SIFT's are found here, those of networks when they are matched."""
+    if options.features == "sift":
+        found = sift_features(images, camera, options.memory_gb, report, kept)
+        if kept is None:
+            return Matcher(found, np.ones(2), camera, known, options.seed)
+        return KeepingMatcher(found, camera, known, options.seed, kept)
     from jcr.match.learned import LearnedFeatures
 
     height, width = images[0].shape[:2]
     scale = np.array([camera.width / width, camera.height / height])
-    return Matcher(LearnedFeatures(features, images, report), scale, camera, known, seed)
+    return Matcher(LearnedFeatures(options.features, images, report), scale, camera, known, options.seed)
 
 
-def _matched(
+def sift_features(
+    images: Sequence[UInt8[ndarray, "h w 3"]],
+    camera: pycolmap.Camera,
+    memory_gb: float,
+    report: Progress,
+    kept: KeptFeatures | None = None,
+) -> SiftFeatures:
+    """SIFT of images at the size of a camera, by as many threads as the budget, a peak resident set, has room for."""
+    give_back()
+    size = camera.width, camera.height
+    at_once = int((memory_gb * GB - resident()) // (size[0] * size[1] * BYTES_OF_FEATURES))
+    found = SiftFeatures(images, size, max(1, min(os.cpu_count() or 1, at_once)), report, kept)
+    give_back()
+    return found
+
+
+def matched_pairs(
     database: Path,
     matcher: Matcher,
     base_from_gripper: Float[ndarray, "n 4 4"] | None,
@@ -200,7 +211,7 @@ def _matched(
     return matched
 
 
-def _map_incrementally(
+def map_incrementally(
     database: Path,
     n_images: int,
     cameras: list[pycolmap.Camera],
@@ -212,7 +223,7 @@ def _map_incrementally(
 
     The share of images in the model is reported; it falls back where another start is tried.
     """
-    pipeline = _pipeline(known, seed)
+    pipeline = pipeline_options(known, seed)
     if n_images > _MANY:
         pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = _GROWN
     mapper = pipeline.mapper
@@ -240,8 +251,6 @@ def _placed(
     matcher: Matcher,
     matched: Matched,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    known: bool,
-    seed: int,
     names: Sequence[str],
 ) -> tuple[pycolmap.Reconstruction, Matched]:
     """The model with images that the mapper left out and the robot helps to place, which `matched` then names, too."""
@@ -251,12 +260,10 @@ def _placed(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
-    lens = matched.lens if known else _lens_of(camera, matched.lens)
-    _match_guided(
-        database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left, known, seed
-    )
+    lens = matched.lens if matcher.known else lens_of(camera, matched.lens)
+    _match_guided(database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left)
     poses = dict(zip(rows, poses_of(model, rows), strict=True))
-    apart = _second_model(database, left, camera, known, seed)
+    apart = _second_model(database, left, camera, matcher.known, matcher.seed)
     together = joined(apart, predicted) if apart is not None else {}
     for row in left:
         if (pose := resectioned(database, model, row, predicted[row])) is not None:
@@ -265,7 +272,7 @@ def _placed(
     resected = poses.keys() - set(rows)
     if not resected and not together:
         return model, matched
-    larger = retriangulated(database, camera, poses | together, lambda made: _adjust_robustly(made, True))
+    larger = retriangulated(database, camera, poses | together, lambda made: adjust_robustly(made, True))
     notes, warnings = list(matched.notes), list(matched.warnings)
     if together and shared_points(larger, set(together)) < LEAST_SHARED:
         listed = ", ".join(names[row] for row in sorted(together))
@@ -275,7 +282,7 @@ def _placed(
         )
         if not resected:
             return model, replace(matched, warnings=tuple(warnings))
-        larger = retriangulated(database, camera, poses, lambda made: _adjust_robustly(made, True))
+        larger = retriangulated(database, camera, poses, lambda made: adjust_robustly(made, True))
     elif together:
         listed = ", ".join(names[row] for row in sorted(together))
         notes.append(f"{listed} were mapped apart, and joined through the robot's motion")
@@ -293,8 +300,6 @@ def _match_guided(
     matched: Matched,
     predicted: Float[ndarray, "n 4 4"],
     left: Sequence[int],
-    known: bool,
-    seed: int,
 ) -> None:
     """Further verified pairs of images that are not mapped, along predicted epipolar lines, into the database."""
     found = read_geometries(database)
@@ -307,7 +312,7 @@ def _match_guided(
             if (i, j) in found:
                 continue
             i_from_j = inverse(predicted[i]) @ predicted[j]
-            geometry = guided(matcher, view, camera, i, j, i_from_j, upright, _PREDICTED_STD, seed, known)
+            geometry = guided(matcher, view, camera, (i, j), i_from_j, upright, _PREDICTED_STD)
             if geometry is not None:
                 found[i, j] = geometry
     write_geometries(database, found)
@@ -322,7 +327,7 @@ def _second_model(
         return None
     with closing(pycolmap.Database.open(database)) as db:
         db.update_camera(camera)
-    pipeline = _pipeline(known, seed)
+    pipeline = pipeline_options(known, seed)
     pipeline.image_names = [f"{row:05d}" for row in left]
     pipeline.mapper.init_min_num_inliers, pipeline.mapper.init_min_tri_angle = 50, 8.0
     pipeline.mapper.abs_pose_min_num_inliers = 15
@@ -331,7 +336,7 @@ def _second_model(
     return largest if largest is not None and largest.num_reg_images() >= 2 else None
 
 
-def _pipeline(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(known: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's incremental mapping, the same for the same seed."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     mapper = pipeline.mapper
@@ -370,7 +375,7 @@ def _models(
     )
 
 
-def _adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
+def adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
     """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
 
     It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
@@ -473,7 +478,7 @@ def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
     return camera
 
 
-def _lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
+def lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
     """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)

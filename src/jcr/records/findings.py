@@ -77,6 +77,11 @@ class Kind(StrEnum):
     FEW_USED = "few images used"
     POSES_SWAPPED = "gripper poses exchanged"
     POSE_CONTRADICTS_IMAGE = "gripper pose contradicts its image"
+    NOT_REGISTERED = "image not registered"
+    FRAME_REPEATED = "image repeats another"
+    SIZE_DIFFERS = "image size differs"
+    CLOCK_JUMPS = "clock jumps back"
+    LEFT_OUT_DISAGREE = "left-out images contradict the accuracy"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -275,6 +275,14 @@ def _blurred(finding: Finding) -> str:
     return f"{count} images are blurred, such as {finding.images[0]} ({edges})"
 
 
+def _not_registered(finding: Finding) -> str:
+    if len(finding.images) == 1 and finding.value:
+        return f"{finding.images[0]} is not registered: it matches {finding.value:.0f} other images, too little of each"
+    if len(finding.images) == 1:
+        return f"{finding.images[0]} matches no other image"
+    return f"{len(finding.images)} images are not registered, such as {finding.images[0]}"
+
+
 # The camera.
 
 
@@ -570,6 +578,16 @@ _TEXT: dict[Kind, Words] = {
     Kind.POSE_CONTRADICTS_IMAGE: (
         "the gripper pose of {images[0]} is {mm:.0f} mm and {deg:.1f}° from where its image shows the gripper"
     ),
+    Kind.NOT_REGISTERED: _not_registered,
+    Kind.FRAME_REPEATED: (
+        "the image is the same as {images[0]}, though the gripper moved by {mm:.0f} mm and {deg:.0f}°: not kept"
+    ),
+    Kind.SIZE_DIFFERS: "the image has {size} pixels, the others {before}: not kept",
+    Kind.CLOCK_JUMPS: "the time of {images[0]} is {value:.3g} s before that of the image before it",
+    Kind.LEFT_OUT_DISAGREE: (
+        "{of:.0f} images that take no part show points {mm:.1f} mm and {deg:.2g}° (rms) from where the others place "
+        "them, where {expected_mm:.1f} mm and {expected_deg:.2g}° are expected"
+    ),
 }
 _REMEDY: dict[Kind, Words] = {
     Kind.UNOBSERVABLE: _to_observe,
@@ -622,5 +640,10 @@ _REMEDY: dict[Kind, Words] = {
     Kind.FEW_USED: "let the views overlap more and show more texture, or use a board (jcr docs markers)",
     Kind.POSES_SWAPPED: "exchange the two poses",
     Kind.POSE_CONTRADICTS_IMAGE: "correct that pose, or drop the image",
+    Kind.NOT_REGISTERED: "take such a view again, nearer to a pose that registered, with textured things in view",
+    Kind.FRAME_REPEATED: "check that the camera's stream is live",
+    Kind.SIZE_DIFFERS: "set the camera's old resolution, or name a new folder",
+    Kind.CLOCK_JUMPS: "check that images and poses are stamped by one clock",
+    Kind.LEFT_OUT_DISAGREE: "add images at other poses until both agree",
 }
 """Of kinds that have one."""

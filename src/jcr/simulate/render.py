@@ -3,7 +3,7 @@
 import ctypes.util
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -37,12 +37,13 @@ class View:
 def render(
     scene: Scene,
     intrinsics: Intrinsics,
-    base_from_camera: Float[ndarray, "n 4 4"],
+    base_from_camera: Iterable[Float[ndarray, "4 4"]],
     textured: bool = True,
     with_truth: bool = True,
 ) -> Iterator[View]:
     """The views of pinhole cameras with fx = fy and a central principal point, which is what MuJoCo has.
 
+    Poses are taken one at a time, each when the view before it was taken.
     Raises InputError where MuJoCo or an OpenGL library is missing.
     """
     size = intrinsics.width, intrinsics.height

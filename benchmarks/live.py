@@ -1,0 +1,253 @@
+"""`benchmarks live`: how many images does a capture need that is calibrated while it is taken, and is its claim true?"""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from benchmarks.simulated.arm_errors import PRESETS
+from jcr.calibration.options import CalibrateOptions
+from jcr.geometry import apply, inverse, retract, rotation_angle, transform
+from jcr.handeye.arms import RobotName, arm_named
+from jcr.handeye.inverse_kinematics import reach_toward
+from jcr.live.calibration import LiveCalibration
+from jcr.live.calibration_progress import Progress
+from jcr.records import Intrinsics
+from jcr.simulate.bent_arm import BentArm, bend
+from jcr.simulate.poses import looking_at
+from jcr.simulate.render import render
+from jcr.simulate.robots import effective_about, hand_eye_on, table_center, view_size, views
+from jcr.simulate.scenes import Scene, make_scene, moved
+from jcr.simulate.taken import pinhole
+
+REQUIRE = (2.0, 0.3)
+"""mm, degrees: 95 % of errors of a seen point, and of directions there."""
+FIRST = 3
+"""Images at poses of the pattern `varied`, with which every way begins: before them nothing can be proposed."""
+ARMS: tuple[RobotName, ...] = ("ur5e", "panda", "fr3", "ur10e", "xarm6")
+AROUND = 0.5
+"""m, of a UR5e: distance from which random poses and those of the grid look at the middle of the table."""
+GRID = (6, 3)
+"""Azimuths and elevations."""
+
+Way = Callable[["Cell", Progress, int], Float[ndarray, "4 4"]]
+"""The next base_from_gripper that somebody wishes, of a cell, from the state and the number of images so far."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An arm with errors, a camera on it, and what it looks at."""
+
+    arm: BentArm
+    scene: Scene
+    camera: Intrinsics
+    physical: Float[ndarray, "4 4"]
+    effective: Float[ndarray, "4 4"]
+    """gripper_from_camera that a calibration is to find."""
+    varied: Float[ndarray, "n dof"]
+    """Joint angles of the pattern `varied`."""
+    seed: int
+
+    def nearest(
+        self, wished: Float[ndarray, "4 4"], joints: Float[ndarray, " dof"]
+    ) -> Float[ndarray, " dof"]:
+        """The joint angles at which the gripper comes nearest to a pose."""
+        return reach_toward(self.arm.arm, wished[None], joints[None])[0]
+
+    def looking(self, place: Float[ndarray, "3"], rng: np.random.Generator) -> Float[ndarray, "4 4"]:
+        """base_from_gripper from which the camera at a place looks at the middle of the table."""
+        return looking_at(place, self.scene.table_center_in_base, rng) @ inverse(self.effective)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One capture that ended by itself, or with the last image that was allowed."""
+
+    scene: str
+    way: str
+    images: int
+    claimed: bool
+    claimed_mm: float
+    claimed_deg: float
+    error_mm: float
+    """Of a seen point at the distance of the scene."""
+    error_deg: float
+    seconds: float
+    """Processor time of the last image's calibration."""
+
+    @property
+    def is_true(self) -> bool:
+        """Whether both errors are within what was required."""
+        return self.error_mm <= REQUIRE[0] and self.error_deg <= REQUIRE[1]
+
+
+def run(long: bool = False) -> str:
+    """Markdown: one scene, or ten."""
+    runs = [
+        run_of(cell_of(seed), name, way, 40 if long else 24)
+        for seed in range(10 if long else 1)
+        for name, way in WAYS.items()
+    ]
+    return page(runs)
+
+
+def page(runs: Sequence[Run]) -> str:
+    """Markdown of measured captures."""
+    of_way = {name: [one for one in runs if one.way == name] for name in WAYS}
+    claimed = [one for one in runs if one.claimed]
+    goal = f"{REQUIRE[0]:g} mm and {REQUIRE[1]:g}°"
+    lines = [
+        "> "
+        + "; ".join(f"{name} {_images(some)}" for name, some in of_way.items() if some)
+        + " images, median",
+        f"> {sum(one.is_true for one in claimed)} of {len(claimed)} claims of {goal} true",
+        "",
+        "A rendered camera on an arm with errors (typical ones: 0.1° a joint, 0.3 mm a link) goes to poses until the "
+        f"calibration that grows with the images claims {goal} (95 % of errors of a seen point) and images that take no "
+        f"part confirm it. Every way begins with {FIRST} varied poses. Errors are against the effective transform.",
+        "",
+        "| scene, arm | poses | images | claims mm | ° | error mm | ° | claim | last image, s of processor |",
+        "|---" * 9 + "|",
+        *map(_line, runs),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _images(runs: Sequence[Run]) -> str:
+    counts = [one.images if one.claimed else np.inf for one in runs]
+    median = float(np.median(counts))
+    return f"more than {max(one.images for one in runs)}" if np.isinf(median) else f"{median:.0f}"
+
+
+def _line(one: Run) -> str:
+    claim = ("true" if one.is_true else "false") if one.claimed else "none"
+    cells = [one.scene, one.way, str(one.images), f"{one.claimed_mm:.2f}", f"{one.claimed_deg:.3f}"]
+    cells += [f"{one.error_mm:.2f}", f"{one.error_deg:.3f}", claim, f"{one.seconds:.1f}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def cell_of(seed: int) -> Cell:
+    """The cell of a seed."""
+    hand_eye, errors, elsewhere, motion, lens = (np.random.default_rng([seed, 40 + k]) for k in range(5))
+    arm = arm_named(ARMS[seed % len(ARMS)])
+    bent = bend(arm, PRESETS["typical"].sizes, errors)
+    target = table_center(arm)
+    x = hand_eye_on(arm, hand_eye)
+    return Cell(
+        arm=bent,
+        scene=moved(make_scene("tabletop", seed), target),
+        camera=pinhole(lens),
+        physical=x,
+        effective=effective_about(bent, x, 12, elsewhere, target).gripper_from_camera,
+        varied=views(arm, 40, x, motion, target),
+        seed=seed,
+    )
+
+
+def _proposed(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+    assert state.next_pose is not None
+    return state.next_pose.base_from_gripper
+
+
+def _varied(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+    return cell.arm.reported(cell.varied[count : count + 1])[0]
+
+
+def _random(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+    rng = np.random.default_rng([cell.seed, 60, count])
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(45, 85))
+    return cell.looking(_place(cell, azimuth, elevation, rng.uniform(0.8, 1.3)), rng)
+
+
+def _grid(cell: Cell, state: Progress, count: int) -> Float[ndarray, "4 4"]:
+    """In rows of equal elevation, without a rotation about the line of sight."""
+    row, column = divmod((count - FIRST) % (GRID[0] * GRID[1]), GRID[0])
+    azimuth, elevation = np.pi * (0.5 + (column + 0.5) / GRID[0]), np.radians(50 + 15 * row)
+    place = _place(cell, azimuth, elevation, 1.0)
+    z = cell.scene.table_center_in_base - place
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    camera = transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+    start = _facing(cell)
+    roll = np.arctan2(start[:3, 1] @ camera[:3, 0], start[:3, 0] @ camera[:3, 0])
+    about = transform(
+        np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]), np.zeros(3)
+    )
+    return camera @ inverse(about) @ inverse(cell.effective)
+
+
+def _facing(cell: Cell) -> Float[ndarray, "4 4"]:
+    """base_from_camera of the first image, whose roll the grid keeps."""
+    return cell.arm.reported(cell.varied[:1])[0] @ cell.effective
+
+
+def _place(cell: Cell, azimuth: float, elevation: float, factor: float) -> Float[ndarray, "3"]:
+    far = AROUND * factor * max(view_size(cell.arm.arm), 0.55)
+    toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return cell.scene.table_center_in_base + far * np.array(toward)
+
+
+WAYS: dict[str, Way] = {"proposed": _proposed, "varied": _varied, "random": _random, "grid": _grid}
+
+
+def run_of(cell: Cell, name: str, way: Way, most: int) -> Run:
+    """A capture by one way, until its claim is confirmed."""
+    white = PRESETS["typical"].white
+    rng = np.random.default_rng([cell.seed, 70])
+    state, seconds, joints = Progress(images=()), 0.0, cell.varied[0]
+    arm = cell.arm.arm
+    wanted: list[Float[ndarray, "4 4"]] = []
+
+    def poses() -> Iterator[Float[ndarray, "4 4"]]:
+        while True:
+            yield wanted[-1]
+
+    seen = render(cell.scene, cell.camera, poses(), with_truth=False)
+    with tempfile.TemporaryDirectory() as folder:
+        options = CalibrateOptions(require=REQUIRE)
+        live = LiveCalibration(
+            Path(folder) / "capture", intrinsics=cell.camera, robot=arm.name, options=options
+        )
+        for count in range(most):
+            if count < FIRST:
+                joints = cell.varied[count]
+            elif name == "proposed" and state.next_joints is not None:
+                joints = state.next_joints
+            else:
+                joints = cell.nearest(way(cell, state, count), joints)
+            wanted.append(cell.arm.true(joints[None])[0] @ cell.physical)
+            reported = retract(
+                cell.arm.reported(joints[None]), np.repeat(white, 3) * rng.normal(size=(1, 6))
+            )[0]
+            begun = time.process_time()
+            state = live.add(next(seen).image, reported, joints)
+            seconds = time.process_time() - begun
+            if state.is_accurate:
+                break
+        live.close()
+    return _measured(cell, name, state, seconds)
+
+
+def _measured(cell: Cell, name: str, state: Progress, seconds: float) -> Run:
+    found = state.hand_eye
+    assert found is not None and state.now is not None and found.in_use is not None
+    ahead = np.array([0.0, 0.0, 1e-3 * found.in_use.seen.distance_mm])
+    x = found.gripper_from_camera
+    away = float(np.linalg.norm(apply(x, ahead) - apply(cell.effective, ahead)))
+    return Run(
+        scene=f"{cell.seed}, {cell.arm.arm.name}",
+        way=name,
+        images=len(state.images),
+        claimed=state.is_accurate,
+        claimed_mm=state.now.translation_mm,
+        claimed_deg=state.now.rotation_deg,
+        error_mm=1e3 * away,
+        error_deg=float(np.degrees(rotation_angle(x[:3, :3].T @ cell.effective[:3, :3]))),
+        seconds=seconds,
+    )

@@ -1,0 +1,422 @@
+"""A calibration that is made while the images are taken: after each image, how exact it is and what is missing."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from numpy import ndarray
+
+from jcr.calibration.case import Case, some_of_many
+from jcr.calibration.checks.left_out import SAME
+from jcr.calibration.checks.views import STILL as MOVED
+from jcr.calibration.expected import FEWEST, Ahead, Assumptions, assumed, assumed_of, typical_camera
+from jcr.calibration.options import CalibrateOptions, check_options
+from jcr.calibration.requirement import advised
+from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
+from jcr.calibration.stage import checked
+from jcr.capture.camera_json import intrinsics_as_json
+from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
+from jcr.errors import NotTrustedError
+from jcr.files import read_bytes, write_text
+from jcr.geometry import apply, largest_motion
+from jcr.handeye.arms import arm_named
+from jcr.least_squares import one_blas_thread
+from jcr.live.arm_words import ArmWords
+from jcr.live.arm_words import Path as ArmPath
+from jcr.live.calibration_left_out import left_out
+from jcr.live.calibration_progress import LeftOut, Progress, Reached
+from jcr.live.coverage import reachable
+from jcr.live.folder import LiveFolder
+from jcr.live.look import STILL, grid
+from jcr.options import checked_options
+from jcr.reconstruct.growing import Growing
+from jcr.records import Capture, Finding, HandEye, Intrinsics, Kind, NextPose, strongest_first
+
+if TYPE_CHECKING:
+    from jcr.results import RunResult
+
+HISTORY = "live/history.json"
+"""In the folder of the capture: how exact the calibration was after each image."""
+RESULT = "result"
+"""In the folder of the capture: the run folder of the calibration of all images."""
+OBSERVATIONS = 300, 8000
+"""An image and in all, that take part while images are taken; what more of them add, the calibration at the end has."""
+FEW = 5
+"""Images from which on there is a calibration, or a finding that says what is missing."""
+MOST_POINTS = 3000
+PROPOSALS = 12
+"""Poses that are compared; the first that the arm reaches and whose image is likely to register is proposed."""
+ALIKE, ELSEWHERE_M = np.radians(25.0), 0.06
+"""Largest angle between the lines of sight of a proposed image and the nearest that registered, and least distance (m)
+of its camera from where an image did not register."""
+
+
+class LiveCalibration:
+    """A calibration that grows with its capture.
+
+    `folder` is that of the capture, or its LiveFolder; a capture that was begun there is continued, from its files.
+    `intrinsics` are of images as they are given to `add`; None: they are estimated. `robot` names the arm
+    (jcr.handeye.arms.ROBOT_NAMES). `reach` (2,3) is the box (m, base frame) in which gripper poses are proposed. Images
+    and poses are written into the folder as they come, and it can be read by jcr.read_capture at any time.
+    """
+
+    def __init__(
+        self,
+        folder: LiveFolder | str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        robot: str | None = None,
+        options: CalibrateOptions | Mapping[str, Any] | None = None,
+        reach: Float[ndarray, "2 3"] | None = None,
+    ) -> None:
+        """Raises InputError where the folder holds no capture that can be continued, or an option cannot be."""
+        if not isinstance(folder, LiveFolder):
+            given = None if intrinsics is None else intrinsics_as_json(intrinsics)
+            folder = LiveFolder(Path(folder), given, robot)
+        self.live, self._reach = folder, reach
+        self._options = checked_options(options, CalibrateOptions)
+        check_options(self._options)
+        name = self._options.robot or folder.rest.get("robot")
+        self._arm = None if name is None else arm_named(name)
+        self._map: Growing | None = None
+        self._mapped: list[str] = []
+        self._of_image: dict[str, tuple[Finding, ...]] = {}
+        self._grids: dict[str, Float32[ndarray, "gh gw"]] = {}
+        self._history = _read_history(folder.folder / HISTORY)
+        self.progress = Progress(images=tuple(folder.names), history=self._history)
+
+    def add(
+        self,
+        image: UInt8[ndarray, "h w 3"],
+        base_from_gripper: Float[ndarray, "4 4"],
+        joints: Float[ndarray, " dof"] | None = None,
+        time_s: float | None = None,
+        depth_mm: UInt16[ndarray, "h w"] | None = None,
+    ) -> Progress:
+        """Keep an image (RGB) and the gripper pose at it, and calibrate with it.
+
+        `joints` are the arm's angles (rad), `time_s` is when the image was taken, `depth_mm` that of a depth camera. An
+        image of another size, or one that repeats an earlier one while the gripper moved, is not kept: `refused` says
+        why, and the rest stays as it was.
+        """
+        refused = self.fault(image, base_from_gripper)
+        if refused is not None:
+            return self._refusing(refused)
+        self.live.add(image, base_from_gripper, joints, depth_mm, time_s)
+        return self.update()
+
+    def remove(self, index: int) -> Progress:
+        """Take the image at `index` out of the capture, and calibrate without it."""
+        self.live.remove(self.live.names[index])
+        return self.update()
+
+    def replace(
+        self,
+        index: int,
+        image: UInt8[ndarray, "h w 3"],
+        base_from_gripper: Float[ndarray, "4 4"],
+        joints: Float[ndarray, " dof"] | None = None,
+        time_s: float | None = None,
+        depth_mm: UInt16[ndarray, "h w"] | None = None,
+    ) -> Progress:
+        """Take an image in place of that at `index`: it becomes the last one, for images are in the order of taking.
+
+        Where the new one is refused, the old one stays.
+        """
+        old = self.live.names[index]
+        refused = self.fault(image, base_from_gripper, without=old)
+        if refused is not None:
+            return self._refusing(refused)
+        self.live.add(image, base_from_gripper, joints, depth_mm, time_s)
+        self.live.remove(old)
+        return self.update()
+
+    def finish(self, out: str | Path | None = None) -> "RunResult":
+        """The calibration of all images by `jcr.calibrate`, from the features and matches that were found.
+
+        Its run folder is `out`, or the folder `result` of the capture. Raises as `jcr.calibrate` does.
+        """
+        from jcr.pipeline import calibrate
+        from jcr.results import RunOptions
+
+        options = RunOptions(calibrate=self._options)
+        return calibrate(self.live.folder, out or self.live.folder / RESULT, options)
+
+    def fault(
+        self,
+        image: UInt8[ndarray, "h w 3"],
+        base_from_gripper: Float[ndarray, "4 4"],
+        without: str | None = None,
+    ) -> Finding | None:
+        """Why an image would not be kept; None of one that can be. `without` names an image that does not count."""
+        size = (image.shape[1], image.shape[0])
+        if self.live.size not in (None, size):
+            sizes = {"size": "{}x{}".format(*size), "before": "{}x{}".format(*self.live.size)}
+            return Finding(kind=Kind.SIZE_DIFFERS, severity="rejects", mend="images", details=sizes)
+        coarse = grid(image)
+        for name, pose in self.live.places():
+            metres, radians = largest_motion(np.stack([pose, base_from_gripper]))
+            if name == without or (metres < MOVED[0] and radians < MOVED[1]):
+                continue
+            if np.abs(self._grid(name) - coarse).mean() < STILL:
+                return Finding(
+                    kind=Kind.FRAME_REPEATED,
+                    severity="rejects",
+                    mend="images",
+                    images=(name,),
+                    value=metres,
+                    details={"rotation": radians},
+                )
+        return None
+
+    @one_blas_thread
+    def update(self) -> Progress:
+        """Bring the calibration up to what the folder holds: images that were added there, or removed."""
+        capture = self.live.capture() if self.live.names else None
+        names, before = [] if capture is None else list(capture.images), len(self._mapped)
+        for name in [name for name in self._mapped if name not in names]:
+            self._forget(name)
+        new = [name for name in names if name not in self._mapped]
+        if capture is not None:
+            self._extend(capture)
+        added = new[-1] if new and before <= len(names) else None
+        self.progress = self._calibrated(capture, added)
+        return self.progress
+
+    def close(self) -> None:
+        """Remove the working files; what lies in the folder of the capture stays."""
+        if self._map is not None:
+            self._map.close()
+
+    def _refusing(self, refused: Finding) -> Progress:
+        self.progress = replace(self.progress, added=None, refused=refused)
+        return self.progress
+
+    def _grid(self, name: str) -> Float32[ndarray, "gh gw"]:
+        if name not in self._grids:
+            self._grids[name] = grid(read_image(self.live.folder / name))
+        return self._grids[name]
+
+    def _forget(self, name: str) -> None:
+        if self._map is not None:
+            self._map.remove(self._mapped.index(name))
+        self._mapped.remove(name)
+        self._of_image.pop(name, None)
+        self._grids.pop(name, None)
+
+    def _extend(self, capture: Capture) -> None:
+        """Map the images of a capture that are not mapped yet."""
+        for count in range(len(self._mapped) + 1, len(capture) + 1):
+            name = capture.images[count - 1]
+            image = read_image(capture.folder / name)
+            self._of_image[name] = self._looked_at(name, image)
+            if self._map is None or self._map.is_to_be_mapped_again:
+                self.close()
+                # What is there already is mapped at once, as after an interruption.
+                self._map = Growing(capture)
+                self._of_image |= {
+                    other: self._looked_at(other, read_image(capture.folder / other))
+                    for other in capture.images[count:]
+                }
+                self._mapped = list(capture.images)
+                return
+            self._map.add(_first(capture, count), image)
+            self._mapped.append(name)
+
+    def _looked_at(self, name: str, image: UInt8[ndarray, "h w 3"]) -> tuple[Finding, ...]:
+        """What an image by itself, and when it was taken, say against it."""
+        found = []
+        if (width := edge_width(image)) > BLURRED_EDGE:
+            edge_px = max(*image.shape[:2], EDGES_AT) * width
+            found.append(
+                Finding(kind=Kind.BLURRED, severity="warns", mend="images", images=(name,), value=edge_px)
+            )
+        if (back := self.live.seconds_back(name)) is not None:
+            found.append(
+                Finding(kind=Kind.CLOCK_JUMPS, severity="warns", mend="poses", images=(name,), value=back)
+            )
+        return tuple(found)
+
+    def _calibrated(self, capture: Capture | None, added: str | None) -> Progress:
+        names = tuple(self._mapped)
+        of_images = [finding for name in names for finding in self._of_image[name]]
+        of_images += self._not_registered(names)
+        made = None if self._map is None or not names else self._map.reconstruction()
+        registered = () if made is None else tuple(names[row] for row in made.image_index)
+        state = Progress(images=names, added=added, registered=registered, history=self._history)
+        if capture is None or made is None or len(registered) < FEWEST:
+            state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
+            return replace(state, **self._before_calibration(capture))
+        tracks = some_of_many(made.tracks, min(OBSERVATIONS[0] * len(registered), OBSERVATIONS[1]))
+        made = replace(made, tracks=tracks)
+        robot = robot_errors(capture, self._options).of(made.image_index)
+        try:
+            case = checked(capture, made, self._options, robot)
+        except NotTrustedError:
+            state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
+            return replace(state, **self._before_calibration(capture))
+        assumptions = assumed_of(case)
+        hand_eye = advised(
+            case.hand_eye, case.base_from_gripper, self._options, robot, assumptions, case.scene_in_base
+        )
+        proof = None
+        required = hand_eye.requirement
+        if hand_eye.converged and required is not None and required.asked and required.met:
+            proof = left_out(capture, made, hand_eye.inliers, robot, self._options)
+        findings = [*of_images, *_contradicting(case, hand_eye), *hand_eye.findings, *_disagreeing(proof)]
+        self._remember(len(names), hand_eye)
+        return replace(
+            state,
+            hand_eye=hand_eye,
+            findings=strongest_first(findings),
+            history=self._history,
+            left_out=proof,
+            points_in_base=_points(case, hand_eye),
+            **self._proposed(case, hand_eye, robot, assumptions),
+        )
+
+    def _not_registered(self, names: tuple[str, ...]) -> list[Finding]:
+        """Images that stay out of the map, where there is one or there are enough for one."""
+        if self._map is None or len(names) < FEWEST:
+            return []
+        inside = set(self._map.registered)
+        return [
+            Finding(
+                kind=Kind.NOT_REGISTERED,
+                severity="warns",
+                mend="images",
+                images=(name,),
+                value=float(self._map.matched_with(row)),
+            )
+            for row, name in enumerate(names)
+            if row not in inside
+        ]
+
+    def _remember(self, images: int, hand_eye: HandEye) -> None:
+        """Write how exact the calibration is with this number of images; what was known of more is of others."""
+        required = hand_eye.requirement
+        assert required is not None
+        reached = Reached(
+            images=images,
+            translation_mm=float(required.reached_mm),
+            rotation_deg=float(required.reached_deg),
+            accepted=hand_eye.converged,
+        )
+        self._history = (*(one for one in self._history if one.images < images), reached)
+        write_text(self.live.folder / HISTORY, json.dumps([asdict(one) for one in self._history]) + "\n")
+
+    def _before_calibration(self, capture: Capture | None) -> dict[str, Any]:
+        """The next pose by a usual robot and usual images, as fields of Progress."""
+        if capture is None or len(capture) < 2:
+            return {}
+        poses = capture.base_from_gripper
+        camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
+        ahead = Ahead.of(assumed(poses, camera), poses, errors_of(poses), 1, self._reach)
+        pose = ahead.next_pose(1, ahead.expected(1))
+        return {"next_pose": pose, "next_like": capture.images[pose.like]}
+
+    def _proposed(
+        self, case: Case, hand_eye: HandEye, robot: RobotErrors, assumptions: Assumptions
+    ) -> dict[str, Any]:
+        """The next pose, within the reach and the arm's limits where they are known, as fields of Progress."""
+        used = case.used
+        poses, names = case.base_from_gripper[used], [case.names[row] for row in used]
+        pose: NextPose = hand_eye.next_poses[0]
+        joints = None
+        if not hand_eye.is_sound:
+            return self._before_calibration(case.capture)
+        is_bounded = self._reach is not None or self._arm is not None
+        registers = self._registers(case, pose.base_from_gripper[None])[0]
+        if is_bounded or not registers:
+            ahead = Ahead.of(assumptions, poses, robot.of(used), PROPOSALS, self._reach)
+            likely = self._registers(case, ahead.added)
+            ahead = replace(ahead, added=ahead.added[likely if likely.any() else slice(None)])
+            angles = case.capture.joints
+            of_used = None if angles is None else angles[case.reconstruction.image_index[used]]
+            row, joints = reachable(ahead.added, ArmPath(poses, of_used), ArmWords(arm=self._arm))
+            ahead = replace(ahead, added=ahead.added[row : row + 1])
+            pose = ahead.next_pose(1, ahead.expected(1))
+        return {"next_pose": pose, "next_joints": joints, "next_like": names[pose.like]}
+
+    def _registers(self, case: Case, added: Float[ndarray, "c 4 4"]) -> Bool[ndarray, " c"]:
+        """Which gripper poses are likely to give an image that registers: one that looks along nearly the same line as
+        an image that registered, and not from where one did not."""
+        x, capture = case.hand_eye.gripper_from_camera, case.capture
+        there = np.isin(np.arange(len(capture)), case.reconstruction.image_index)
+        camera, known = added @ x, capture.base_from_gripper[there] @ x
+        angle = np.arccos(np.clip(camera[:, :3, 2] @ known[:, :3, 2].T, -1, 1)).min(1)
+        failed = capture.base_from_gripper[~there] @ x
+        away = np.linalg.norm(camera[:, None, :3, 3] - failed[:, :3, 3], axis=2).min(1, initial=np.inf)
+        return (angle < ALIKE) & (away > ELSEWHERE_M)
+
+
+def _first(capture: Capture, count: int) -> Capture:
+    return replace(
+        capture, images=capture.images[:count], base_from_gripper=capture.base_from_gripper[:count]
+    )
+
+
+def _too_few(images: int) -> list[Finding]:
+    """That there is no calibration, and why."""
+    if images < FEW:
+        return [Finding(kind=Kind.FEW_IMAGES, severity="informs", mend="images", value=float(images))]
+    details = {"text": "fewer than three images are registered", "remedy": "let the views overlap more"}
+    return [Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)]
+
+
+def _contradicting(case: Case, hand_eye: HandEye) -> list[Finding]:
+    """Images whose gripper poses a sound calibration leaves out, and where their cameras show the gripper."""
+    if not hand_eye.is_sound:
+        return []
+    images = hand_eye.images
+    return [
+        Finding(
+            kind=Kind.POSE_CONTRADICTS_IMAGE,
+            severity="warns",
+            mend="poses",
+            images=(case.names[row],),
+            value=float(images.translation_residual_m[row]),
+            details={"rotation": float(images.rotation_residual_rad[row])},
+        )
+        for row in np.flatnonzero(~images.inliers)
+        if images.translation_residual_m[row] > SAME[0] or images.rotation_residual_rad[row] > SAME[1]
+    ]
+
+
+def _disagreeing(proof: LeftOut | None) -> list[Finding]:
+    if proof is None or proof.agree:
+        return []
+    return [
+        Finding(
+            kind=Kind.LEFT_OUT_DISAGREE,
+            severity="warns",
+            mend="images",
+            value=1e-3 * proof.translation_mm,
+            details={
+                "of": float(proof.images),
+                "rotation": float(np.radians(proof.rotation_deg)),
+                "expected_mm": proof.expected_mm,
+                "expected_deg": proof.expected_deg,
+            },
+        )
+    ]
+
+
+def _points(case: Case, hand_eye: HandEye) -> Float[ndarray, "p 3"]:
+    """Points of the scene that three or more images see (m, base frame)."""
+    tracks = case.reconstruction.tracks
+    seen = np.flatnonzero(np.bincount(tracks.point, minlength=len(tracks.points_in_recon)) >= 3)
+    some = seen[:: max(1, len(seen) // MOST_POINTS)]
+    return apply(hand_eye.base_from_recon, hand_eye.scale * tracks.points_in_recon[some])
+
+
+def _read_history(file: Path) -> tuple[Reached, ...]:
+    """As it was written; nothing of a file that cannot be read, for it decides nothing."""
+    try:
+        return tuple(Reached(**one) for one in json.loads(read_bytes(file)))
+    except (OSError, ValueError, TypeError):
+        return ()

@@ -1,0 +1,77 @@
+"""What a calibration that is made while the images are taken has come to after each of them."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from numpy import ndarray
+
+from jcr.records import Finding, HandEye, NextPose
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reached:
+    """How exact the calibration was with the first images."""
+
+    images: int
+    translation_mm: float
+    """95 % of errors are smaller; of what `Requirement.at` names."""
+    rotation_deg: float
+    accepted: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """Points that images see which take no part, against where calibrations without these images place them."""
+
+    images: int
+    translation_mm: float
+    """Distance between the two, root mean square; the error of the left-out gripper pose is in it."""
+    rotation_deg: float
+    expected_mm: float
+    """The same as the calibrations claim it, for themselves and for the robot's poses."""
+    expected_deg: float
+    agree: bool
+    """Whether the distances are what is expected, within chance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """The state of a calibration that grows by an image at a time."""
+
+    images: tuple[str, ...]
+    """Names of all that are kept, in the order in which they were taken."""
+    added: str | None = None
+    """The image that this is the state after; None where none was added."""
+    refused: Finding | None = None
+    """Why the image that was given is not kept."""
+    registered: tuple[str, ...] = ()
+    """Images whose cameras are known."""
+    findings: tuple[Finding, ...] = ()
+    """Against single images and against the calibration, strongest first; where there is none, what is missing."""
+    hand_eye: HandEye | None = None
+    """The calibration; None while fewer than three images are registered."""
+    history: tuple[Reached, ...] = ()
+    """After each image that gave a calibration."""
+    next_pose: NextPose | None = None
+    """The gripper pose that helps most, and what is expected of the calibration with it; None below two images."""
+    next_joints: Float[ndarray, " dof"] | None = None
+    """Joint angles (rad) there; None where the arm is not known or does not reach it."""
+    next_like: str | None = None
+    """The image whose pose is nearest to it."""
+    points_in_base: Float[ndarray, "p 3"] | None = None
+    """Points of the scene that are seen so far (m); None without a calibration."""
+    left_out: LeftOut | None = None
+    """Made when the calibration claims what is required; None before."""
+
+    @property
+    def now(self) -> Reached | None:
+        """How exact the calibration is; None where there is none with these images."""
+        return self.history[-1] if self.hand_eye is not None and self.history else None
+
+    @property
+    def is_accurate(self) -> bool:
+        """Whether the calibration is accepted, claims what is required, and images that take no part agree."""
+        found = self.hand_eye
+        if found is None or not found.converged or found.requirement is None or self.left_out is None:
+            return False
+        return found.requirement.met and self.left_out.agree

@@ -1,0 +1,85 @@
+"""The state of a growing calibration as lines that a person reads at the arm, and as an answer for a program."""
+
+import numpy as np
+
+from jcr.live.arm_words import ArmWords, pose_lines
+from jcr.live.asks import Answer
+from jcr.live.calibration_progress import Progress, Reached
+from jcr.records import Kind
+from jcr.records.findings import without_consequences
+from jcr.records.words import sentence
+from jcr.rounding import significant
+
+EARLIER = 5
+"""States before the present one that are printed."""
+
+
+def progress_lines(state: Progress, require: tuple[float, float] | None, words: ArmWords) -> list[str]:
+    """How exact the calibration is beside what is required, how it came to that, what is wrong, and the next pose."""
+    lines = [f"{_registered(state)}: {_accuracy(state, require)}"]
+    if len(earlier := state.history[-EARLIER - 1 : -1]) and state.now is not None:
+        course = " → ".join(significant(one.translation_mm) for one in (*earlier, state.now))
+        angles = " → ".join(significant(one.rotation_deg) for one in (*earlier, state.now))
+        lines.append(f"  image by image: {course} mm, {angles}°")
+    if (proof := state.left_out) is not None:
+        verdict = "as expected" if proof.agree else "more than expected"
+        lines.append(
+            f"  {proof.images} images that take no part are off by {significant(proof.translation_mm)} mm and "
+            f"{significant(proof.rotation_deg)}° (rms), {verdict}"
+        )
+    lines += [
+        f"  {sentence(one)}"
+        for one in without_consequences(state.findings)
+        if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
+    ]
+    if (pose := state.next_pose) is not None:
+        moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+        then = (
+            f"then {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}° are expected"
+        )
+        lines.append(f"next: {moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}")
+        lines += [f"  {line}" for line in pose_lines(pose.base_from_gripper, words, state.next_joints)]
+    return lines
+
+
+def _registered(state: Progress) -> str:
+    return f"{len(state.registered)} of {len(state.images)} images registered"
+
+
+def _accuracy(state: Progress, require: tuple[float, float] | None) -> str:
+    if state.now is None or state.hand_eye is None:
+        return "no calibration yet"
+    asked = "" if require is None else f"; {require[0]:g} mm and {require[1]:g}° are required"
+    verdict = "" if state.hand_eye.is_sound else ", rejected"
+    return f"± {_pair(state.now)} (95 % of errors of a seen point){verdict}{asked}"
+
+
+def _pair(reached: Reached) -> str:
+    return f"{significant(reached.translation_mm)} mm and {significant(reached.rotation_deg)}°"
+
+
+def progress_answer(state: Progress) -> Answer:
+    """The same for a program."""
+    pose, now, proof = state.next_pose, state.now, state.left_out
+    return {
+        "images": list(state.images),
+        "registered": list(state.registered),
+        "translation_95_mm": None if now is None else now.translation_mm,
+        "rotation_95_deg": None if now is None else now.rotation_deg,
+        "verdict": None if state.hand_eye is None else state.hand_eye.verdict,
+        "history": [vars(one) for one in state.history],
+        "findings": [
+            {
+                "kind": one.kind.value,
+                "severity": one.severity,
+                "images": list(one.images),
+                "text": sentence(one),
+            }
+            for one in state.findings
+        ],
+        "left_out": None if proof is None else vars(proof),
+        "accurate": state.is_accurate,
+        "next_base_from_gripper": None if pose is None else pose.base_from_gripper.tolist(),
+        "next_joints": None if state.next_joints is None else state.next_joints.tolist(),
+        "next_expected": None if pose is None else [pose.within_95_mm, pose.rotation_95_deg],
+    }

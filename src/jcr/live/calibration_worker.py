@@ -1,0 +1,103 @@
+"""A calibration that is made in a thread of its own, so that neither the camera nor the source of poses waits for it."""
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jcr.errors import InputError, NotTrustedError
+from jcr.live.calibration_progress import Progress
+
+if TYPE_CHECKING:
+    from jcr.live.calibration import LiveCalibration
+    from jcr.results import RunResult
+
+    Heard = Callable[["Progress | RunResult | Failed | Exception"], None]
+
+LONGEST_S = 60.0
+"""That the end of a capture waits for the calibration of its last images."""
+INTERRUPTED_S = 10.0
+"""The same of a capture that is interrupted."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why there is no calibration of the images so far: the capture goes on."""
+
+    reason: str
+
+
+class CalibrationWorker:
+    """Calibrates whenever the capture has changed; what it comes to is handed to `heard`, in the worker's thread."""
+
+    def __init__(self, calibration: "LiveCalibration", heard: "Heard", until_accurate: bool = False) -> None:
+        """`until_accurate`: as soon as the calibration is as accurate as required, it is finished, too."""
+        self._calibration, self._heard, self._until_accurate = calibration, heard, until_accurate
+        self._removed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._changed = threading.Event()
+        self._ended = self._abandoned = False
+        self._calibrated: tuple[str, ...] = ()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def start(self) -> None:
+        """Begin with what the folder of the capture holds."""
+        self._changed.set()
+        self._thread.start()
+
+    def changed(self) -> None:
+        """An image was added to the capture."""
+        self._changed.set()
+
+    def remove(self, name: str) -> None:
+        """Take an image out of the capture, before the next calibration."""
+        self._removed.put(name)
+        self._changed.set()
+
+    def finish(self) -> None:
+        """Calibrate what is left to calibrate, and stop."""
+        self._ended = True
+        self._stop(LONGEST_S)
+
+    def abandon(self) -> None:
+        """Stop with the state that is being calculated; what is not calibrated yet lies in the folder."""
+        self._abandoned = True
+        self._stop(INTERRUPTED_S)
+
+    def _stop(self, longest_s: float) -> None:
+        self._changed.set()
+        if self._thread.is_alive():
+            self._thread.join(longest_s)
+
+    def _watch(self) -> None:
+        while True:
+            self._changed.wait()
+            if self._abandoned:
+                return
+            ends = self._ended
+            self._changed.clear()
+            self._remove_all()
+            try:
+                self._calibrate()
+            except (InputError, NotTrustedError) as error:
+                self._heard(Failed(str(error)))
+            except Exception as error:
+                self._heard(error)
+            if ends:
+                return
+
+    def _calibrate(self) -> None:
+        names = tuple(name for name, _ in self._calibration.live.places())
+        if names == self._calibrated:
+            return
+        progress = self._calibration.update()
+        self._calibrated = progress.images
+        self._heard(progress)
+        if self._until_accurate and progress.is_accurate:
+            self._heard(self._calibration.finish())
+
+    def _remove_all(self) -> None:
+        live = self._calibration.live
+        while not self._removed.empty():
+            if (name := self._removed.get()) in live.names:
+                live.remove(name)

@@ -1,0 +1,23 @@
+"""What a user can choose of the COLMAP back end."""
+
+from dataclasses import dataclass
+
+from jcr.match.matchers import FeatureName
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapOptions:
+    """Structure from motion without a network."""
+
+    working_size_px: int = 1600
+    """Images whose long side is larger are reduced to this before features are extracted."""
+    seed: int = 0
+    """Same seed, same result, bit for bit."""
+    verbose: bool = False
+    """Let COLMAP's own log through."""
+    features: FeatureName = "sift"
+    """What is matched between images."""
+    robot_checks: bool = True
+    """Let the gripper poses check the matches; off, images alone decide."""
+    memory_gb: float = 8.0
+    """Peak resident set of the process, the program itself included."""

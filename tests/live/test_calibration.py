@@ -1,0 +1,283 @@
+"""A calibration that grows with its capture: the same as the batch in the end, and faults named where they happen."""
+
+import json
+import queue
+import shutil
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy import ndarray
+
+import jcr
+from jcr.capture.images import read_image
+from jcr.geometry import inverse, rotation_exp, step_between, transform
+from jcr.live.asks import Ask
+from jcr.live.calibration import LiveCalibration
+from jcr.live.calibration_keys import Typed, command_of, without_commands
+from jcr.live.calibration_progress import LeftOut, Progress, Reached
+from jcr.live.camera import Camera, Frame
+from jcr.live.collect import CollectOptions, collect
+from jcr.live.folder import LiveFolder
+from jcr.reconstruct.colmap import reconstruct
+from jcr.records import HandEye, Kind, Plan, Requirement
+
+REQUIRED = (2.0, 0.3)
+
+
+def still(tabletop: Path, k: int) -> ndarray:
+    return read_image(tabletop / "images" / f"{k:02d}.jpg")
+
+
+@pytest.fixture(scope="module")
+def grown(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
+    """The bundled capture fed image by image, and the state after each."""
+    capture = jcr.read_capture(tabletop)
+    folder = tmp_path_factory.mktemp("live") / "capture"
+    live = LiveCalibration(folder, intrinsics=capture.intrinsics, options={"require": REQUIRED})
+    states = [live.add(still(tabletop, k), pose) for k, pose in enumerate(capture.base_from_gripper)]
+    live.close()
+    return folder, states
+
+
+@pytest.fixture
+def resumed(grown: tuple[Path, list[Progress]], tmp_path: Path) -> Iterator[LiveCalibration]:
+    """The same capture without its last image, begun again from its files."""
+    folder = shutil.copytree(grown[0], tmp_path / "capture")
+    live = LiveCalibration(folder, options={"require": REQUIRED})
+    live.live.remove(live.live.names[-1])
+    live.update()
+    yield live
+    live.close()
+
+
+@pytest.mark.slow
+def test_every_image_from_the_fifth_on_gives_a_calibration_and_it_becomes_more_exact(grown):
+    _, states = grown
+    assert all(state.added == state.images[-1] and state.refused is None for state in states)
+    assert all(state.hand_eye is None and state.findings for state in states[:2])
+    assert all(state.hand_eye is not None and state.hand_eye.converged for state in states[4:])
+    assert [one.images for one in states[-1].history] == list(range(3, 13))
+    reached = [one.translation_mm for one in states[-1].history]
+    assert reached[-1] < 0.5 * reached[2]
+    assert states[-1].registered == states[-1].images
+    # The next pose is one to which a robot can be sent, and makes the calibration more exact.
+    pose, now = states[-1].next_pose, states[-1].now
+    assert pose is not None and now is not None and pose.within_95_mm < now.translation_mm
+    # Points are on the table or on what stands there.
+    points = states[-1].points_in_base
+    assert points is not None and len(points) > 200 and -0.02 < np.median(points[:, 2]) < 0.2
+
+
+@pytest.mark.slow
+def test_a_requirement_that_holds_is_proven_by_images_that_take_no_part(grown):
+    _, states = grown
+    accurate = [state.is_accurate for state in states]
+    assert not any(accurate[:7]) and accurate[-1]
+    proof = states[-1].left_out
+    assert proof is not None and proof.images >= 9 and proof.translation_mm < REQUIRED[0]
+
+
+@pytest.mark.slow
+def test_the_end_is_the_batch_calibration_without_finding_features_again(
+    grown, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from jcr.match import sift
+
+    folder = shutil.copytree(grown[0], tmp_path / "capture")
+    found: list[str] = []
+    for name in ("detect", "matches"):
+        real = getattr(sift, name)
+        monkeypatch.setattr(sift, name, lambda *a, name=name, real=real: (found.append(name), real(*a))[1])
+    kept = {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
+    with closing(LiveCalibration(folder)) as live:
+        result = live.finish()
+    batch = jcr.load_run(done)
+    assert not found and result.verdict == batch.verdict and batch.covariance is not None
+    # The files round.
+    assert np.allclose(result.gripper_from_camera, batch.gripper_from_camera, rtol=0, atol=1e-7)
+    assert np.allclose(result.covariance, batch.covariance, rtol=1e-4, atol=0)
+    # A batch reads what is kept, and writes nothing there; what is damaged is found again.
+    assert kept == {file.name: file.stat().st_mtime_ns for file in (folder / "live" / "features").iterdir()}
+    next((folder / "live" / "features").glob("image-*")).write_bytes(b"damaged")
+    again = reconstruct(jcr.read_capture(folder))
+    assert np.array_equal(again.recon_from_camera, result.reconstruction.recon_from_camera)
+    assert found == ["detect"]
+
+
+@pytest.mark.slow
+def test_a_capture_that_is_resumed_stands_where_it_stood_and_a_retake_replaces(
+    grown, resumed: LiveCalibration, tabletop: Path
+):
+    _, states = grown
+    before, now = states[10], resumed.progress
+    assert now.registered == before.registered and now.images == before.images
+    assert now.hand_eye is not None and before.hand_eye is not None
+    std = np.sqrt(np.diag(before.hand_eye.covariance)[:6])
+    away = step_between(now.hand_eye.gripper_from_camera, before.hand_eye.gripper_from_camera)
+    assert np.abs(away / std).max() < 1
+    pose = resumed.live.poses[4]
+    after = resumed.replace(4, still(tabletop, 4), pose)
+    assert len(after.images) == 11 and states[4].added not in after.images
+    assert after.images[-1] == after.added and after.registered == after.images
+    assert after.hand_eye is not None
+    away = step_between(after.hand_eye.gripper_from_camera, before.hand_eye.gripper_from_camera)
+    assert np.abs(away / std).max() < 1
+    assert not (resumed.live.folder / str(states[4].added)).exists()
+    assert jcr.read_capture(resumed.live.folder).images == after.images
+
+
+@pytest.mark.slow
+def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibration, tabletop: Path):
+    pose, image = jcr.read_capture(tabletop).base_from_gripper[11], still(tabletop, 11)
+    count = len(resumed.live.names)
+
+    repeated = resumed.add(still(tabletop, 3), pose)
+    assert repeated.refused is not None and repeated.refused.kind is Kind.FRAME_REPEATED
+    assert repeated.refused.images == ("images/003.png",)
+    small = resumed.add(image[::2, ::2], pose)
+    assert small.refused is not None and small.refused.kind is Kind.SIZE_DIFFERS
+    assert len(resumed.live.names) == count and repeated.registered == resumed.progress.registered
+
+    def against(state: Progress) -> dict[Kind, Any]:
+        return {one.kind: one for one in state.findings if one.images == (state.added,)}
+
+    noise = np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8)
+    strange = resumed.add(noise, pose, time_s=10.0)
+    assert against(strange)[Kind.NOT_REGISTERED].value == 0
+    wrong = pose @ transform(rotation_exp(np.radians([3.0, 8.0, 0.0])), np.array([0.03, 0.0, 0.02]))
+    contradicted = resumed.add(image, wrong, time_s=9.0)
+    assert contradicted.added in contradicted.registered
+    found = against(contradicted)
+    assert found[Kind.POSE_CONTRADICTS_IMAGE].details["rotation"] == pytest.approx(np.radians(8.5), rel=0.1)
+    assert found[Kind.CLOCK_JUMPS].value == pytest.approx(1.0)
+    resumed.remove(len(resumed.live.names) - 1)
+    blurred = resumed.add(np.asarray(cv2.GaussianBlur(image, (0, 0), 9), np.uint8), pose)
+    assert Kind.BLURRED in against(blurred) and Kind.POSE_CONTRADICTS_IMAGE not in against(blurred)
+    # What is wrong with single images has not harmed the others.
+    assert blurred.hand_eye is not None and blurred.hand_eye.converged
+
+
+@pytest.mark.slow
+def test_poses_of_another_convention_are_named(grown, tmp_path: Path):
+    folder = shutil.copytree(grown[0], tmp_path / "capture")
+    content = json.loads((folder / "capture.json").read_text())
+    for frame in content["frames"]:
+        frame["base_from_gripper"] = inverse(np.array(frame["base_from_gripper"])).tolist()
+    (folder / "capture.json").write_text(json.dumps(content))
+    with closing(LiveCalibration(folder)) as live:
+        state = live.update()
+    assert Kind.POSE_CONVENTION in {one.kind for one in state.findings}
+    assert state.hand_eye is not None and not state.hand_eye.converged and not state.is_accurate
+
+
+def test_commands_are_distinguished_from_poses():
+    assert command_of("retake") == Typed("retake") and command_of("rem 3") == Typed("remove", 3)
+    assert command_of("FINISH\n") == Typed("finish")
+    assert all(command_of(line) is None for line in ("", "0.4 0 0.5 0 0 0", "re", "remove it", "finish 1 2"))
+    typed: list[Typed] = []
+    assert list(without_commands(["1 2", "remove 2", "3 4"], typed.append)) == ["1 2", "3 4"]
+    assert typed == [Typed("remove", 2)]
+
+
+PROOF = LeftOut(images=9, translation_mm=1.0, rotation_deg=0.1, expected_mm=1.0, expected_deg=0.1, agree=True)
+
+
+def a_hand_eye(met: bool) -> HandEye:
+    """An accepted calibration that meets what is required, or does not."""
+    rng = np.random.default_rng(0)
+    poses = transform(rotation_exp(0.5 * rng.normal(size=(10, 3))), 0.2 * rng.normal(size=(10, 3)))
+    found = jcr.solve_hand_eye(poses, poses @ transform(np.eye(3), np.array([0.05, 0.0, 0.1])))
+    required = Requirement(
+        translation_mm=REQUIRED[0],
+        rotation_deg=REQUIRED[1],
+        asked=True,
+        distance_mm=500.0,
+        reached_mm=1.0 if met else 3.0,
+        reached_deg=0.1,
+    )
+    return replace(found, plan=Plan(requirement=required))
+
+
+class Scripted:
+    """A calibration that is accurate from a number of images on."""
+
+    def __init__(self, live: LiveFolder, accurate_from: int) -> None:
+        self.live, self.accurate_from = live, accurate_from
+        self.finished = 0
+
+    def update(self) -> Progress:
+        images = tuple(self.live.names)
+        reached = Reached(images=len(images), translation_mm=1.0, rotation_deg=0.1, accepted=True)
+        found = a_hand_eye(len(images) >= self.accurate_from)
+        return Progress(images=images, added=images[-1], hand_eye=found, history=(reached,), left_out=PROOF)
+
+    def finish(self) -> Any:
+        self.finished += 1
+        requirement = SimpleNamespace(met=True)
+        return SimpleNamespace(converged=True, hand_eye=SimpleNamespace(requirement=requirement))
+
+
+def taken_live(
+    folder: Path, tabletop: Path, accurate_from: int, commands: dict[int, Typed]
+) -> tuple[LiveFolder, Scripted, list[dict], Any]:
+    """A capture by still images and their poses, each given when the state after the one before it is there."""
+    pose = jcr.read_capture(tabletop).base_from_gripper
+    live, answers, k = LiveFolder(folder), [], [0]
+    calibration = Scripted(live, accurate_from)
+    typed: queue.SimpleQueue[Typed] = queue.SimpleQueue()
+    states: queue.SimpleQueue[dict] = queue.SimpleQueue()
+
+    def tell(answer: dict, lines: list[str]) -> None:
+        answers.append(answer)
+        if "image" not in answer:
+            states.put(answer)
+
+    def frames() -> Iterator[Frame]:
+        step = 0
+        while True:
+            yield Frame(still(tabletop, k[0]), 0.25 * step)
+            step += 1
+
+    def asks() -> Iterator[Ask]:
+        for row in range(12):
+            k[0] = row
+            yield Ask(pose[row])
+            while "calibration" not in states.get(timeout=20):
+                pass
+            if (command := commands.get(row)) is not None:
+                typed.put(command)
+                if command.action == "finish":
+                    return
+                states.get(timeout=20)
+
+    camera = Camera(frames(), lambda: None)
+    options = CollectOptions(require=REQUIRED, until_accurate=True)
+    stub: Any = calibration
+    done = collect(live, camera, asks(), options, tell, calibration=stub, typed=typed)
+    return live, calibration, answers, done
+
+
+def test_a_capture_ends_by_itself_when_it_is_accurate(tmp_path: Path, tabletop: Path):
+    live, calibration, answers, done = taken_live(tmp_path / "c", tabletop, 4, {})
+    assert done is not None and calibration.finished >= 1
+    assert 4 <= len(live.names) <= 5
+    assert answers[1]["calibration"]["accurate"] is False
+
+
+def test_what_is_typed_removes_and_retakes_images(tmp_path: Path, tabletop: Path):
+    live, _, answers, done = taken_live(
+        tmp_path / "c", tabletop, 3, {0: Typed("retake"), 1: Typed("remove", 7), 2: Typed("finish")}
+    )
+    # The second image was taken in place of the first; there was no seventh.
+    assert {"retake": "images/000.png"} in answers
+    assert "images/000.png" not in live.names and "images/001.png" in live.names
+    written = json.loads((live.folder / "capture.json").read_text())["frames"]
+    assert [frame["image"] for frame in written] == live.names and len(live.names) == 2
+    assert done is None
