@@ -85,7 +85,7 @@ def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_p
     assert other["requirement"]["translation_mm"] == 50
 
 
-def test_what_needs_torch_says_what_to_install_before_any_work(
+def test_what_needs_torch_shows_what_to_install_before_any_work(
     capture: Path, calibrated: Path, tmp_path: Path
 ):
     mapped = tmp_path / "mapped"
