@@ -63,12 +63,12 @@ def test_help_of_run_names_the_back_ends():
 
 
 def test_names_of_the_first_release_still_work_and_warn(tmp_path: Path):
-    assert jcr.RejectedError is jcr.RejectedError
+    assert jcr.NotTrustedError is jcr.RejectedError
     with (
         pytest.warns(DeprecationWarning, match="images"),
         pytest.raises(jcr.InputError, match="holds no run"),
     ):
-        jcr.add_camera(tmp_path, "overhead", images="overhead.png")
+        jcr.add_camera(tmp_path, "overhead", pictures="overhead.png")
     with pytest.raises(jcr.InputError, match="overhead: no images"):
         jcr.add_camera(tmp_path, "overhead")
     with (
@@ -133,7 +133,7 @@ def test_a_png_holds_the_same_pixels(
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"mapp": None}, "RunOptions: no option 'mapp'; did you mean map?"),
         ({"calibrate": {"reqire": (1, 1)}}, "CalibrateOptions: no option 'reqire'; did you mean require?"),

@@ -141,7 +141,7 @@ def test_float32_stays_float32():
     np.testing.assert_allclose(project(NORMALIZED, x), x[:, :2])
 
 
-@pytest.mark.parametrize("lens", [WIDE, BARREL, PINCUSHION, FOLDING])
+@pytest.mark.parametrize("intrinsics", [WIDE, BARREL, PINCUSHION, FOLDING])
 def test_distortion_is_opencvs(intrinsics: Intrinsics) -> None:
     x = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
     points = np.concatenate([x, np.ones((200, 1))], axis=1)
@@ -151,7 +151,7 @@ def test_distortion_is_opencvs(intrinsics: Intrinsics) -> None:
     np.testing.assert_allclose(project(intrinsics, points), expected[:, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("lens", [WIDE, BARREL, PINCUSHION])
+@pytest.mark.parametrize("intrinsics", [WIDE, BARREL, PINCUSHION])
 def test_every_pixel_of_the_frame_has_its_ray(intrinsics: Intrinsics) -> None:
     u, v = np.meshgrid(
         np.linspace(-0.5, intrinsics.width - 0.5, 33), np.linspace(-0.5, intrinsics.height - 0.5, 25)
@@ -186,7 +186,7 @@ def test_a_frame_wider_than_the_model_reaches_counts_as_folded() -> None:
     assert fold_distance_px(intrinsics) is not None
 
 
-@pytest.mark.parametrize("lens", [WIDE, BARREL, PINCUSHION])
+@pytest.mark.parametrize("intrinsics", [WIDE, BARREL, PINCUSHION])
 def test_pinhole_grid_stays_inside_the_frame_and_touches_it(intrinsics: Intrinsics) -> None:
     pinhole = pinhole_inside(intrinsics, 320)
     assert max(pinhole.width, pinhole.height) == 320

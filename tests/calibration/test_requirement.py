@@ -204,7 +204,7 @@ def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         (CalibrateOptions(require=(-1.0, 2.0)), "--require -1 2: give two positive numbers"),
         (

@@ -23,7 +23,7 @@ FISHEYE = Intrinsics(260.0, 261.0, 318.0, 241.0, *SIZE, (-0.01, 0.02, -0.01, 0.0
 CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1, -0.2, 1e-3, 2e-3, 0.05))]
 
 
-@pytest.mark.parametrize("lens", CAMERAS)
+@pytest.mark.parametrize("intrinsics", CAMERAS)
 def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
     intrinsics: Intrinsics, tmp_path: Path
 ):
@@ -40,7 +40,7 @@ def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
     assert IntrinsicsAndStd.model_validate_json(file.model_dump_json()).record() == intrinsics
 
 
-@pytest.mark.parametrize("lens", CAMERAS)
+@pytest.mark.parametrize("intrinsics", CAMERAS)
 def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 

@@ -425,7 +425,7 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
     assert [image.image for image in found.images] == list(front.images)
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("rotated", [False, True])
 def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, rotated: bool):
     """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board turned by 180°."""
     rng = np.random.default_rng(3)
@@ -518,7 +518,7 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
 
 
 @pytest.mark.parametrize(
-    ("camera", "says"),
+    ("camera", "message"),
     [
         ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
         ({"mount": "base", "images": []}, "no images"),

@@ -200,7 +200,7 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "message"),
     [
         ("chessboard:8x5:25", "30 mm is 0.030"),
         ("chessboard:8x6:0.025", "a rotation by 180°"),

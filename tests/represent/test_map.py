@@ -363,7 +363,7 @@ def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: 
 
 
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("points", "message"),
     [
         (np.zeros(3), r"\(n, 3\)"),
         (np.zeros((4, 2)), r"\(n, 3\)"),
