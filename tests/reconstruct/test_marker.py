@@ -244,7 +244,7 @@ DATA = SHARED / "data"
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the real captures are not beside this checkout")
 @pytest.mark.parametrize(
-    ("name", "spec", "limit_mm", "limit_deg", "trusted"),
+    ("name", "spec", "limit_mm", "limit_deg", "accepted"),
     [
         ("doosan_bench", "charuco:7x5:0.030:0.022:DICT_4X4_50", 1.0, 0.2, True),
         # The robot's motion excludes the size of the squares with which the reference was made.
