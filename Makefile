@@ -17,8 +17,10 @@ env: .venv/ready
 demo: .venv/ready
 	$(BIN)/python examples/demo.py $(BACKEND)
 
-# Files in the order of tests/conftest.py, the slowest first.
+# Files in the order of tests/conftest.py, slow ones first.
 TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
+# Where bytecode is not kept, each of the many processes that tests start compiles all of jcr: a second, half of a start.
+test test-fast test-lowest: export PYTHONDONTWRITEBYTECODE :=
 
 test: .venv/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_WORKERS)
