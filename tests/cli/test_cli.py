@@ -177,6 +177,7 @@ def test_check_finds_the_bundled_capture_good_and_a_planted_mistake_bad(tabletop
     shutil.copytree(tabletop, tmp_path / "bad")
     file = tmp_path / "bad" / "capture.json"
     content = json.loads(file.read_text())
+    content["frames"] = content["frames"][:6]
     for frame in content["frames"]:
         frame["base_from_gripper"] = np.linalg.inv(frame["base_from_gripper"]).tolist()
     file.write_text(json.dumps(content))
