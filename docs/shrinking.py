@@ -1,4 +1,4 @@
-"""Draws shrinking.svg, the moving drawing of the README: `python docs/shrinking.py` feeds examples/tabletop image by image.
+"""Draws shrinking.svg, the moving drawing of the README: `python docs/shrinking.py` calibrates image by image.
 
 Left the image that has just been taken; right the accuracy that the calibration states after it, of a point that the
 camera sees: 95 % of errors are smaller. Without animation it shows the last state.
@@ -92,7 +92,8 @@ def drawing(found: list[tuple[str, float, float]]) -> str:
         last = 1 if k == count - 1 else 0
         now = shown_during(k, k + 1, count)
         parts.append(
-            f'<image x="20" y="30" width="{PHOTO[0]}" height="{PHOTO[1]}" opacity="{last}" href="{photo(name)}">{now}</image>'
+            f'<image x="20" y="30" width="{PHOTO[0]}" height="{PHOTO[1]}" opacity="{last}" '
+            f'href="{photo(name)}">{now}</image>'
         )
         words = f"{mm:.2g} mm, {deg:.2g}°" if math.isfinite(mm) else "too few images"
         parts.append(
