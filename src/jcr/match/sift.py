@@ -111,8 +111,11 @@ class SiftFeatures:
             kept.keep_features(row, self._size, found)
         return found
 
-    def matches(self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"]) -> list[Int[ndarray, "_ 2"]]:
-        """Rows of the keypoints that match, of each pair; the rotations of the images (rad) change nothing."""
+    def matches(
+        self, pairs: Sequence[Key], rolls: Float[ndarray, "p 2"], coarse: bool = False
+    ) -> list[Int[ndarray, "_ 2"]]:
+        """Rows of the keypoints that match, of each pair; neither the rotations of the images (rad) nor `coarse` change
+        them."""
 
         def of_pair(key: Key) -> Int[ndarray, "_ 2"]:
             return np.stack(matches(self._descriptors[key[0]], self._descriptors[key[1]]), 1)
