@@ -6,6 +6,7 @@ published; for XFeat its authors' smaller one. The state dict has the published 
 
 import math
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -90,6 +91,10 @@ class _Assignment(nn.Module):
         has_match = F.logsigmoid(self.matchability(x0)) + F.logsigmoid(self.matchability(x1)).T
         return alike.log_softmax(1) + alike.log_softmax(0) + has_match
 
+    def probability_of_match(self, x: Tensor) -> Float[Tensor, " k"]:
+        """That a keypoint has a match at all."""
+        return self.matchability(x)[:, 0].sigmoid()
+
 
 class _Confidence(nn.Module):
     def __init__(self, width: int) -> None:
@@ -154,15 +159,14 @@ class LightGlue(nn.Module):
             unsure = [self._unsure(side, last) for side in sides] if self._ends_early else None
             if unsure is not None and sum(int(of.sum()) for of in unsure) < (1 - CONFIDENT) * count:
                 break
-            matchable = [
-                self.log_assignment[last].matchability(side.x)[:, 0].sigmoid() > self._least_matchable
-                for side in sides
-            ]
+            assignment = cast(_Assignment, self.log_assignment[last])
+            matchable = [assignment.probability_of_match(side.x) > self._least_matchable for side in sides]
             kept = matchable if unsure is None else [a | b for a, b in zip(matchable, unsure, strict=True)]
             sides = [side.only(of) for side, of in zip(sides, kept, strict=True)]
-        score, match = (assignment := self.log_assignment[last](sides[0].x, sides[1].x)).max(1)
+        likely = self.log_assignment[last](sides[0].x, sides[1].x)
+        score, match = likely.max(1)
         row = torch.arange(len(score))
-        mutual = (assignment.argmax(0)[match] == row) & (score > math.log(LEAST_SCORE))
+        mutual = (likely.argmax(0)[match] == row) & (score > math.log(LEAST_SCORE))
         return torch.stack([sides[0].row[row[mutual]], sides[1].row[match[mutual]]], 1), score[mutual].exp()
 
     def _unsure(self, side: "_Side", layer: int) -> Bool[Tensor, " k"]:
