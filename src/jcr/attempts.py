@@ -206,8 +206,9 @@ def choose(
     as one `needs_another`; where SIFT finds features in plenty, none that does not test the camera as these do, for
     what they reject it would accept unseen, and where these register nearly all images no other features. Of two
     results an accepted one is kept, else the one with the smaller leave-one-out error. `chosen` gets the
-    reconstruction as soon as it is sure that the run keeps it. `depth_options` are for a known length. Raises InputError as the back end does, and where gripper poses and joint angles contradict
-    each other; NothingFoundError where no back end gave anything.
+    reconstruction as soon as it is sure that the run keeps it. `depth_options` are for a known length. Raises
+    InputError as the back end does, and where gripper poses and joint angles contradict each other; NothingFoundError
+    where no back end gave anything.
     """
     robot_errors(capture, calibrate_options)  # refuses before the images cost time
     depth_options = depth_options or DepthOptions()
