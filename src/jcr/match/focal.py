@@ -37,28 +37,28 @@ def focal_by_robot(
     best, support = None, LEAST_SUPPORT
     for factor in LADDER:
         focal = float(factor * max(size))
-        lens = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-        readings = [_rotations(x_px, lens, key, geometry) for key, geometry in known]
+        intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+        readings = [_rotations(x_px, intrinsics, key, geometry) for key, geometry in known]
         of_pair = np.repeat(np.arange(len(known)), np.array([len(one) for one in readings], int))
         rotations = np.array([rotation for one in readings for rotation in one]).reshape(-1, 3, 3)
         gap = np.full(len(known), np.inf)
         np.minimum.at(gap, of_pair, np.abs(rotation_angle(rotations) - of_gripper[of_pair]))
         agreeing = float(np.exp(-0.5 * (gap / TOLERANCE) ** 2).sum())
         if agreeing > support:
-            best, support = lens, agreeing
+            best, support = intrinsics, agreeing
     return best
 
 
 def _rotations(
     x_px: list[Float[ndarray, "_ 2"]],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     key: Key,
     geometry: pycolmap.TwoViewGeometry,
 ) -> list[Float[ndarray, "3 3"]]:
     """Rotations that a geometry may mean."""
     rows = np.asarray(geometry.inlier_matches, dtype=int)[:MATCHES]
-    essential, homography = matrices(geometry, lens)
-    view = View.of([x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]], lens)
+    essential, homography = matrices(geometry, intrinsics)
+    view = View.of([x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]], intrinsics)
     found = []
     if homography is not None:
         count, rotations, _, normals = cv2.decomposeHomographyMat(homography, np.eye(3))

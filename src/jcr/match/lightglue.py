@@ -28,7 +28,7 @@ class _SelfAttention(nn.Module):
 
     def forward(self, x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
         q, k, v = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(0, 1).unbind(-1)
-        q, k = (of * cosine + _quarter_turn(of) * sine for of in (q, k))
+        q, k = (of * cosine + _quarter_rotation(of) * sine for of in (q, k))
         message = _attention(q, k, v)
         return x + self.ffn(torch.cat([x, self.out_proj(message.transpose(0, 1).flatten(1))], -1))
 
@@ -192,7 +192,7 @@ def _feed_forward(width: int) -> nn.Sequential:
     )
 
 
-def _quarter_turn(x: Tensor) -> Tensor:
+def _quarter_rotation(x: Tensor) -> Tensor:
     """Neighbouring channels as coordinates of a plane, rotated by 90°."""
     a, b = x.unflatten(-1, (-1, 2)).unbind(-1)
     return torch.stack([-b, a], -1).flatten(-2)

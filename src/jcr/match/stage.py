@@ -50,7 +50,7 @@ class Matched:
     """Those that a mapper may believe."""
     gate: Gate | None
     """None where the robot poses were not used."""
-    lens: Intrinsics
+    intrinsics: Intrinsics
     """At the working size: given, or as the robot and the images have it."""
     upright: Float[ndarray, " n"] | None = None
     """Angles (rad) by which the images were rotated, once X's rotation was known."""
@@ -74,7 +74,7 @@ class _Search:
     pairs: dict[Key, Pair] = field(default_factory=dict)
     still: Bool[ndarray, "r c"] | None = None
     """Parts of the image that do not move."""
-    turns: dict[Key, tuple[float, float]] = field(default_factory=dict)
+    rotations: dict[Key, tuple[float, float]] = field(default_factory=dict)
     """Angles (rad) by which the images of each pair were rotated."""
     tried: set[tuple[int, int, int, int, bool]] = field(default_factory=set)
     """Pairs, the angles (degrees) by which their images were rotated, and whether of the best keypoints alone."""
@@ -103,15 +103,15 @@ class _Search:
         as they matched."""
         few = [key for key in pairs if key not in self.pairs or len(self.pairs[key].rows) < ENOUGH]
         self._match_rotated(
-            {(i, j): self.turns[i, j] if rolls is None else (rolls[i], rolls[j]) for i, j in few}, False
+            {(i, j): self.rotations[i, j] if rolls is None else (rolls[i], rolls[j]) for i, j in few}, False
         )
 
-    def _match_rotated(self, turns: dict[Key, tuple[float, float]], coarse: bool) -> None:
+    def _match_rotated(self, rotations: dict[Key, tuple[float, float]], coarse: bool) -> None:
         """Match pairs, the images of each rotated by two angles (rad)."""
         if not self.matcher.minds_roll:
-            turns, coarse = dict.fromkeys(turns, (0.0, 0.0)), False
+            rotations, coarse = dict.fromkeys(rotations, (0.0, 0.0)), False
         todo = {}
-        for key, both in turns.items():
+        for key, both in rotations.items():
             both = robot.by_quarters(both[0]), robot.by_quarters(both[1])
             how = (*key, round(math.degrees(both[0])), round(math.degrees(both[1])), coarse)
             if how not in self.tried:
@@ -121,21 +121,21 @@ class _Search:
             return
         found = self.matcher.geometries(list(todo), np.array(list(todo.values())), coarse)
         if self.matcher.minds_roll:  # an image that is rotated brings keypoints of its own
-            self.view = View.of(self.matcher.x_px, self.view.lens)
+            self.view = View.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             clean = self._seen(key, geometry)
             if clean is None:
                 continue
             pair = pair_of(self.view, *key, clean)
             if key not in self.geometries or self._better(pair, self.pairs[key]):
-                self.geometries[key], self.pairs[key], self.turns[key] = clean, pair, todo[key]
+                self.geometries[key], self.pairs[key], self.rotations[key] = clean, pair, todo[key]
 
     def hide_still_parts(self) -> None:
         """Take out what does not move in the image while the gripper does; pairs are verified again without it."""
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
         way = np.linalg.norm(self.motion[..., :3, 3], axis=-1)
         moving = [key for key in self.matcher.raw if angle[key] > STILL[1] or way[key] > STILL[0]]
-        size = self.view.lens.width, self.view.lens.height
+        size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.matcher.x_px, self.matcher.raw, size, moving)
         if not still.any():
             return
@@ -208,7 +208,7 @@ class _Search:
 def match_with_robot(
     matcher: Matcher,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     known: bool,
     names: Sequence[str],
     original: tuple[int, int],
@@ -223,24 +223,24 @@ def match_with_robot(
     n = len(base_from_gripper)
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
+    search = _Search(matcher, motion, View.of(matcher.x_px, intrinsics), known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not matcher.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     search.match([key for key in first if not matcher.minds_roll or angle[key] < AS_TAKEN])
     search.hide_still_parts()
     report(0.3)
-    found = _with_lens(search, lens)
+    found = _with_intrinsics(search, intrinsics)
     if found.of_x is None and matcher.minds_roll:
         found = _guessed(search, everything, angle, found)
     report(0.5)
     if found.of_x is None:
         search.match(everything)
-        found = _with_lens(search, lens)
+        found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
         search.match_in_full(list(search.geometries))
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.lens, None, search.still, notes)
+        return Matched(search.geometries, None, search.view.intrinsics, None, search.still, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     found = _upright(search, seen_in_common(search.view, found, motion) or everything, upright, found)
     report(0.8)
@@ -257,7 +257,7 @@ def match_with_robot(
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.lens, upright, search.still, notes, warnings)
+    return Matched(kept, found, search.view.intrinsics, upright, search.still, notes, warnings)
 
 
 def _upright(search: _Search, pairs: Sequence[Key], upright: Float[ndarray, " n"], found: Gate) -> Gate:
@@ -273,14 +273,14 @@ def _without_partners(found: Gate, count: int) -> set[int]:
     return set(np.flatnonzero(np.bincount(rows, minlength=count) < 2).tolist())
 
 
-def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
+def _with_intrinsics(search: _Search, guess: Intrinsics) -> Gate:
     """The gate through the intrinsics that are known, or else through those by which most pairs agree with the robot."""
     if search.known:
         return search.gate()
     size = guess.width, guess.height
-    lens = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
-    if lens is not None:
-        search.view = View.of(search.matcher.x_px, lens)
+    intrinsics = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
+    if intrinsics is not None:
+        search.view = View.of(search.matcher.x_px, intrinsics)
         search.pairs = {key: pair_of(search.view, *key, found) for key, found in search.geometries.items()}
     return search.gate()
 
@@ -347,7 +347,7 @@ def _wrong_poses(stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
 
 def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:
     """What is left out of the matches because it does not move with the scene."""
-    notes, size = [], (search.view.lens.width, search.view.lens.height)
+    notes, size = [], (search.view.intrinsics.width, search.view.intrinsics.height)
     if search.still is not None:
         place = still_in_words(search.still, size, original)
         notes.append(
