@@ -244,8 +244,8 @@ def map_incrementally(
 ) -> pycolmap.Reconstruction | None:
     """The model with most images over all starting cameras; with relaxed demands if that is below three.
 
-    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it falls
-    back where another start is tried.
+    A model that is `begun` is resumed with the images that it lacks. The share of images in the model is reported; it
+    falls back where another start is tried.
     """
     pipeline = pipeline_options(known, seed)
     if n_images > _MANY:
