@@ -5,7 +5,7 @@ import numpy as np
 from jcr.live.arm_words import ArmWords, pose_lines
 from jcr.live.asks import Answer
 from jcr.live.calibration_progress import Progress, Reached
-from jcr.records import Kind
+from jcr.records import Finding, Kind
 from jcr.records.findings import without_consequences
 from jcr.records.words import remedy, sentence, text
 from jcr.rounding import significant
@@ -29,15 +29,21 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
             f"  {proof.images} images that take no part are off by {significant(proof.translation_mm)} mm and "
             f"{significant(proof.rotation_deg)}° (rms), {verdict}"
         )
-    lines += [
-        f"  {sentence(one)}"
-        for one in without_consequences(state.findings)
-        if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
-    ]
+    lines += [f"  {sentence(one)}" for one in faults(state)]
     if state.next_pose is not None:
         lines.append(f"next: {next_sentence(state)}")
         lines += [f"  {line}" for line in next_lines(state, words)]
     return lines
+
+
+def faults(state: Progress) -> list[Finding]:
+    """What is found against the images and the calibration, that of the last image first; not that more images help."""
+    found = [
+        one
+        for one in without_consequences(state.findings)
+        if one.severity != "informs" and one.kind not in (Kind.NOT_EXACT_ENOUGH, Kind.FEW_IMAGES)
+    ]
+    return sorted(found, key=lambda one: one.images != (state.added,))
 
 
 def next_sentence(state: Progress) -> str:

@@ -62,6 +62,7 @@ class LiveFolder:
         if robot is not None:
             self.rest["robot"] = robot
         self._before_session = frozenset(self.names)
+        self._ever = {one.name: one for one in self.images}
         self._next_number = self._first_free_number()
 
     def _resume(self, content: Any) -> None:
@@ -139,6 +140,7 @@ class LiveFolder:
             self._delete(new)
             raise
         self.size = size
+        self._ever[new.name] = new
         self._next_number += 1
         return new.name
 
@@ -161,10 +163,8 @@ class LiveFolder:
 
     def close(self) -> None:
         """Delete the files of images that this session took out of the capture: no change can be undone after."""
-        names = set(self.names)
-        for one in {one.name: one for images in self._earlier for one in images}.values():
-            if one.name not in names:
-                self._delete(one)
+        for name in self._ever.keys() - set(self.names):
+            self._delete(self._ever.pop(name))
         self._earlier.clear()
 
     def _change(self, images: tuple[TakenImage, ...]) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 from jcr.calibration.requirement import GRASPING
 from jcr.live.arm_words import ArmWords
 from jcr.live.calibration_progress import Progress
-from jcr.live.calibration_words import next_lines, next_sentence
+from jcr.live.calibration_words import faults, next_lines, next_sentence
 from jcr.live.collect import LiveCapture, Shown
 from jcr.live.folder import LiveFolder
-from jcr.records import Finding, Intrinsics, Kind
-from jcr.records.findings import without_consequences
+from jcr.records import Finding, Intrinsics
 from jcr.records.words import reached_in_words, sentence
 from jcr.report.figures import course_figure
 from jcr.report.raster import TRACK_COLOR
@@ -53,8 +52,6 @@ class PageState:
     headline: str
     lines: Sequence[str]
     """What is to be known of it, and what is wrong."""
-    at_fault: Sequence[ImageCard]
-    """Images that are to be taken again or removed."""
     replaces: int | None
     """The number of the image in place of which the next one is taken."""
     is_over: bool
@@ -98,7 +95,6 @@ def page_state(shown: Shown, live: LiveFolder, required: tuple[float, float], wo
         kind=kind,
         headline=headline,
         lines=lines,
-        at_fault=[one for one in images if one.fault and one.name == progress.added],
         replaces=None if shown.replaces is None else live.names.index(shown.replaces) + 1,
         is_over=shown.is_over,
         can_undo=live.can_undo or shown.replaces is not None,
@@ -134,14 +130,7 @@ def _of_one(finding: Finding) -> tuple[str, ...]:
 
 def _verdict(shown: Shown, required: tuple[float, float]) -> tuple[str, str, list[str]]:
     """The kind, the headline and the lines below it."""
-    progress = shown.progress
-    wrong = [
-        one
-        for one in without_consequences(progress.findings)
-        if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
-    ]
-    # What is wrong with the last image comes first: it can be taken again now.
-    wrong.sort(key=lambda one: progress.added not in _of_one(one))
+    progress, wrong = shown.progress, faults(shown.progress)
     lines = [_capitalised(sentence(one)) for one in wrong]
     if shown.result is not None:
         verdict = shown.result.verdict
@@ -217,7 +206,7 @@ def _reached(shown: Shown) -> tuple[float, ...]:
 
 def _courses(progress: Progress, required: tuple[float, float]) -> list[Figure]:
     """How exact the calibration was, image by image."""
-    if (history := progress.history) == ():
+    if len(history := progress.history) < 2:
         return []
     count = [one.images for one in history]
     curves = [
