@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -203,9 +204,7 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         Buffer=lambda: SimpleNamespace(lookup_transform=None),
         StaticTransformBroadcaster=lambda node: SimpleNamespace(sendTransform=sent.append, sent=sent),
     )
-    from jcr_ros import node
-
-    return node
+    return import_module("jcr_ros.node")
 
 
 def stamped(pose: ndarray, time_s: float) -> Any:

@@ -148,7 +148,7 @@ class LiveCapture:
     def finish(self) -> "RunResult | None":
         """The calibration of all images; None, with a line that says why, where there is none."""
         if self.shown.result is None and len(self.live.names) >= LEAST_IMAGES:
-            self._show(f"calibrating all {len(self.live.names)} images")
+            self._show(f"calibrating all {len(self.live.names)} images", is_over=True)
             try:
                 self._show("", result=self.calibration.finish())
             except NotTrustedError as error:

@@ -133,7 +133,7 @@ def course_figure(title: str, count: Sequence[int], value: Sequence[float], goal
     wide, tall = WIDTH - left - right, COURSE_HEIGHT - top - bottom
     first, last = count[0], max(count[-1], count[0] + 1)
 
-    def at(images: float, y: float) -> tuple[float, float]:
+    def at(images: int, y: float) -> tuple[float, float]:
         down = float(np.log(high / y) / np.log(high / low))
         return left + wide * (images - first) / (last - first), top + tall * down
 
