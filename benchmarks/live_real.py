@@ -14,7 +14,7 @@ from numpy import ndarray
 from benchmarks.live import cell_of
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import step_between
 from jcr.live.calibration import LiveCalibration
 from jcr.pipeline import calibrate
@@ -133,7 +133,7 @@ def _calibrated(calibration) -> tuple[RunResult | None, float]:
     begun = time.process_time()
     try:
         result = calibration()
-    except NotTrustedError:
+    except RejectedError:
         return None, time.process_time() - begun
     return result, time.process_time() - begun
 

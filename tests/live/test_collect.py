@@ -31,11 +31,11 @@ class Stepped:
     def __init__(self, folder: Path, tabletop: Path, has_gripper: bool = True, **options) -> None:
         self.poses = list(jcr.read_capture(tabletop).base_from_gripper)
         self.tabletop, self.at = tabletop, 0
-        self.told: queue.SimpleQueue[tuple[Answer, list[str]]] = queue.SimpleQueue()
+        self.printed: queue.SimpleQueue[tuple[Answer, list[str]]] = queue.SimpleQueue()
         self.capture, self.scripted = a_capture(
             folder,
             still_frames(lambda: still(tabletop, self.at)),
-            lambda answer, lines: self.told.put((answer, lines)),
+            lambda answer, lines: self.printed.put((answer, lines)),
             (lambda: State(0.0, self.poses[self.at])) if has_gripper else None,
             **options,
         )
@@ -53,7 +53,7 @@ class Stepped:
                     self.at = step
                     yield Ask(self.poses[step])
                 while True:
-                    heard.append(self.told.get(timeout=20))
+                    heard.append(self.printed.get(timeout=20))
                     answer = heard[-1][0]
                     if "calibration" in answer or answer.get("accepted") is False or "retake" in answer:
                         break

@@ -352,15 +352,15 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     refused = subprocess.run(second, capture_output=True, text=True, timeout=60)
     assert refused.returncode == 2 and "another jcr is writing there" in refused.stderr.splitlines()[-1]
     running.send_signal(signal.SIGINT)
-    told = running.communicate(timeout=20)[1]
+    printed = running.communicate(timeout=20)[1]
     client.close()
     assert running.returncode == 130
-    assert told.splitlines()[-1].startswith("error: interrupted") and "Traceback" not in told
+    assert printed.splitlines()[-1].startswith("error: interrupted") and "Traceback" not in printed
 
     running, port = start(out, video(tmp_path / "b.avi", tabletop, range(1, 4)))
     talked = subprocess.run([sys.executable, CLIENT, port], capture_output=True, text=True, timeout=60)
-    told = running.communicate(timeout=20)[1]
-    assert running.returncode == 0, told
+    printed = running.communicate(timeout=20)[1]
+    assert running.returncode == 0, printed
     assert talked.returncode == 0 and talked.stdout.count("images/00") == 3, talked.stdout + talked.stderr
     # From the second image on there is a pose to go to.
     assert "next: [[" in talked.stdout.splitlines()[-1]

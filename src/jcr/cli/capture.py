@@ -91,7 +91,7 @@ def main(arguments: Arguments) -> int:
 
     def tell(answer: "Answer", lines: list[str]) -> None:
         answers.append(answer)
-        _say("\n".join(lines))
+        _print("\n".join(lines))
 
     given = _intrinsics(arguments.intrinsics_from)
     with locked(arguments.out), opened(arguments.camera, arguments.optics) as camera:
@@ -101,7 +101,7 @@ def main(arguments: Arguments) -> int:
         capture = LiveCapture(calibration, camera, options, tell, _words(arguments, live), gripper)
         try:
             with PageServer(capture, arguments.page_port) as page:
-                _say(f"{len(live.names)} images in {arguments.out}; open {page.address} in a browser")
+                _print(f"{len(live.names)} images in {arguments.out}; open {page.address} in a browser")
                 capture.run(_asks(arguments, states, _lines(arguments, capture)))
                 result = capture.finish()
         finally:
@@ -149,13 +149,13 @@ def _lines(arguments: Arguments, capture: "LiveCapture") -> "Iterator[str]":
 
     lines = without_commands(sys.stdin, capture.press)
     if sys.stdin.isatty():
-        _say(HELP)
+        _print(HELP)
     if arguments.poses != "typed":
         threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
     return lines
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
 
@@ -180,16 +180,16 @@ def _asks(arguments: Arguments, states: "States | None", lines: "Iterator[str]")
     from jcr.live.typed import typed_poses
 
     if states is not None:
-        _say(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
+        _print(f"move the arm; an image is taken whenever it rests ({arguments.poses.partition(':')[2]})")
         yield from asks_at_rest(states)
     elif arguments.poses == "typed":
-        yield from typed_poses(lines, _say, arguments.pose_convention, arguments.pose_units)
+        yield from typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
     elif arguments.poses == "tcp":
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
         listen = Listen(host, port, token, arguments.timeout)
         with bound(listen) as server:
-            _say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
+            _print("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
     else:
         raise InputError(f"--poses {arguments.poses}: give ur:HOST, franka:HOST, xarm:HOST, typed or tcp")

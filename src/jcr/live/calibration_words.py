@@ -50,7 +50,7 @@ def next_sentence(state: Progress) -> str:
     """Where the next pose is, and what is expected of the calibration with it."""
     pose = state.next_pose
     assert pose is not None
-    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
     then = f"then {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}° are expected"
     return f"{moved:.0f} mm and {rotated:.0f}° from {state.next_like}; {then}"
 

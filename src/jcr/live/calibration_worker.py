@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.live.calibration_progress import Progress
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class CalibrationWorker:
             self._changed.clear()
             try:
                 self._calibrate()
-            except (InputError, NotTrustedError) as error:
+            except (InputError, RejectedError) as error:
                 self._heard(Failed(str(error)))
             except OSError as error:
                 self._heard(Failed(f"{error.filename or self._calibration.live.folder}: {error.strerror}"))

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from jcr.capture.images import read_image
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.live.arm_words import ArmWords
 from jcr.live.asks import Answer, Ask
 from jcr.live.calibration_progress import Progress
@@ -151,7 +151,7 @@ class LiveCapture:
             self._show(f"calibrating all {len(self.live.names)} images", is_over=True)
             try:
                 self._show("", result=self.calibration.finish())
-            except NotTrustedError as error:
+            except RejectedError as error:
                 self._refuse(f"no calibration: {error}")
         return self.shown.result
 
