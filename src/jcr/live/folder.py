@@ -62,7 +62,7 @@ class LiveFolder:
         if robot is not None:
             self.rest["robot"] = robot
         self._before_session = frozenset(self.names)
-        self._ever = {one.name: one for one in self.images}
+        self._ever: dict[str, TakenImage] = {one.name: one for one in self.images}
         self._next_number = self._first_free_number()
 
     def _resume(self, content: Any) -> None:
