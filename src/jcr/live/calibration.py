@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 HISTORY = "live/history.json"
 """In the folder of the capture: how exact the calibration was after each image."""
-RESULT = "result"
-"""In the folder of the capture: the run folder of the calibration of all images."""
 OBSERVATIONS = 300, 8000
 """An image and in all, that take part while images are taken; what more of them add, the calibration at the end has."""
 FEW = 5
@@ -139,9 +137,10 @@ class LiveCalibration:
         """
         from jcr.pipeline import calibrate
         from jcr.results import RunOptions
+        from jcr.run_folder import LIVE
 
         options = RunOptions(calibrate=self._options)
-        return calibrate(self.live.folder, out or self.live.folder / RESULT, options)
+        return calibrate(self.live.folder, out or self.live.folder / LIVE, options)
 
     def fault(
         self,
