@@ -79,7 +79,7 @@ class Shown:
     """Whether that is why an image was not kept."""
     images: tuple[str, ...] = ()
     replaces: str | None = None
-    """The image in place of which the next one is taken."""
+    """The image that the next one replaces."""
     progress: Progress = Progress(images=())
     """Of the last calibration, which may be of fewer images."""
     is_over: bool = False

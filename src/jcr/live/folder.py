@@ -111,7 +111,7 @@ class LiveFolder:
     ) -> str:
         """Keep an image (RGB) and its pose, and return the image's name; capture.json is whole again after.
 
-        `replaces` is the image in place of which it is taken. `joints` (rad) are kept when all images have them. Raises
+        `replaces` is an image that is taken out for it. `joints` (rad) are kept when all images have them. Raises
         InputError where the image's size is not that of the others, and OSError where it cannot be written: the capture
         is then what it was.
         """

@@ -53,7 +53,7 @@ class PageState:
     lines: Sequence[str]
     """What is to be known of it, and what is wrong."""
     replaces: int | None
-    """The number of the image in place of which the next one is taken."""
+    """The number of the image that the next one replaces."""
     is_over: bool
     can_undo: bool
     tiles: Sequence[Tile]
