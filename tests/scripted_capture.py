@@ -122,4 +122,4 @@ def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:
 def asked(poses: list[ndarray], answers: list[Answer], waits: bool = False) -> Iterator[Ask]:
     """A request at each pose."""
     for pose in poses:
-        yield Ask(pose, answers.append, waits=waits)
+        yield Ask(pose, answer=answers.append, waits=waits)

@@ -202,7 +202,9 @@ class Session:
             return False, "not started, or finished: call ~/start"
         answered: queue.Queue[Answer] = queue.Queue()
         current = lambda: self._state_now().base_from_gripper  # noqa: E731
-        self._asked.put(Ask(state.base_from_gripper, answered.put, current, state.joints))
+        self._asked.put(
+            Ask(state.base_from_gripper, answer=answered.put, current=current, joints=state.joints)
+        )
         try:
             answer = answered.get(timeout=ANSWER_S)
         except queue.Empty:
@@ -260,7 +262,9 @@ class Session:
                 ask.answer(answer)
                 done.set()
 
-            self._asked.put(Ask(ask.base_from_gripper, answered, ask.current, ask.joints))
+            self._asked.put(
+                Ask(ask.base_from_gripper, answer=answered, current=ask.current, joints=ask.joints)
+            )
             done.wait()
 
     def _tell(self, answer: Answer, lines: list[str]) -> None:

@@ -16,11 +16,11 @@ from jcr.geometry import rotation_exp, transform
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ask:
     """The gripper rests here: take an image."""
 
-    base_from_gripper: Float[ndarray, "4 4"]
+    base_from_gripper: Float[ndarray, "4 4"] = field(kw_only=False)
     answer: Callable[[Answer], None] = field(default=lambda answer: None)
     """Is called with the answer, once."""
     current: Callable[[], Float[ndarray, "4 4"]] | None = None

@@ -37,7 +37,7 @@ LEAST_IMAGES = 3
 """Of a calibration."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CollectOptions:
     """How images are taken."""
 

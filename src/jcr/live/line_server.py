@@ -123,7 +123,7 @@ def _served(client: socket.socket, listen: Listen):
                 _answer(client, found)
                 answered.set()
 
-            yield Ask(pose, answer, waits=True)
+            yield Ask(pose, answer=answer, waits=True)
             answered.wait()
 
 

@@ -49,7 +49,7 @@ def asks_at_rest(states: States) -> Iterator[Ask]:
     while True:
         state = _at_rest(states, last, limit)
         # The connection is closed meanwhile: states that wait would be those of where the arm has been.
-        yield Ask(state.base_from_gripper, heard, current, state.joints)
+        yield Ask(state.base_from_gripper, answer=heard, current=current, joints=state.joints)
         last = state.base_from_gripper
 
 
