@@ -313,7 +313,7 @@ BENCHES = {
         HONEST,
         "images until 2 mm and 0.3° are claimed and confirmed, at proposed poses, varied ones, random ones and a grid",
         measures=(*SOLVER, *FEATURES, *LIVE, "src/jcr/simulate"),
-        long="ten scenes instead of one, and up to 40 images instead of 24",
+        long="ten scenes instead of two, and up to 40 images instead of 24",
     ),
     "live_real": Bench(
         "Fed image by image",
