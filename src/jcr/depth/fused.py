@@ -88,9 +88,7 @@ def fused_depth(
 
         support = _support(inverse_depth, matched, recon_from_camera, pinhole)
         even = evened(colors, inverse_depth, matched, views, pinhole)
-        even = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
-        depths = np.where(matched, inverse_depth, 0)[..., None]
-        surfaces = padded(np.concatenate([depths, even], -1))
+        surfaces = _surfaces(np.where(matched, inverse_depth, 0), even)
         report(0.4)
 
         def prior(i: int) -> Prior:
@@ -140,6 +138,14 @@ def _where(there: Bool[ndarray, "m h w"], values: Float[ndarray, "m h w"]) -> Fl
 def _stacked(priors: Sequence[Prior]) -> Prior:
     """Of all images, (m,h,w) each."""
     return Prior(**{one.name: np.stack([getattr(p, one.name) for p in priors]) for one in fields(Prior)})
+
+
+def _surfaces(
+    inverse_depth: Float[ndarray, "m h w"], even: Float[ndarray, "m h w 3"]
+) -> Float[ndarray, "m h _ 4"]:
+    """Inverse depths and colours, these a little smooth, as `colours_agree` takes them."""
+    smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in even]
+    return padded(np.concatenate([inverse_depth[..., None], smooth], -1))
 
 
 def _with_planes(
