@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
 from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.adjust.score_test import freed
@@ -52,7 +52,7 @@ def adjust_wrist(
     """
     x, scale, z = start
     each, systematic = np.arange(len(base_from_gripper)), options.systematic
-    prior = prior_of(intrinsics, HELD) if prior is None else prior
+    prior = prior_of(intrinsics, FIXED) if prior is None else prior
     freedom = Freedom.of((intrinsics,), (prior,), len(each))
     if options.combinations is not None:
         freedom = freed(freedom, options.combinations, each)
