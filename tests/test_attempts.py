@@ -54,7 +54,9 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
     intrinsics = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
     n = observations
-    tracks = Tracks(np.zeros(n, int), np.zeros((n, 2)), np.arange(n), np.zeros((n, 3)))
+    tracks = Tracks(
+        image=np.zeros(n, int), x_px=np.zeros((n, 2)), point=np.arange(n), points_in_recon=np.zeros((n, 3))
+    )
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
@@ -79,7 +81,9 @@ def without_surface(capture: Capture, made: Reconstruction, *_: object, **__: ob
 
 def capture_of(problem: HandEyeProblem) -> Capture:
     names = tuple(f"{k:02d}.png" for k in range(len(problem.base_from_gripper)))
-    return Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    return Capture(
+        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
+    )
 
 
 def chosen(problem: HandEyeProblem, poses: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> HandEye:
@@ -265,7 +269,7 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     kept, tried = auto_result(problem, {"sift": RejectedError("0 of 8"), "xfeat": good}, monkeypatch)
     assert tried == ["colmap", "colmap"]
     assert "colmap with sift failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
-    # Two that fail, and a third that does not: all three are told.
+    # Two that fail, and a third that does not: all three are named.
     refused = RejectedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
     assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
@@ -387,7 +391,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
     assert made == ["colmap"]
-    # Where there is no choice, the reconstruction is kept before it is calibrated: mended options find it there.
+    # Where there is no choice, the reconstruction is kept before it is calibrated: corrected options find it there.
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     kept = RunFolder(tmp_path / "colmap").reconstruction()
@@ -416,7 +420,9 @@ def test_a_known_length_ends_on_surfaces_and_nothing_else_needs_depth_before_the
     )
     monkeypatch.setattr(attempts, "densify", deeper)
     names = tuple(f"{k:02d}.png" for k in range(8))
-    capture = Capture(Path(), names, problem.base_from_gripper, (640, 480))
+    capture = Capture(
+        folder=Path(), images=names, base_from_gripper=problem.base_from_gripper, image_size=(640, 480)
+    )
     chosen = []
     choice = attempts.choose(
         capture, ReconstructOptions(), CalibrateOptions(), None, lambda made: chosen.append(made)
@@ -506,7 +512,7 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_repo
     why = next(text for text in found["notes"] if text.startswith("back end dust3r"))
     assert "colmap" in why and ("rejected" in why or "failed" in why)
     assert why in (out / "log.txt").read_text()
-    # Its own answer, asked for by name, is not trusted.
+    # Its own answer, asked for by name, is rejected.
     assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3
     found = json.loads((out / "calibration.json").read_text())
     assert found["backend"] == "dust3r" and not found["converged"]

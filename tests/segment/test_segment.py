@@ -91,13 +91,13 @@ def cloud_of(
     x = apply(base_from_table, x + rng.normal(0, noise, x.shape))
     n = len(x)
     return PointCloud(
-        x,
-        np.zeros((n, 3), np.uint8),
-        np.ones(n),
-        np.zeros(n),
-        np.zeros(n, int),
-        rng.integers(IMAGES, size=n),
-        apply(base_from_table, EYES),
+        points_in_base=x,
+        color=np.zeros((n, 3), np.uint8),
+        confidence=np.ones(n),
+        margin=np.zeros(n),
+        label=np.zeros(n, int),
+        image=rng.integers(IMAGES, size=n),
+        camera_centers_in_base=apply(base_from_table, EYES),
     )
 
 
@@ -217,7 +217,7 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
 
 
 def test_the_height_of_a_can_is_its_rims_and_not_its_sunk_lids(rng: np.random.Generator):
-    """A lid 3 mm below a rim of 6 mm, of which depth makes a slope; a tilted lid without one is no can."""
+    """A lid 3 mm below a rim of 6 mm that depth makes a slope; a tilted lid without one is no can."""
     flat = box(rng, (0.07, 0.07, 0.1))
     lid = flat[:, 2] > 0.0999
     inward = np.abs(flat[:, :2]).max(1) < 0.029
@@ -299,7 +299,11 @@ PINHOLE = Intrinsics(60.0, 60.0, 19.5, 14.5, 40, 30)
 
 def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capture, Reconstruction]:
     capture = Capture(
-        folder, ("images/a.png", "images/b.png"), np.stack([np.eye(4)] * 2), (80, 60), INTRINSICS
+        folder=folder,
+        images=("images/a.png", "images/b.png"),
+        base_from_gripper=np.stack([np.eye(4)] * 2),
+        image_size=(80, 60),
+        intrinsics=INTRINSICS,
     )
     m = len(rows)
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
@@ -308,7 +312,12 @@ def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capt
         image_index=np.array(rows),
         recon_from_camera=np.stack([np.eye(4)] * m),
         intrinsics=INTRINSICS,
-        tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
+        tracks=Tracks(
+            image=np.zeros(0, int),
+            x_px=np.zeros((0, 2)),
+            point=np.zeros(0, int),
+            points_in_recon=np.zeros((0, 3)),
+        ),
         backend="colmap",
         pointmaps=Pointmaps(
             intrinsics=PINHOLE,
@@ -342,7 +351,7 @@ def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_pa
     capture, reconstruction = labelled_capture(tmp_path)
     for name in "ab":
         spot = np.zeros((60, 80), np.uint8)
-        # Where the lens puts the ray of the grid's pixel (35, 15).
+        # Where the camera model puts the ray of the grid's pixel (35, 15).
         ray = np.array([[(35 - PINHOLE.cx) / PINHOLE.fx, (15 - PINHOLE.cy) / PINHOLE.fy, 1.0]])
         x, y = cv2.projectPoints(
             ray, np.zeros(3), np.zeros(3), INTRINSICS.matrix, np.array(INTRINSICS.distortion)

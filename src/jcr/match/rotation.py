@@ -19,7 +19,7 @@ LEAST_ACROSS = 0.25
 ROUNDS = 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RotationOfX:
     """gripper_from_camera's rotation, how sure it is, and which pairs say so."""
 
@@ -90,7 +90,7 @@ def _refined(
         agreeing = np.linalg.norm(residual, axis=1) < tolerance
         if agreeing.sum() < 3:
             return None
-        # turned → exp(w) turned exp(-w): the residual, in the axes after turned, changes by (turnedᵀ − I) w.
+        # rotated → exp(w) rotated exp(-w): the residual, in the axes after rotated, changes by (rotatedᵀ − I) w.
         jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
         w = np.where(agreeing, weight / (1 + (2 * np.linalg.norm(residual, axis=1) / tolerance) ** 2), 0.0)
         information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
@@ -103,7 +103,13 @@ def _refined(
     sigma = max(1.48 * float(np.median(gap[agreeing])) / np.sqrt(3), np.radians(0.02))
     if np.linalg.eigvalsh(information)[0] < LEAST_ACROSS**2 * 0.1:
         return None
-    return RotationOfX(x, sigma**2 * np.linalg.inv(information), agreeing, gap, sigma)
+    return RotationOfX(
+        rotation=x,
+        covariance=sigma**2 * np.linalg.inv(information),
+        agreeing=agreeing,
+        residual=gap,
+        sigma=sigma,
+    )
 
 
 def _gap(

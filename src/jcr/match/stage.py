@@ -40,7 +40,7 @@ GUESSED_AT_ONCE = 6
 GUESSED_AT_MOST = 30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Matched:
     """What matching found."""
 
@@ -59,7 +59,7 @@ class Matched:
     """As those of records.Reconstruction."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Search:
     """What is known while pairs are matched."""
 
@@ -171,7 +171,7 @@ class _Search:
     def _better(self, new: Pair, old: Pair) -> bool:
         """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
         first, second = (self._agrees(pair) for pair in (new, old))
-        # The later one is of images turned upright, whose keypoints all pairs share.
+        # The later one is of images rotated upright, whose keypoints all pairs share.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def _agrees(self, pair: Pair) -> bool:
@@ -201,7 +201,7 @@ def match_with_robot(
     n = len(base_from_gripper)
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher, motion, View.of(matcher.x_px, intrinsics), known)
+    search = _Search(matcher=matcher, motion=motion, view=View.of(matcher.x_px, intrinsics), known=known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not matcher.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
@@ -217,7 +217,14 @@ def match_with_robot(
         found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.intrinsics, None, search.still, notes)
+        return Matched(
+            geometries=search.geometries,
+            gate=None,
+            intrinsics=search.view.intrinsics,
+            upright=None,
+            still=search.still,
+            notes=notes,
+        )
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     search.match(seen_in_common(search.view, found, motion) or everything, upright)
     found = search.gate(found)
@@ -230,13 +237,21 @@ def match_with_robot(
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
     believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
     if known:
-        # Of a pair that cannot say how it turns, only what the known rotation explains would be right.
+        # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
         believed -= {pair.key for pair in found.undecided}
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.intrinsics, upright, search.still, notes, warnings)
+    return Matched(
+        geometries=kept,
+        gate=found,
+        intrinsics=search.view.intrinsics,
+        upright=upright,
+        still=search.still,
+        notes=notes,
+        warnings=warnings,
+    )
 
 
 def _without_partners(found: Gate, count: int) -> set[int]:
@@ -278,7 +293,7 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
     suspects = {row for pair in found.contradicted for row in pair.key} - confirmed
     stale = set()
     for row in sorted(suspects):
-        # By how much the gripper would have to be turned for each pair; sound pairs ask for the same.
+        # By how much the gripper would have to be rotated for each pair; sound pairs ask for the same.
         corrections = []
         for pair in found.contradicted:
             if row not in pair.key or not (set(pair.key) - {row}) & confirmed:

@@ -8,7 +8,7 @@ from numpy import ndarray
 from jcr.records.capture import Intrinsics
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tracks:
     """Observations of common 3D points, for bundle adjustment, whatever back end made them."""
 
