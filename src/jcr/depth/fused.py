@@ -190,10 +190,10 @@ def _support(
     pinhole: Intrinsics,
 ) -> Float[ndarray, "4"]:
     """The plane of most matched points, in the recon frame."""
-    direction = rays(pinhole)
-    x_in_recon = [
-        apply(pose, (direction / depth[..., None].astype(float))[there][::10])
-        for pose, depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True)
-    ]
+    direction = rays(pinhole).reshape(-1, 3)
+    x_in_recon = []
+    for pose, per_depth, there in zip(recon_from_camera, inverse_depth, matched, strict=True):
+        some = np.flatnonzero(there)[::10]
+        x_in_recon.append(apply(pose, direction[some] / per_depth.ravel()[some, None].astype(float)))
     tolerance = 0.004 / float(np.median(inverse_depth[matched]))
     return support_plane(np.concatenate(x_in_recon), tolerance)

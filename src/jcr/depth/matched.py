@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy import ndarray
 
 from jcr.camera import rays, resized
 from jcr.depth.patch_match import UNKNOWN, best_neighbours, peaks, random_planes, spread_planes
-from jcr.depth.window import PAD, blocks_of, continued, quads, windows
+from jcr.depth.window import PAD, blocks_of, continued, floats_of_windows, quads, windows
 from jcr.geometry import inverse
 from jcr.records import Intrinsics
 
@@ -81,13 +82,17 @@ class _Level:
         return cls(pinhole, np.stack(fitting), np.stack(greys), np.stack(packed))
 
     def views(
-        self, i: int, others: Int[ndarray, " n"], recon_from_camera: Float[ndarray, "m 4 4"]
+        self,
+        i: int,
+        others: Int[ndarray, " n"],
+        recon_from_camera: Float[ndarray, "m 4 4"],
+        space: Float[ndarray, " _"],
     ) -> tuple[ndarray, ndarray, ndarray, tuple[np.float32, ...]]:
-        """`packed`, `motions`, `windows` and k of image i, as the loops take them."""
+        """`packed`, `motions`, `windows` (written to `space`) and k of image i, as the loops take them."""
         near = relative(i, others, recon_from_camera, self.pinhole)
         motions = np.concatenate([near.a.reshape(-1, 9), near.b], 1)
         k = tuple(grid(self.pinhole))  # of numbers, that the loops keep in registers
-        return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i])), k
+        return self.packed[others], motions, windows(continued(self.colors[i], self.greys[i]), space), k
 
     def enlarged(self, map_of_half: ndarray) -> ndarray:
         """A map of the level below, each number for the pixels that it covers here."""
@@ -114,6 +119,9 @@ def match_depth(
     half = _Level.of(colors, resized(pinhole, pinhole.width // 2, pinhole.height // 2))
     full = _Level.of(colors, pinhole)
     h, w = half.greys.shape[1:]
+    spaces = SimpleQueue[ndarray]()
+    for _ in range(threads):
+        spaces.put(np.empty(floats_of_windows(*full.greys.shape[1:]), np.float32))
 
     def one(i: int) -> tuple[Float[ndarray, "h w"], Float[ndarray, "h w"]]:
         others, seed = neighbours[i][:COMPARED], 100 * i
@@ -121,7 +129,8 @@ def match_depth(
         reach = np.einsum("di,hwi->dhw", family, rays(half.pinhole))
         span = max(float(reach.min()), LEAST * float(reach.max())), float(reach.max())
 
-        views = half.views(i, others, recon_from_camera)
+        space = spaces.get()
+        views = half.views(i, others, recon_from_camera, space)
         found = random_planes(family, span, views[-1], h, blocks_of(w), i)
         asked = np.empty((len(others), *found.shape[1:]), np.uint8)
         asked[:] = np.arange(len(others))[:, None, None]
@@ -130,11 +139,12 @@ def match_depth(
         asked = best_neighbours(found, asked, *views, ASKED)
         found, asked = full.enlarged(found), full.enlarged(asked)
 
-        views = full.views(i, others, recon_from_camera)
+        views = full.views(i, others, recon_from_camera, space)
         found[3] = UNKNOWN
         for n, (size, tries) in enumerate(_FINE):
             spread_planes(found, asked, *views, (*span, size, tries, n == 0), seed + n)
         depth = peaks(found, asked, *views, np.float32(_PEAK))
+        spaces.put(space)
         return np.maximum(depth, np.float32(0.5 * span[0]))[:, : pinhole.width], found[3, :, : pinhole.width]
 
     depths, correlations = [], []

@@ -26,8 +26,10 @@ BEST = 2
 """Neighbours whose correlations count at a pixel; the worse ones are taken to be occluded."""
 UNKNOWN = -2.0
 """Score of a plane that has not been compared."""
-_PASSED, _BESIDE = 3, 3
-"""Planes that a pixel is passed from the row before: its own column's, and the best of so many to either side."""
+_PASSED = 3
+"""Planes that a pixel is passed from the row before: its own column's, and the best of those to either side."""
+_BESIDE = 3
+"""Columns to either side of which the best plane is passed."""
 
 
 @inlined

@@ -14,7 +14,7 @@ from jcr.represent.rays import Rays, Samples, draw_samples, on_surface
 from jcr.represent.seen import SeenGrid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recipe:
     """What a preset is made of."""
 
@@ -37,9 +37,27 @@ class Recipe:
 
 RECIPES = {
     "default": Recipe(
-        32, 0, ((0, 4), (1, 2)), ((0, 4), (2, 4)), rays=True, layer_rate=3e-2, grid_rate=0.3, look=6, falls=2
+        hidden=32,
+        frequencies=0,
+        grids=((0, 4), (1, 2)),
+        surface_grids=((0, 4), (2, 4)),
+        rays=True,
+        layer_rate=3e-2,
+        grid_rate=0.3,
+        look=6,
+        falls=2,
     ),
-    "paper": Recipe(256, 10, (), (), rays=False, layer_rate=5e-3, grid_rate=0.0, look=100, falls=3),
+    "paper": Recipe(
+        hidden=256,
+        frequencies=10,
+        grids=(),
+        surface_grids=(),
+        rays=False,
+        layer_rate=5e-3,
+        grid_rate=0.0,
+        look=100,
+        falls=3,
+    ),
 }
 BATCH = 6144
 """Rays a step."""
