@@ -29,7 +29,7 @@ UNKNOWN = -2.0
 _PASSED = 3
 """Planes that a pixel is passed from the row before: its own column's, and the best of those to either side."""
 _BESIDE = 3
-"""Columns to either side of which the best plane is passed."""
+"""Columns to either side; the best plane of them is passed."""
 
 
 @inlined
