@@ -65,6 +65,8 @@ from jcr.records.reconstruction import (
     MATCHED,
     NO_DEPTH,
     PRIOR,
+    Boards,
+    Body,
     CameraEvidence,
     Pointmaps,
     Reconstruction,
@@ -134,4 +136,6 @@ __all__ = [
     "strongest_first",
     "verdict_of",
     "without_consequences",
+    "Boards",
+    "Body",
 ]
