@@ -82,7 +82,7 @@ def main(arguments: Arguments) -> int:
     from jcr.live.collect import collect
     from jcr.live.devices import opened
     from jcr.live.folder import LiveFolder
-    from jcr.run_folder import held
+    from jcr.run_folder import locked
 
     options = arguments.collect
     if options.until_accurate and options.require is None:
@@ -95,7 +95,7 @@ def main(arguments: Arguments) -> int:
         _say("\n".join(lines))
 
     given = _intrinsics(arguments.intrinsics_from)
-    with held(arguments.out), opened(arguments.camera, arguments.optics) as camera:
+    with locked(arguments.out), opened(arguments.camera, arguments.optics) as camera:
         live = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
         _say(f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
         calibration = _calibration(live, options)
