@@ -82,7 +82,7 @@ def test_a_sheet_is_found_as_large_and_as_bent_as_it_is(bend_m: float):
 
 
 def test_a_board_makes_cameras_more_certain_and_their_covariance_stays_true():
-    """Images alone, 15 draws: the cameras are as far from the true ones, in units of their covariance, as they may be."""
+    """Images alone, 15 draws: cameras are as far from the true ones, in units of their covariance, as they may be."""
     squared = []
     for seed in range(15):
         rng = np.random.default_rng(seed)

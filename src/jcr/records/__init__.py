@@ -78,6 +78,8 @@ __all__ = [
     "AngleRatio",
     "Assessed",
     "Attempt",
+    "Boards",
+    "Body",
     "BENT",
     "BOTH",
     "Budget",

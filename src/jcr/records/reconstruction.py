@@ -32,6 +32,11 @@ class Boards:
     size_std: float | None
     """Relative standard deviation of the stated size, common to all bodies; None: the size is unknown."""
     bodies: tuple[Body, ...]
+    """Empty where no two images show one."""
+    elsewhere: tuple[int, ...] = ()
+    """Rows of the reconstruction whose images show a body at another place than most do: their corners are left out."""
+    proposed: str | None = None
+    """Where no body was found, the `--board` that the images seem to show; None where they show none."""
 
 
 @dataclass(frozen=True)
