@@ -450,9 +450,10 @@ def _in_order(boards: Boards | None, row_of: Int[ndarray, " m"]) -> Boards | Non
 def candidates(options: ReconstructOptions) -> tuple[BackendName, ...]:
     """What `auto` stands for here, the best first, or the one back end that was asked for.
 
-    An option that only one back end uses selects that one. A network whose weights were named is followed by the
-    best back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for a back end that is not there, for options that select
-    different ones, and for an option that none of the answer uses.
+    An option that only one back end uses selects that one. A network whose weights were named is followed by the best
+    back end that needs none, and one that uses a board beside its features by the board alone. Raises InputError for
+    a back end that is not there, for options that select different ones, and for an option that none of the answer
+    uses.
     """
     given = _given_options(options)
     selecting = [row for row in BACKENDS.values() if row.selected_by in given]

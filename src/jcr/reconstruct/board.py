@@ -59,8 +59,8 @@ def boards(spec: str) -> list[Board]:
     """The readings of a board's name, the literal one first.
 
     A ChArUco board has others: printed by OpenCV before 4.6, with its sides swapped, or with a marker of unknown size.
-    With SIDE in place of the length of a side, and MARKER in place of that of a marker, the unit is the side. Raises InputError on a
-    name that means none, with the forms it may have.
+    With SIDE in place of the length of a side, and MARKER in place of that of a marker, the unit is the side. Raises
+    InputError on a name that means none, with the forms it may have.
     """
     kind, *parts = spec.split(":")
     if MARKER in parts:

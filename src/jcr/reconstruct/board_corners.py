@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from jcr.camera import project, unproject
@@ -151,8 +151,9 @@ def _with_corners(
     """The tracks with what these images show of a body; its corners are further points."""
     points = _triangulated(seen.x_px[images], cameras[images], intrinsics)
     shown = np.isfinite(seen.x_px[images, :, 0]) & np.isfinite(points[:, 0])
-    kept: Bool[ndarray, " c"] = shown.any(0)
-    row = len(tracks.points_in_recon) + np.cumsum(kept) - 1
+    kept = np.flatnonzero(shown.any(0))
+    row = np.zeros(len(points), int)
+    row[kept] = len(tracks.points_in_recon) + np.arange(len(kept))
     image, corner = np.nonzero(shown)
     std = tracks.std_px
     if std is not None:

@@ -60,7 +60,7 @@ def reconstruct_marker(
     if (fold_px := fold_distance_px(intrinsics)) is not None:
         seen = [_within(sightings, intrinsics, fold_px) for sightings in seen]
         notes.append(f"the distortion folds over at {fold_px:.0f} px from the centre: nothing beyond is used")
-    poses = [{s.body: pose for s in sightings if (pose := _pose(s, intrinsics))} for sightings in seen]
+    poses = [{s.body: pose for s in sightings if (pose := pose_of_body(s, intrinsics))} for sightings in seen]
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
@@ -126,7 +126,7 @@ def _within(sightings: Sequence[Sighting], intrinsics: Intrinsics, fold_px: floa
     return [s for s in sightings if np.linalg.norm(s.x_px - centre, axis=1).max() < limit_px]
 
 
-def _pose(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
+def pose_of_body(sighting: Sighting, intrinsics: Intrinsics) -> Pose | None:
     """The body's pose, unless its points lie on a line, miss, or leave open which way it is tilted."""
     x, x_px = sighting.x_in_body, sighting.x_px
     seen, camera = x_px, (intrinsics.matrix, np.array(intrinsics.distortion))
