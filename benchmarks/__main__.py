@@ -134,7 +134,7 @@ def _all(arguments: Arguments) -> int:
 
 def _stale(arguments: Arguments) -> int:
     """Which pages are older than the code that they measure; 1 where one does not say so."""
-    from benchmarks.freshness import PAGES, changed_since_measured, marked, says_it_is_old
+    from benchmarks.freshness import PAGES, changed_since_measured, is_marked_old, marked
     from benchmarks.suite import with_claims
     from jcr.files import write_text
 
@@ -148,7 +148,7 @@ def _stale(arguments: Arguments) -> int:
         lines.append(f"{page.stem}: {f'{len(changed)} files changed since' if changed else 'new'}")
         if arguments.write:
             write_text(page, marked(text, changed))
-        elif bool(changed) is not says_it_is_old(text):
+        elif bool(changed) is not is_marked_old(text):
             silent += 1
             lines[-1] += (
                 f"; the page does {'not say so' if changed else 'say otherwise'}: python -m benchmarks stale --write"

@@ -46,7 +46,7 @@ FEW_STEPS = 3
 """Of adam at the large size, whose 300 take a quarter of an hour."""
 ERRORS = {
     "white 0.3 %, smooth distance 1 %, 2 % outliers (below: these and)": PairErrors(),
-    "pairs rotated by 1° per axis": PairErrors(pair_turn_deg=1.0),
+    "pairs rotated by 1° per axis": PairErrors(pair_rotation_deg=1.0),
     "smooth direction 0.6°": PairErrors(bend=0.01),
     "20 % outliers": PairErrors(outliers=0.2),
     "10 % of the pairs wrong": PairErrors(wrong_pairs=6),
@@ -84,11 +84,11 @@ def camera_errors(
     """Mean distance (mm) and angle (deg) of the cameras from the truth, after the best similarity."""
     base_from_recon, scale = fit_similarity(base_from_camera[:, :3, 3], recon_from_camera[:, :3, 3])
     centers = apply_similarity(base_from_recon, scale, recon_from_camera[:, :3, 3])
-    turn = rotation_between_deg(
+    rotation = rotation_between_deg(
         base_from_recon[:3, :3] @ recon_from_camera[:, :3, :3], base_from_camera[:, :3, :3]
     )
     return 1e3 * float(np.linalg.norm(centers - base_from_camera[:, :3, 3], axis=1).mean()), float(
-        turn.mean()
+        rotation.mean()
     )
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.simulated.faults import LENS, Faults, FaultyCapture, faulty_capture
-from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from benchmarks.simulated.faults import INTRINSICS, Faults, FaultyCapture, faulty_capture
+from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
@@ -65,11 +65,11 @@ CASES = (
     Case("focal length scatters by 1 %", Faults(focal_scatter=0.01), draws=DRAWS),
     Case("by 2 %", Faults(focal_scatter=0.02), draws=DRAWS),
     Case("zoom by 3 % in the second half", Faults(zoom=0.03)),
-    Case("principal point 12 px off in x", Faults(lens=(("cx", 12.0),))),
-    Case("6 px in x and in y", Faults(lens=(("cx", 6.0), ("cy", 6.0)))),
-    Case("k1 of -0.03 ignored", Faults(lens=(("k1", -0.03),))),
-    Case("pixels stretched by 5 % in x", Faults(lens=(("fx", 31.0),))),
-    Case("fx alone 3 % off", Faults(lens=(("fx", -18.6),))),
+    Case("principal point 12 px off in x", Faults(intrinsics=(("cx", 12.0),))),
+    Case("6 px in x and in y", Faults(intrinsics=(("cx", 6.0), ("cy", 6.0)))),
+    Case("k1 of -0.03 ignored", Faults(intrinsics=(("k1", -0.03),))),
+    Case("pixels stretched by 5 % in x", Faults(intrinsics=(("fx", 31.0),))),
+    Case("fx alone 3 % off", Faults(intrinsics=(("fx", -18.6),))),
     Case("rolling shutter, 15 px in x", Faults(rolling_px=15.0)),
     Case("mount slips by 1 mm 0.3° midway", Faults(slip=(1e-3, np.radians(0.3))), draws=DRAWS),
     Case("by 3.6 mm 1.1° midway", Faults(slip=(3.6e-3, np.radians(1.1))), draws=DRAWS),
@@ -111,21 +111,21 @@ def reconstructed(found: FaultyCapture, estimated: bool) -> tuple[Capture, Recon
     """What structure from motion makes of the observations with the believed intrinsics, or its own."""
     cameras, m = found.base_from_camera, len(found.base_from_camera)
     start = np.eye(4), 1.0, np.eye(4)
-    free = prior_of(found.lens, ESTIMATED) if estimated else prior_of(found.lens, HELD)
-    sfm = adjust_wrist(cameras, start, cameras, found.lens, found.tracks, noise=LOOSE, prior=free)
-    lens, x = sfm.placed.scene.cameras[0], sfm.placed.x[0]
+    free = prior_of(found.intrinsics, ESTIMATED) if estimated else prior_of(found.intrinsics, FIXED)
+    sfm = adjust_wrist(cameras, start, cameras, found.intrinsics, found.tracks, noise=LOOSE, prior=free)
+    intrinsics, x = sfm.placed.scene.cameras[0], sfm.placed.x[0]
     rigs = predict(x, sfm.placed.scale, sfm.placed.z[0], sfm.placed.scene.world_from_rig)
     capture = Capture(
         Path("."),
         tuple(f"{k:02d}.png" for k in range(m)),
         found.base_from_gripper,
-        (LENS.width, LENS.height),
-        None if estimated else found.lens,
+        (INTRINSICS.width, INTRINSICS.height),
+        None if estimated else found.intrinsics,
     )
     return capture, Reconstruction(
         image_index=np.arange(m),
         recon_from_camera=rigs @ x,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=found.tracks,
         backend="simulated",
     )
@@ -197,10 +197,10 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for case, row in rows.items():
-        says = Counter(name for one in row for name in one.said).most_common(3)
+        message = Counter(name for one in row for name in one.said).most_common(3)
         lines.append(
             f"| {case.what} | {len(row)} | {_share(bool(one.said) for one in row)} | "
-            f"{', '.join(f'{name} {count}' for name, count in says)} | {_share(one.accepted for one in row)} | "
+            f"{', '.join(f'{name} {count}' for name, count in message)} | {_share(one.accepted for one in row)} | "
             f"{np.median([one.mm for one in row]):.1f} | {np.median([one.deg for one in row]):.2f} | "
             f"{np.median([one.sigmas for one in row]):.1f} | {_share(one.is_sound for one in row)} |"
         )
@@ -217,6 +217,6 @@ def page(rows: dict[Case, list[Outcome]], clean: list[Outcome]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _share(held) -> str:
-    values = list(held)
+def _share(fixed) -> str:
+    values = list(fixed)
     return f"{sum(values)} of {len(values)}"

@@ -21,7 +21,7 @@ import jcr
 from benchmarks.simulated import image_faults as make
 from benchmarks.simulated.image_faults import IMAGES, Drawn, Fault
 from benchmarks.simulated.rendered import Rendered, rendered
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import step_between
 from jcr.records import CAMERA, Finding, HandEye, Kind
 from jcr.results import RunResult
@@ -186,7 +186,7 @@ def outcome(capture: Drawn) -> Outcome:
             result = jcr.calibrate(make.write(capture, Path(folder) / "capture"), Path(folder) / "out")
         except InputError:
             return Outcome(False, refused=True)
-        except NotTrustedError:
+        except RejectedError:
             return Outcome(False, frozenset({Kind.NO_RECONSTRUCTION}))
         return _judged(capture, result)
 

@@ -20,7 +20,7 @@ from jcr.records import Intrinsics
 
 CAPTURES, MANY, IMAGES = 32, 200, 6
 """MANY with --long."""
-LENS = Intrinsics(30.0, 30.0, 15.5, 11.5, 32, 24)
+INTRINSICS = Intrinsics(30.0, 30.0, 15.5, 11.5, 32, 24)
 
 
 def run(long: bool = False) -> str:
@@ -34,7 +34,7 @@ def run(long: bool = False) -> str:
     lines = [
         f"> {count} small captures take {seconds[1]:.0f} s by one process and {seconds[2]:.0f} s by two.",
         "",
-        f"{count} captures of {IMAGES} images of {LENS.width}x{LENS.height} with pointmaps given (`--backend "
+        f"{count} captures of {IMAGES} images of {INTRINSICS.width}x{INTRINSICS.height} with pointmaps given (`--backend "
         "predictions --calibrate-only`); memory is the resident set of the command and of its workers together",
         "",
         "| processes | s | times one process | MiB after a quarter | half | three quarters | all |",
@@ -77,11 +77,11 @@ def _capture(folder: Path, seed: int) -> Path:
     draw = np.random.default_rng(seed)
     frames = []
     for k, pose in enumerate(noisy.base_from_gripper):
-        pixels = draw.integers(0, 255, (LENS.height, LENS.width, 3), dtype=np.uint8)
+        pixels = draw.integers(0, 255, (INTRINSICS.height, INTRINSICS.width, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(folder / f"images/{k}.png")
         frames.append({"image": f"images/{k}.png", "base_from_gripper": pose.tolist()})
-    lens = {key: getattr(LENS, key) for key in ("fx", "fy", "cx", "cy")}
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    intrinsics = {key: getattr(INTRINSICS, key) for key in ("fx", "fy", "cx", "cy")}
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     if seed == 0:
         _write_pointmaps(
             folder / "pointmaps.npz", problem.true_base_from_gripper @ problem.gripper_from_camera
@@ -91,11 +91,11 @@ def _capture(folder: Path, seed: int) -> Path:
 
 def _write_pointmaps(path: Path, base_from_camera: np.ndarray) -> None:
     """Where every pixel of every view meets the table, in the first camera's frame and half metres."""
-    seen = rays(LENS).reshape(-1, 3) @ np.swapaxes(base_from_camera[:, :3, :3], 1, 2)
+    seen = rays(INTRINSICS).reshape(-1, 3) @ np.swapaxes(base_from_camera[:, :3, :3], 1, 2)
     centers = base_from_camera[:, None, :3, 3]
     points = centers - centers[..., 2:] / np.minimum(seen[..., 2:], -1e-3) * seen
     recon_from_base = inverse(base_from_camera[0])
-    shape = (len(base_from_camera), LENS.height, LENS.width)
+    shape = (len(base_from_camera), INTRINSICS.height, INTRINSICS.width)
     np.savez(
         path,
         recon_from_camera=scale_translation(recon_from_base @ base_from_camera, 2.0),

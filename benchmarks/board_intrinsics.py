@@ -10,7 +10,7 @@ from numpy import ndarray
 from benchmarks.corners import Corners
 from jcr.calibration.stage import calibrate
 from jcr.camera import parameters
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.records import HandEye, Intrinsics, Reconstruction
 from jcr.results import RunResult
 
@@ -60,7 +60,7 @@ def intrinsics_of_features(result: RunResult) -> tuple[Fit, ...]:
         own = _half(result.reconstruction, half)
         try:
             found = calibrate(result.capture, own)
-        except (NotTrustedError, np.linalg.LinAlgError):
+        except (RejectedError, np.linalg.LinAlgError):
             continue
         if found.estimate.intrinsics_std is not None:
             fits.append(_of_features(f"{FEATURES}, {which}", found, own.intrinsics, int(found.inliers.sum())))

@@ -17,7 +17,7 @@ from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import project, unproject
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, nearest_to_lines, rotation_between_deg, step_between
 from jcr.pipeline import calibrate
 from jcr.reconstruct.backends import ReconstructOptions
@@ -53,7 +53,7 @@ class Row:
 
     capture: str
     how: str
-    says: str
+    message: str
     off_mm: float | None = None
     off_deg: float | None = None
     std_mm: float | None = None
@@ -95,13 +95,13 @@ def _rows(capture: Capture, board: str) -> Iterator[Row]:
         begun = time.perf_counter()
         result = _calibrated(capture, how, board)
         seconds = time.perf_counter() - begun
-        if isinstance(result, NotTrustedError):
+        if isinstance(result, RejectedError):
             yield Row(capture.folder.name, how, f"none: {result.what}", seconds=seconds)
             continue
         found = result.hand_eye
         std = np.sqrt(np.diag(found.covariance))
         halves = (None, None)
-        if not isinstance(shown, NotTrustedError):
+        if not isinstance(shown, RejectedError):
             halves = _left_out(capture, how, board, shown.reconstruction)
         yield Row(
             capture.folder.name,
@@ -117,7 +117,7 @@ def _rows(capture: Capture, board: str) -> Iterator[Row]:
         )
 
 
-def _calibrated(capture: Capture, how: str, board: str) -> RunResult | NotTrustedError:
+def _calibrated(capture: Capture, how: str, board: str) -> RunResult | RejectedError:
     backend, named = {"features": ("colmap", None), "board": ("marker", board), "both": ("colmap", board)}[
         how
     ]
@@ -125,7 +125,7 @@ def _calibrated(capture: Capture, how: str, board: str) -> RunResult | NotTruste
     try:
         with tempfile.TemporaryDirectory() as out:
             return calibrate(capture, out, options)
-    except NotTrustedError as refusal:
+    except RejectedError as refusal:
         return refusal
 
 
@@ -135,7 +135,7 @@ def _left_out(
     """Median reprojection error of features and of corners in the odd images, by a calibration of the even ones."""
     even = np.arange(len(capture)) % 2 == 0
     half = _calibrated(_of(capture, even), how, board)
-    if isinstance(half, NotTrustedError):
+    if isinstance(half, RejectedError):
         return None, None
     intrinsics = half.hand_eye.intrinsics or half.reconstruction.intrinsics
     cameras = capture.base_from_gripper[shown.image_index] @ half.hand_eye.gripper_from_camera
@@ -198,7 +198,7 @@ def _real_line(row: Row) -> str:
     cells = (
         row.capture,
         row.how,
-        row.says,
+        row.message,
         shown(row.off_mm, 2),
         shown(row.off_deg, 3),
         shown(row.std_mm, 2),
@@ -239,7 +239,7 @@ def _board_alone(found: FaultyCapture) -> Reconstruction:
         own = (tracks.image == k) & tracks.on_board[tracks.point]
         corner = tracks.point[own] - first
         seen = Sighting(0, tuple(corner.tolist()), body.x_in_body[corner], tracks.x_px[own])
-        pose = pose_of_body(seen, found.lens) if len(corner) else None
+        pose = pose_of_body(seen, found.intrinsics) if len(corner) else None
         if pose is not None:
             rows.append(k)
             cameras.append(inverse(pose.camera_from_body))
@@ -254,7 +254,7 @@ def _board_alone(found: FaultyCapture) -> Reconstruction:
     return Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=np.stack(cameras),
-        intrinsics=found.lens,
+        intrinsics=found.intrinsics,
         tracks=corners,
         backend="marker",
         is_metric=True,

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from benchmarks.figure import blank, png
 from benchmarks.peers import OPENCV_METHODS, andreff_with_scale, grid_search, opencv
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.calibration.case import of_images
@@ -35,7 +35,7 @@ WRONG = (0, 1, 2, 3, 4, 5)
 GRID = "paper's grid search"
 
 Solver = Callable[[HandEyeProblem, int], tuple[np.ndarray, float]]
-Missed = dict[tuple[str, tuple[float, float], int], Float[ndarray, "t 3"]]
+Distances = dict[tuple[str, tuple[float, float], int], Float[ndarray, "t 3"]]
 """By method, robot pose noise and number of images."""
 Spoilt = dict[tuple[str, int], Float[ndarray, "t 3"]]
 """By method and number of wrong images."""
@@ -44,24 +44,24 @@ Spoilt = dict[tuple[str, int], Float[ndarray, "t 3"]]
 def run(out: Path | None = None, long: bool = False) -> str:
     """Markdown tables: accuracy over noise and image count, with outliers, and time; a figure goes to `out`."""
     trials, image = (MANY_TRIALS, "calibrate_long.png") if long else (TRIALS, "calibrate.png")
-    missed = {
-        (name, noise, count): _all_missed(solver, noise, count, 0, trials)
+    distances = {
+        (name, noise, count): _all_errors(solver, noise, count, 0, trials)
         for noise in NOISES
         for count in COUNTS
         for name, solver in _solvers().items()
     }
     spoilt = {
-        (name, wrong): _all_missed(solver, NOISES[1], MANY, wrong, trials)
+        (name, wrong): _all_errors(solver, NOISES[1], MANY, wrong, trials)
         for wrong in WRONG
         for name, solver in _solvers().items()
     }
     if out is not None:
-        write_bytes(out / image, _figure(missed, spoilt))
+        write_bytes(out / image, _figure(distances, spoilt))
     named = {wrong: _named(wrong, trials) for wrong in WRONG}
     lines = [
-        *_claims(missed, spoilt, named, trials),
+        *_claims(distances, spoilt, named, trials),
         "",
-        *_accuracy(missed, trials, image),
+        *_accuracy(distances, trials, image),
         "",
         *_outliers(spoilt, named, trials),
         *_time(),
@@ -69,13 +69,13 @@ def run(out: Path | None = None, long: bool = False) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _claims(missed: Missed, spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
+def _claims(distances: Distances, spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     def middle(errors: Float[ndarray, "t 3"]) -> str:
         mm, deg, _ = np.median(errors, axis=0)
         return f"{mm:.2f} mm, {deg:.3f}°"
 
     ours, papers = ("jcr, bundle adjustment", GRID)
-    at = {name: middle(missed[name, NOISES[1], 10]) for name in (ours, papers)}
+    at = {name: middle(distances[name, NOISES[1], 10]) for name in (ours, papers)}
     most = max(wrong for wrong in WRONG if named[wrong] == trials)
     others = min(
         np.median(errors[:, 0])
@@ -104,7 +104,7 @@ def _solvers() -> dict[str, Solver]:
             problem.base_from_gripper[used],
             (start.gripper_from_camera, start.scale, start.base_from_recon),
             problem.recon_from_camera[used],
-            LENS,
+            INTRINSICS,
             tracks,
         )
         return adjusted.placed.x[0], recon_frame(adjusted, tracks)[0]
@@ -135,11 +135,13 @@ def problem_of(seed: int, count: int, noise: tuple[float, float]) -> HandEyeProb
     )
 
 
-def _all_missed(
+def _all_errors(
     solver: Solver, noise: tuple[float, float], count: int, wrong: int, trials: int
 ) -> Float[ndarray, "t 3"]:
     """mm, degrees and percent of scale in every trial."""
-    return np.array([_missed(_spoilt(seed, count, noise, wrong)[0], solver, seed) for seed in range(trials)])
+    return np.array(
+        [_distances(_spoilt(seed, count, noise, wrong)[0], solver, seed) for seed in range(trials)]
+    )
 
 
 def _spoilt(
@@ -165,7 +167,7 @@ def _named(wrong: int, trials: int) -> int:
     return right
 
 
-def _accuracy(missed: Missed, trials: int, image: str) -> list[str]:
+def _accuracy(distances: Distances, trials: int, image: str) -> list[str]:
     lines = [
         f"Median error over {trials} simulated captures (seeds 0 to {trials - 1}): mm / degrees / % of scale. "
         f"Vision noise {1e3 * VISION[0]:.1f} mm, {np.degrees(VISION[1]):.2f}°. OpenCV's methods cannot find the scale "
@@ -182,7 +184,7 @@ def _accuracy(missed: Missed, trials: int, image: str) -> list[str]:
             "|---" * (len(COUNTS) + 1) + "|",
         ]
         for name in _solvers():
-            cells = [_cell(missed[name, noise, count]) for count in COUNTS]
+            cells = [_cell(distances[name, noise, count]) for count in COUNTS]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return lines
 
@@ -192,7 +194,7 @@ def _cell(errors: Float[ndarray, "t 3"]) -> str:
     return f"{mm:.2f} / {deg:.3f} / {percent:.2f}"
 
 
-def _missed(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[float, float, float]:
+def _distances(problem: HandEyeProblem, solver: Solver, seed: int) -> tuple[float, float, float]:
     try:
         x, scale = solver(problem, seed)
     except cv2.error:  # with wrong poses among them some of OpenCV's methods give up
@@ -214,11 +216,11 @@ def _outliers(spoilt: Spoilt, named: dict[int, int], trials: int) -> list[str]:
     ]
     for name in _solvers():
         lines.append(f"| {name} | " + " | ".join(_cell(spoilt[name, wrong]) for wrong in WRONG) + " |")
-    told = " | ".join(f"{named[wrong]} of {trials}" for wrong in WRONG)
-    return [*lines, f"| *captures in which jcr identifies the wrong ones, and no others* | {told} |"]
+    counts = " | ".join(f"{named[wrong]} of {trials}" for wrong in WRONG)
+    return [*lines, f"| *captures in which jcr identifies the wrong ones, and no others* | {counts} |"]
 
 
-def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
+def _figure(distances: Distances, spoilt: Spoilt) -> bytes:
     """PNG: median errors of the translation by robot pose noise, number of images and share of wrong gripper poses."""
     figure = blank(14, 4.4, "constrained")
     axes = figure.subplots(1, 3, sharey=True)
@@ -226,8 +228,8 @@ def _figure(missed: Missed, spoilt: Spoilt) -> bytes:
         style = {"linewidth": 2.5} if name.startswith("jcr") else {"linewidth": 1, "linestyle": "--"}
         label = name.replace(" (scale given)", "*")
         series = (
-            ([1e3 * noise[0] for noise in NOISES], [missed[name, noise, 10] for noise in NOISES]),
-            (COUNTS, [missed[name, NOISES[1], count] for count in COUNTS]),
+            ([1e3 * noise[0] for noise in NOISES], [distances[name, noise, 10] for noise in NOISES]),
+            (COUNTS, [distances[name, NOISES[1], count] for count in COUNTS]),
             ([100 * wrong / MANY for wrong in WRONG], [spoilt[name, wrong] for wrong in WRONG]),
         )
         for axis, (x, errors) in zip(axes, series, strict=True):
@@ -262,9 +264,9 @@ def _time() -> list[str]:
         ("jcr: closed form, outliers, uncertainty, observability, leave-one-out error", 15,
          lambda: solve_hand_eye(gripper, camera), 21),
         (f"jcr: bundle adjustment, {len(tracks.image)} observations", 15,
-         lambda: adjust_wrist(gripper, pose_fit, camera, LENS, tracks), 3),
+         lambda: adjust_wrist(gripper, pose_fit, camera, INTRINSICS, tracks), 3),
         (f"jcr: bundle adjustment, {len(large_tracks.image)} observations", 36,
-         lambda: adjust_wrist(large.base_from_gripper, large_fit, large.recon_from_camera, LENS, large_tracks), 1),
+         lambda: adjust_wrist(large.base_from_gripper, large_fit, large.recon_from_camera, INTRINSICS, large_tracks), 1),
         ("paper's grid search: closed form, all values at once", 15, lambda: grid_search(gripper, camera), 21),
         ("Andreff with scale: closed form", 15, lambda: andreff_with_scale(gripper, camera), 21),
         *(

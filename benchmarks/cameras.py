@@ -20,7 +20,7 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import parameters, with_parameters
 from jcr.capture.read import read_capture
 from jcr.cell.stage import place_cameras
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import inverse, scale_translation, skew, step_between
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
 from jcr.records import Capture, CellCamera
@@ -132,14 +132,14 @@ class Row:
 
     capture: str
     image: str
-    lens: str
+    intrinsics: str
     points: int
     draw: Draw | None
     """Of base_from_camera against the robot's pose and X; None where it was not placed."""
     std_mm: float = 0.0
     std_deg: float = 0.0
     scene_mm: float = 0.0
-    says: str = ""
+    message: str = ""
 
 
 def _withheld(folder: Path) -> list[Row]:
@@ -150,21 +150,23 @@ def _withheld(folder: Path) -> list[Row]:
     try:
         reconstruction = reconstruct(rest, ReconstructOptions(backend="colmap"))
         hand_eye = calibrate(rest, reconstruction)
-    except NotTrustedError as refusal:
-        return [Row(folder.name, "–", "", 0, None, says=str(refusal))]
+    except RejectedError as refusal:
+        return [Row(folder.name, "–", "", 0, None, message=str(refusal))]
     if not hand_eye.converged:
-        return [Row(folder.name, "–", "", 0, None, says=hand_eye.warnings[0])]
+        return [Row(folder.name, "–", "", 0, None, message=hand_eye.warnings[0])]
     cameras = [
         CellCamera(f"fixed{row}", "base", (capture.images[row],), capture.image_size, capture.intrinsics)
         for row in apart
     ]
     found = place_cameras(rest, cameras, reconstruction, hand_eye)
-    lens, rows = "estimated" if capture.intrinsics is None else "given", []
+    intrinsics, rows = "estimated" if capture.intrinsics is None else "given", []
     rig = int(hand_eye.inliers.sum())
     for row, camera in zip(apart, found.cameras, strict=True):
         points = camera.images[0].points
         if camera.parent_from_camera is None or camera.covariance is None:
-            rows.append(Row(folder.name, capture.images[row], lens, points, None, says=camera.warnings[0]))
+            rows.append(
+                Row(folder.name, capture.images[row], intrinsics, points, None, message=camera.warnings[0])
+            )
             continue
         assert found.answer is not None
         draw = _against_robot(found.answer, rig, capture.base_from_gripper[row])
@@ -174,7 +176,7 @@ def _withheld(folder: Path) -> list[Row]:
             Row(
                 folder.name,
                 capture.images[row],
-                lens,
+                intrinsics,
                 points,
                 draw,
                 1e3 * float(std[:3].max()),
@@ -229,7 +231,7 @@ def _page(
         named = sorted({row.capture for row in placed})
         median = np.median(errors, axis=0)
         lines.append(
-            f"> Real images declared to be of fixed cameras, {len(placed)} of {len([r for r in real if r.lens])} "
+            f"> Real images declared to be of fixed cameras, {len(placed)} of {len([r for r in real if r.intrinsics])} "
             f"placed, of {', '.join(named)}: base_from_camera {median[0]:.1f} mm and {median[1]:.2f}° from the robot's "
             f"pose times X (median), at most {errors[:, 0].max():.1f} mm; "
             f"{sum(row.draw.sigmas > 3 for row in placed if row.draw is not None)} beyond 3 σ of both on an axis."
@@ -271,15 +273,15 @@ def _page(
     for row in real:
         if row.draw is None:
             lines.append(
-                f"| {row.capture} | {row.image} | {row.lens} | {row.points} | – | – | – | – | – | – |"
+                f"| {row.capture} | {row.image} | {row.intrinsics} | {row.points} | – | – | – | – | – | – |"
             )
             continue
         mm, deg = _size(row.draw)
         lines.append(
-            f"| {row.capture} | {row.image} | {row.lens} | {row.points} | {mm:.2f} | {deg:.3f} | "
+            f"| {row.capture} | {row.image} | {row.intrinsics} | {row.points} | {mm:.2f} | {deg:.3f} | "
             f"{row.draw.sigmas:.1f} | {row.std_mm:.2f} | {row.std_deg:.3f} | {row.scene_mm:.1f} |"
         )
-    lines += ["", *(f"- {row.capture}, {row.image}: {row.says}" for row in real if row.says)]
+    lines += ["", *(f"- {row.capture}, {row.image}: {row.message}" for row in real if row.message)]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -35,7 +35,7 @@ from jcr.calibration.seen import joint_covariance
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import retract
 from jcr.pipeline import calibrate
 from jcr.reconstruct.board import Sighting, boards, most_seen
@@ -86,7 +86,7 @@ def run(captures: Path, boards: Sequence[str] = (), runs: Path | None = None) ->
     for folder in folders:
         try:
             rows.append(_row(read_capture(folder), named.get(folder.name), runs))
-        except NotTrustedError as refusal:
+        except RejectedError as refusal:
             absent.append(f"{folder.name}: {refusal.what}")
         except InputError as refusal:
             absent.append(f"{folder.name}: {refusal}")
@@ -146,7 +146,7 @@ def _sightings(capture: Capture, named: str | None) -> tuple[str, list[list[Sigh
     images = [read_image(capture.folder / name) for name in capture.images]
     spec = named or board_in_view(images)
     if spec is None:
-        raise NotTrustedError("no board or tag is found in its images", "name it with --boards")
+        raise RejectedError("no board or tag is found in its images", "name it with --boards")
     for word, length in LENGTHS_M.items():
         spec = spec.replace(word, length)
     board, seen = most_seen(boards(spec), images)
@@ -162,7 +162,7 @@ def _plausible(camera: WristCamera, corners: Corners) -> Corners:
     """Without the images whose corners do not fit the others': another thing was taken for the board."""
     for _ in range(len(camera.base_from_gripper)):
         if not len(corners.x_in_board):
-            raise NotTrustedError("too few images share the corners of a board", "name it with --boards")
+            raise RejectedError("too few images share the corners of a board", "name it with --boards")
         points = triangulated(camera, corners)
         poses, _ = camera_poses(camera, corners, points)
         own = replace(camera, gripper_from_camera=np.eye(4), base_from_gripper=poses)
@@ -199,11 +199,11 @@ def _true_cameras(camera: WristCamera, hand_eye: HandEye, rng: np.random.Generat
     spread = vectors * np.sqrt(values.clip(0))
     for _ in range(DRAWS):
         step = spread @ rng.normal(size=len(spread))
-        lens = camera.intrinsics
+        intrinsics = camera.intrinsics
         if estimate.intrinsics_cross is not None:
-            lens = with_parameters(lens, parameters(lens) + step[7:])
+            intrinsics = with_parameters(intrinsics, parameters(intrinsics) + step[7:])
         x = retract(camera.gripper_from_camera, step[:6])
-        yield replace(camera, gripper_from_camera=x, intrinsics=lens)
+        yield replace(camera, gripper_from_camera=x, intrinsics=intrinsics)
 
 
 def _claim(rows: Sequence[Row]) -> str:

@@ -63,12 +63,12 @@ def run(out: Path | None = None) -> str:
         options = ReconstructOptions(predictions=pairs)
         _, predicted = _clouds(capture, options, "simulated predictions")
         surface, labels = truth_points(made)
-        picture = read_image(capture.folder / capture.images[0])
+        image = read_image(capture.folder / capture.images[0])
     drawn = np.random.default_rng(SEED).choice(len(surface), PLACES, replace=False)
     clouds = [sparse, swept, predicted]
     covered = {cloud.name: _covered(cloud, surface[drawn], labels[drawn]) for cloud in clouds}
     if out is not None:
-        write_bytes(out / "density.png", _figure(picture, clouds))
+        write_bytes(out / "density.png", _figure(image, clouds))
     table, things = covered[sparse.name]
     best_table, best_things = covered[predicted.name]
     swept_table, swept_things = covered[swept.name]
@@ -113,12 +113,12 @@ def _covered(cloud: Cloud, surface: Float[ndarray, "n 3"], labels: ndarray) -> t
     return 100 * float(near[labels == TABLE].mean()), 100 * float(near[labels > TABLE].mean())
 
 
-def _figure(picture: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
+def _figure(image: UInt8[ndarray, "h w 3"], clouds: list[Cloud]) -> bytes:
     """PNG: an image, and each dense cloud from above in its colours with COLMAP's points in red (paper, Fig. 8)."""
     sparse, *dense = clouds
     figure = blank(12, 4.2, "constrained")
     first, *others = figure.subplots(1, 1 + len(dense))
-    first.imshow(picture)
+    first.imshow(image)
     first.set_title("one of the images", fontsize=9)
     first.set_axis_off()
     for axis, cloud in zip(others, dense, strict=True):

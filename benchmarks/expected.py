@@ -21,7 +21,7 @@ from jcr.calibration.seen import within_95
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
 from jcr.check import QUICK, check, spread_rows
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.handeye.arms import ROBOT_NAMES, arm_named
 from jcr.pipeline import calibrate as run_calibrate
 from jcr.records import Capture, HandEye, Reconstruction
@@ -110,7 +110,7 @@ def of_capture(folder: Path) -> Row | None:
     try:
         with tempfile.TemporaryDirectory() as out:
             result = run_calibrate(capture, out)
-    except NotTrustedError:
+    except RejectedError:
         return None
     ahead = None if found.expected is None else _numbers(found.expected)
     used = sum(image.used for image in result.calibration.images)

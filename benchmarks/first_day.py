@@ -24,7 +24,7 @@ from jcr.simulate.capture import SimulateOptions, simulate
 TABLETOP = Path("examples/tabletop")
 SHOWN = 16
 """Lines of what a command prints, at most."""
-Say = Callable[[str], None]
+Show = Callable[[str], None]
 MARKER_NOISE = (1e-3, np.radians(0.15))
 """m, rad per axis of a marker's pose; of the robot half of it."""
 
@@ -85,14 +85,14 @@ def _images(capture: Capture, folder: Path) -> None:
     (folder / "scan" / "images").mkdir(parents=True)
     for name in capture.images:
         (folder / "scan" / name).write_bytes((capture.folder / name).read_bytes())
-    lens = capture.intrinsics
-    assert lens is not None
+    intrinsics = capture.intrinsics
+    assert intrinsics is not None
     info = {
-        "image_width": lens.width,
-        "image_height": lens.height,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": lens.matrix.ravel().tolist()},
+        "image_width": intrinsics.width,
+        "image_height": intrinsics.height,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": intrinsics.matrix.ravel().tolist()},
         "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(lens.distortion)},
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(intrinsics.distortion)},
     }
     (folder / "scan" / "camera_info.yaml").write_text(yaml.safe_dump(info))
 
@@ -145,9 +145,9 @@ def _easy_handeye2_samples(capture: Capture, folder: Path) -> tuple[str, Command
     truth = np.array(yaml.safe_load((capture.folder / "reference.json").read_text())["gripper_from_camera"])
 
     def shaken(poses: np.ndarray, share: float) -> np.ndarray:
-        turn = rotation_exp(share * MARKER_NOISE[1] * rng.normal(size=(len(poses), 3)))
+        rotation = rotation_exp(share * MARKER_NOISE[1] * rng.normal(size=(len(poses), 3)))
         shift = share * MARKER_NOISE[0] * rng.normal(size=(len(poses), 3))
-        return transform(turn @ poses[:, :3, :3], poses[:, :3, 3] + shift)
+        return transform(rotation @ poses[:, :3, :3], poses[:, :3, 3] + shift)
 
     base_from_camera = capture.base_from_gripper @ truth
     marker = inverse(transform(np.eye(3), np.array([0.45, 0.0, 0.0]))) @ base_from_camera
@@ -192,10 +192,10 @@ def _opencv_camera(capture: Capture, folder: Path) -> tuple[str, Commands]:
         str(folder / "wrist.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, capture.image_size
     )
     for name in capture.images[:4]:
-        picture = np.asarray(cv2.imread(str(capture.folder / name)))
+        image = np.asarray(cv2.imread(str(capture.folder / name)))
         for step in range(15):
             shift = np.array([[1.0, 0, 40.0 * max(0, 5 - step)], [0, 1.0, 0]])
-            writer.write(cv2.warpAffine(picture, shift, capture.image_size, borderMode=cv2.BORDER_WRAP))
+            writer.write(cv2.warpAffine(image, shift, capture.image_size, borderMode=cv2.BORDER_WRAP))
     writer.release()
     about = "Nothing but a camera (here a recording of one): the command says what it waits for."
     return about, [

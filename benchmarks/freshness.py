@@ -106,7 +106,7 @@ def _is_text(line: ast.stmt) -> bool:
     )
 
 
-def says_it_is_old(text: str) -> bool:
+def is_marked_old(text: str) -> bool:
     """Whether a page has the line."""
     return any(line.startswith(OLD) for line in text.splitlines())
 
@@ -114,7 +114,7 @@ def says_it_is_old(text: str) -> bool:
 def marked(text: str, changed: Sequence[str]) -> str:
     """The text of a page with that line below the one that names its commit, or without it where nothing changed."""
     lines = text.splitlines()
-    if says_it_is_old(text):
+    if is_marked_old(text):
         at = next(i for i, line in enumerate(lines) if line.startswith(OLD))
         del lines[at : at + 2]
     if changed:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from benchmarks.matching import off, sigmas
 from jcr.calibration.stage import calibrate
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import Transforms, inverse, rotation_exp, transform
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct.colmap import reconstruct
@@ -52,7 +52,7 @@ class Verdict:
     features: FeatureName
     gate: bool
     registered: int
-    trusted: bool
+    accepted: bool
     wrong: bool
     off_mm: float | None
     seconds: float
@@ -79,17 +79,17 @@ def table(verdicts: Sequence[Verdict], seeds: Mapping[FeatureName, int]) -> str:
             cells = []
             for gate in (True, False):
                 some = [v for v in verdicts if (v.kind, v.features, v.gate) == (kind, features, gate)]
-                right = sum(v.trusted and not v.wrong for v in some)
+                right = sum(v.accepted and not v.wrong for v in some)
                 off_mm = [v.off_mm for v in some if v.off_mm is not None]
                 cells.append(
-                    f"{right} / {sum(v.trusted for v in some)} / {sum(v.trusted and v.wrong for v in some)} | "
+                    f"{right} / {sum(v.accepted for v in some)} / {sum(v.accepted and v.wrong for v in some)} | "
                     f"{np.mean([v.registered for v in some]):.1f} | "
                     f"{f'{np.median(off_mm):.1f}' if off_mm else '–'} | {np.mean([v.seconds for v in some]):.0f}"
                 )
             lines.append(f"| {kind} | {features} | {cells[0]} | {cells[1]} |")
-    wrong = {gate: sum(v.trusted and v.wrong for v in verdicts if v.gate == gate) for gate in (True, False)}
+    wrong = {gate: sum(v.accepted and v.wrong for v in verdicts if v.gate == gate) for gate in (True, False)}
     right = {
-        gate: sum(v.trusted and not v.wrong for v in verdicts if v.gate == gate) for gate in (True, False)
+        gate: sum(v.accepted and not v.wrong for v in verdicts if v.gate == gate) for gate in (True, False)
     }
     total = len(verdicts) // 2
     head = (
@@ -123,7 +123,7 @@ def judged(kind: str, drawn: Drawn, features: FeatureName, gate: bool) -> Verdic
     try:
         made = reconstruct(drawn.capture, options)
         hand_eye = calibrate(drawn.capture, made)
-    except NotTrustedError:
+    except RejectedError:
         return Verdict(kind, features, gate, 0, False, False, None, time.perf_counter() - begun)
     seconds = time.perf_counter() - begun
     mm, deg = off(hand_eye.gripper_from_camera, drawn.gripper_from_camera)
@@ -140,12 +140,14 @@ def draw(kind: str, seed: int, folder: Path) -> Drawn:
     gripper = gripper_poses("varied", IMAGES, scene.table_center_in_base, x, motion)
     if kind in _ROLLS:
         gripper = gripper @ _rolled(x, _ROLLS[kind])
-    lens = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
-    images = [view.image for view in render(scene, lens, gripper @ x, with_truth=False)]
+    intrinsics = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+    images = [view.image for view in render(scene, intrinsics, gripper @ x, with_truth=False)]
     if kind == "moved object":
         other = _with_moved_object(scene)
         for k in range(0, IMAGES, 3):
-            images[k] = next(iter(render(other, lens, (gripper @ x)[k : k + 1], with_truth=False))).image
+            images[k] = next(
+                iter(render(other, intrinsics, (gripper @ x)[k : k + 1], with_truth=False))
+            ).image
     if kind == "own fingers":
         images = [_with_fingers(image) for image in images]
     folder.mkdir(parents=True)
@@ -153,7 +155,7 @@ def draw(kind: str, seed: int, folder: Path) -> Drawn:
     for name, image in zip(names, images, strict=True):
         Image.fromarray(image).save(folder / name)
     reported = with_robot_noise(gripper, *ROBOT_NOISE, np.random.default_rng([seed, 6]))
-    return Drawn(Capture(folder, names, reported, (640, 480), lens), x)
+    return Drawn(Capture(folder, names, reported, (640, 480), intrinsics), x)
 
 
 def _on_table(
@@ -207,8 +209,8 @@ _ROLLS = {"rolls of 90°": 90.0, "rolls of 180°": 180.0}
 
 def _rolled(gripper_from_camera: Float[ndarray, "4 4"], step_deg: float) -> Transforms:
     """Gripper motions that rotate every image against the one before about the viewing axis."""
-    turns = np.radians(step_deg) * np.arange(IMAGES)[:, None] * np.array([0.0, 0.0, 1.0])
-    about_axis = transform(rotation_exp(turns), np.zeros(3))
+    rotations = np.radians(step_deg) * np.arange(IMAGES)[:, None] * np.array([0.0, 0.0, 1.0])
+    about_axis = transform(rotation_exp(rotations), np.zeros(3))
     return gripper_from_camera @ about_axis @ inverse(gripper_from_camera)
 
 

@@ -18,7 +18,7 @@ from benchmarks.simulated.truth import read_truth
 from jcr.calibration.stage import calibrate
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.files import write_bytes
 from jcr.geometry import transform
 from jcr.handeye.solve import solve_hand_eye
@@ -41,7 +41,7 @@ ROTATIONS = (0.0, 1.0, 3.0, 6.0, 12.0, 25.0)
 """Degrees."""
 SURPRISE = 3.0
 """Reported standard deviations beyond which an accepted result is a silent fault."""
-PICTURE = (213, 160)
+IMAGE_SIZE = (213, 160)
 """Pixels of an example in the figure."""
 
 Change = Callable[[Path], None]
@@ -93,7 +93,7 @@ class Verdict:
     """What came of one trial."""
 
     trial: Trial
-    picture: UInt8[ndarray, "h w 3"]
+    image: UInt8[ndarray, "h w 3"]
     """One of its images, small."""
     used: int = 0
     mm: float = np.nan
@@ -169,12 +169,12 @@ def _verdict(trial: Trial) -> Verdict:
         trial.change(made)
         capture, truth = read_capture(made), read_truth(made)
         # The last one: what happens midway has happened.
-        picture = cv2.resize(read_image(_pictures(made)[-1]), PICTURE, interpolation=cv2.INTER_AREA)
+        image = cv2.resize(read_image(_images(made)[-1]), IMAGE_SIZE, interpolation=cv2.INTER_AREA)
         try:
             reconstruction = reconstruct(capture)
             found = calibrate(capture, reconstruction)
-        except NotTrustedError as refusal:
-            return Verdict(trial, np.asarray(picture, np.uint8), reason=_short(str(refusal)))
+        except RejectedError as refusal:
+            return Verdict(trial, np.asarray(image, np.uint8), reason=_short(str(refusal)))
     problem = HandEyeProblem(
         capture.base_from_gripper,
         reconstruction.recon_from_camera,
@@ -184,7 +184,7 @@ def _verdict(trial: Trial) -> Verdict:
     )
     return Verdict(
         trial,
-        np.asarray(picture, np.uint8),
+        np.asarray(image, np.uint8),
         int(found.inliers.sum()),
         *_off(problem, found),
         0 if found.converged else 3,
@@ -227,7 +227,7 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
         for axis in row[len(chosen) :]:
             axis.set_visible(False)
         for axis, v in zip(row, chosen, strict=False):
-            axis.imshow(v.picture)
+            axis.imshow(v.image)
             axis.set_xticks([])
             axis.set_yticks([])
             color = "tab:red" if v.silent else "tab:green" if v.status == 0 else "tab:orange"
@@ -240,7 +240,7 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
 
 
 def _rotation(degrees: float) -> str:
-    trusted, wrong, silent, off, std = 0, 0, 0, [], []
+    accepted, wrong, silent, off, std = 0, 0, 0, [], []
     for seed in range(POSE_TRIALS):
         problem = hand_eye_problem(
             np.random.default_rng(seed),
@@ -254,16 +254,16 @@ def _rotation(degrees: float) -> str:
         if not found.converged:
             continue
         mm, deg, sigmas, std_mm = _off(problem, found)
-        trusted += 1
+        accepted += 1
         wrong += mm > WRONG_MM or deg > WRONG_DEG
         silent += sigmas > SURPRISE
         off.append(mm)
         std.append(std_mm)
     middle = f"{np.median(off):.1f} | {np.median(std):.1f}" if off else "| "
-    return f"| {degrees:g}° | {trusted} of {POSE_TRIALS} | {wrong} | {silent} | {middle} |"
+    return f"| {degrees:g}° | {accepted} of {POSE_TRIALS} | {wrong} | {silent} | {middle} |"
 
 
-def _pictures(folder: Path) -> list[Path]:
+def _images(folder: Path) -> list[Path]:
     return sorted((folder / "images").iterdir())
 
 
@@ -271,7 +271,7 @@ def _blurred(length_px: int) -> Change:
     """A wrist that moves while it takes the image, each time in another direction."""
 
     def change(folder: Path) -> None:
-        for k, path in enumerate(_pictures(folder)):
+        for k, path in enumerate(_images(folder)):
             angle = 2.4 * k
             line = np.zeros((length_px, length_px), np.float32)
             middle = length_px // 2
@@ -301,7 +301,7 @@ def _redrawn(other: Callable[[Scene], Scene], first: int) -> Change:
         truth: Truth = read_truth(folder)
         scene = other(make_scene("tabletop", truth.seed))
         views = render(scene, truth.intrinsics, truth.base_from_camera[first:], with_truth=False)
-        for path, view in zip(_pictures(folder)[first:], views, strict=True):
+        for path, view in zip(_images(folder)[first:], views, strict=True):
             cv2.imwrite(str(path), view.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
 
     return change

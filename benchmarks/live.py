@@ -133,7 +133,9 @@ def _line(one: Run) -> str:
 
 def cell_of(seed: int) -> Cell:
     """The cell of a seed."""
-    hand_eye, errors, elsewhere, motion, lens = (np.random.default_rng([seed, 40 + k]) for k in range(5))
+    hand_eye, errors, elsewhere, motion, intrinsics = (
+        np.random.default_rng([seed, 40 + k]) for k in range(5)
+    )
     arm = arm_named(ARMS[seed % len(ARMS)])
     bent = bend(arm, PRESETS["typical"].sizes, errors)
     target = table_center(arm)
@@ -141,7 +143,7 @@ def cell_of(seed: int) -> Cell:
     return Cell(
         arm=bent,
         scene=moved(make_scene("tabletop", seed), target),
-        camera=pinhole(lens),
+        camera=pinhole(intrinsics),
         physical=x,
         effective=effective_about(bent, x, 12, elsewhere, target).gripper_from_camera,
         varied=views(arm, 40, x, motion, target),

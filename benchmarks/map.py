@@ -290,8 +290,8 @@ def true_surface(truth: Truth) -> Surface:
     for k, base_from_camera in enumerate(truth.base_from_camera):
         depth = true_depth(truth, k)
         shown = depth > 0
-        with Image.open(truth.folder / truth.images[k]) as picture:
-            color = np.asarray(picture)[shown]
+        with Image.open(truth.folder / truth.images[k]) as image:
+            color = np.asarray(image)[shown]
         x_in_base = apply(base_from_camera, depth[shown][:, None] * rays(truth.intrinsics)[shown])
         parts.append((x_in_base, color, true_labels(truth, k)[shown].astype(int), np.full(shown.sum(), k)))
     return Surface(*map(np.concatenate, zip(*parts, strict=True)))

@@ -12,7 +12,7 @@ from numpy import ndarray
 from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import rotation_between_deg, rotation_log
 from jcr.match.matchers import FeatureName
 from jcr.reconstruct import marker
@@ -49,8 +49,8 @@ class Row:
     std_deg: float | None = None
     sigmas: float | None = None
     joint: float | None = None
-    trusted: bool = False
-    says: str = ""
+    accepted: bool = False
+    message: str = ""
 
 
 def run(captures: Path, boards: Sequence[str] = (), long: bool = False) -> str:
@@ -108,14 +108,14 @@ def apart(one: Reference, other: Reference) -> str:
 
 def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
     """Markdown of the rows; `remade` says of captures with which board their references were made."""
-    told = []
+    counts = []
     for features, gate in WAYS:
         some = [row for row in rows if (row.features, row.gate) == (features, gate)]
         how = features + ("" if gate else " and no gate")
-        told += [f"{sum(row.trusted for row in some)} of {len(some)} with {how}"] if some else []
+        counts += [f"{sum(row.accepted for row in some)} of {len(some)} with {how}"] if some else []
     lines = [
         f"> Real captures, {len({row.capture for row in rows})}: accepted calibrations from images alone: "
-        f"{', '.join(told)}.",
+        f"{', '.join(counts)}.",
         "",
         "Distance from the reference stored with each capture, which has an error of its own; in σ: the largest on any "
         "axis in reported standard deviations; joint: in those and the reference's, where it states them. ±σ: the "
@@ -130,9 +130,9 @@ def table(rows: Sequence[Row], remade: Mapping[str, str]) -> str:
         *map(line, rows),
         "",
         *(
-            f"- {row.capture}, {row.features}{'' if row.gate else ', no gate'}: {row.says}"
+            f"- {row.capture}, {row.features}{'' if row.gate else ', no gate'}: {row.message}"
             for row in rows
-            if row.says
+            if row.message
         ),
     ]
     return "\n".join(lines).rstrip() + "\n"
@@ -146,10 +146,10 @@ def row_of(folder: Path, features: FeatureName, gate: bool, reference: Reference
     try:
         made = reconstruct(capture, ColmapOptions(features=features, robot_checks=gate))
         hand_eye = calibrate(capture, made)
-    except NotTrustedError as refusal:
+    except RejectedError as refusal:
         count = 0 if made is None else len(made.image_index)
         seconds = time.perf_counter() - begun
-        return Row(folder.name, features, gate, f"{count} of {len(capture)}", seconds, says=str(refusal))
+        return Row(folder.name, features, gate, f"{count} of {len(capture)}", seconds, message=str(refusal))
     seconds = time.perf_counter() - begun
     mm, deg = off(hand_eye.gripper_from_camera, reference.gripper_from_camera)
     std = np.sqrt(np.diag(hand_eye.covariance))
@@ -202,6 +202,6 @@ def line(row: Row) -> str:
             f"{row.std_deg:.2f}",
         ]
     )
-    gate, trusted = ("on" if row.gate else "off"), ("yes" if row.trusted else "no")
-    cells = [row.capture, row.features, gate, row.images, *numbers, trusted, f"{row.seconds:.0f}"]
+    gate, accepted = ("on" if row.gate else "off"), ("yes" if row.accepted else "no")
+    cells = [row.capture, row.features, gate, row.images, *numbers, accepted, f"{row.seconds:.0f}"]
     return f"| {' | '.join(cells)} |"

@@ -126,17 +126,17 @@ def _capture(folder: Path, count: int) -> Path:
     if not large.exists():
         simulate(large, SimulateOptions(images=max(IMAGES), truth="scene"))
     content = json.loads((large / "capture.json").read_text())
-    frames, lens = content["frames"][:count], content["intrinsics"]
+    frames, intrinsics = content["frames"][:count], content["intrinsics"]
     (small / "images").mkdir(parents=True)
-    with Image.open(large / frames[0]["image"]) as picture:
-        factor = WIDTH / picture.width
+    with Image.open(large / frames[0]["image"]) as image:
+        factor = WIDTH / image.width
     for frame in frames:
-        with Image.open(large / frame["image"]) as picture:
-            size = (WIDTH, round(picture.height * factor))
-            picture.resize(size, Image.Resampling.BOX).save(small / frame["image"], quality=95)
-    lens |= {name: lens[name] * factor for name in ("fx", "fy")}
-    lens |= {name: (lens[name] + 0.5) * factor - 0.5 for name in ("cx", "cy")}
-    write_text(small / "capture.json", json.dumps({"frames": frames, "intrinsics": lens}))
+        with Image.open(large / frame["image"]) as image:
+            size = (WIDTH, round(image.height * factor))
+            image.resize(size, Image.Resampling.BOX).save(small / frame["image"], quality=95)
+    intrinsics |= {name: intrinsics[name] * factor for name in ("fx", "fy")}
+    intrinsics |= {name: (intrinsics[name] + 0.5) * factor - 0.5 for name in ("cx", "cy")}
+    write_text(small / "capture.json", json.dumps({"frames": frames, "intrinsics": intrinsics}))
     return small
 
 

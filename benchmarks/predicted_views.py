@@ -20,7 +20,7 @@ from jcr.simulate.truth import Truth
 class ViewErrors:
     """Errors of predicted views; one sigma."""
 
-    turn_deg: float = 0.4
+    rotation_deg: float = 0.4
     """Rotation of each camera about the scene that it looks at, per axis: what moves the camera and keeps its image."""
     aim_deg: float = 0.1
     """Rotation of each camera about itself, per axis."""
@@ -47,9 +47,9 @@ def predictions(folder: Path, errors: ViewErrors, seed: int) -> Predict:
 def predicted_views(truth: Truth, errors: ViewErrors, seed: int) -> Predicted:
     """The truth on the grid of Depth Anything 3, with errors."""
     rng = np.random.default_rng([seed, 17])
-    count, lens = len(truth.images), truth.intrinsics
-    grid = grid_of((lens.width, lens.height))
-    pinhole = grid.grid_intrinsics(lens)
+    count, intrinsics = len(truth.images), truth.intrinsics
+    grid = grid_of((intrinsics.width, intrinsics.height))
+    pinhole = grid.grid_intrinsics(intrinsics)
     width, height = grid.size
     looked_at = np.zeros((count, 3))
     points = np.empty((count, height, width, 3), np.float32)
@@ -65,10 +65,10 @@ def predicted_views(truth: Truth, errors: ViewErrors, seed: int) -> Predicted:
         points[k] = z[..., None] * rays(pinhole)
         slope = np.abs(cv2.Laplacian(z.astype(np.float32), cv2.CV_32F)) / np.maximum(z, 1e-6)
         confidence[k] = np.where(known > 0.99, 1 + np.exp(1.5 - 60 * slope), 0)
-    turn = rotation_exp(np.radians(errors.turn_deg) * rng.normal(size=(count, 3)))
+    rotation = rotation_exp(np.radians(errors.rotation_deg) * rng.normal(size=(count, 3)))
     aim = rotation_exp(np.radians(errors.aim_deg) * rng.normal(size=(count, 3)))
     farther = 1 + errors.distance * rng.normal(size=count)
-    moved = transform(turn, looked_at - np.einsum("kij,kj->ki", turn, looked_at * farther[:, None]))
+    moved = transform(rotation, looked_at - np.einsum("kij,kj->ki", rotation, looked_at * farther[:, None]))
     base_from_camera = truth.base_from_camera @ moved @ transform(aim, np.zeros((count, 3)))
     recon_from_camera = inverse(base_from_camera[0]) @ base_from_camera
     recon_from_camera[:, :3, 3] /= errors.unit
@@ -87,10 +87,10 @@ def auc(
     """
     first, second = np.triu_indices(len(recon_from_camera), 1)
     found, true = (inverse(poses[first]) @ poses[second] for poses in (recon_from_camera, base_from_camera))
-    turned = np.degrees(rotation_angle(found[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)))
+    rotated = np.degrees(rotation_angle(found[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)))
     ways = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in (found[:, :3, 3], true[:, :3, 3])]
     aimed = np.degrees(np.arccos(np.clip((ways[0] * ways[1]).sum(1), -1, 1)))
-    return float(np.clip(1 - np.maximum(turned, aimed) / threshold_deg, 0, 1).mean())
+    return float(np.clip(1 - np.maximum(rotated, aimed) / threshold_deg, 0, 1).mean())
 
 
 def _smooth(rng: np.random.Generator, height: int, width: int) -> Float[ndarray, "h w"]:

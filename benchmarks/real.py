@@ -17,7 +17,7 @@ from jcr.calibration.known_transform import read_hand_eye
 from jcr.calibration.stage import calibrate as calibrate_stage
 from jcr.camera import unproject
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import (
     Transforms,
     apply,
@@ -30,7 +30,7 @@ from jcr.geometry import (
 from jcr.pipeline import RunOptions, calibrate
 from jcr.reconstruct.backends import ReconstructOptions
 from jcr.reconstruct.marker import reconstruct_marker
-from jcr.records import Capture, HandEye, HeldOut, Intrinsics, coefficients_of
+from jcr.records import Capture, HandEye, Intrinsics, LeaveOneOut, coefficients_of
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class Row:
     """The same in standard deviations of both, where the reference states its own."""
     std_mm: float | None = None
     std_deg: float | None = None
-    held_out: HeldOut | None = None
-    trusted: bool = False
+    leave_one_out: LeaveOneOut | None = None
+    accepted: bool = False
     seconds: float = 0.0
-    says: str = ""
+    message: str = ""
     alone: bool = False
     """From images, without a board."""
 
@@ -93,7 +93,7 @@ def run(captures: Path, boards: Sequence[str] = ()) -> str:
         "|---" * 14 + "|",
         *map(_line, rows),
         "",
-        *(f"- {row.capture}, {row.how}: {row.says}" for row in rows if row.says),
+        *(f"- {row.capture}, {row.how}: {row.message}" for row in rows if row.message),
     ]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -103,19 +103,19 @@ def _claims(rows: Sequence[Row]) -> list[str]:
     alone = [row for row in tried if row.alone]
     by_boards = [row for row in tried if not row.alone]
     of = [
-        f"{len([row for row in some if row.trusted])} of {len(some)} accepted from {what}, {_off_from_references(some)}"
+        f"{len([row for row in some if row.accepted])} of {len(some)} accepted from {what}, {_off_from_references(some)}"
         for what, some in (("images alone", alone), ("a board", by_boards))
-        if any(row.trusted for row in some)
+        if any(row.accepted for row in some)
     ]
-    seen = [row.seen_mm for row in tried if row.trusted and row.seen_mm is not None]
+    seen = [row.seen_mm for row in tried if row.accepted and row.seen_mm is not None]
     placed = (
         f" A seen point is {np.median(seen):.1f} mm (median) from where the references put it."
         if seen
         else ""
     )
-    joint = [row.joint_sigmas for row in tried if row.trusted and row.joint_sigmas is not None]
+    joint = [row.joint_sigmas for row in tried if row.accepted and row.joint_sigmas is not None]
     beyond = f" Beyond 3 joint σ: {sum(sigmas > 3 for sigmas in joint)} of {len(joint)}." if joint else ""
-    refused = [f"{row.capture} ({row.how})" for row in tried if not row.trusted]
+    refused = [f"{row.capture} ({row.how})" for row in tried if not row.accepted]
     rejected = f" Rejected: {', '.join(refused)}." if refused else ""
     return [f"> Real captures: {'; '.join(of) or 'none is accepted'}.{rejected}{beyond}{placed}"]
 
@@ -125,7 +125,7 @@ def _off_from_references(rows: Sequence[Row]) -> str:
     off = [
         (row.off_mm, row.off_deg, row.capture)
         for row in rows
-        if row.trusted and row.off_mm is not None and row.off_deg is not None
+        if row.accepted and row.off_mm is not None and row.off_deg is not None
     ]
     if not off:
         return "none with a reference"
@@ -144,7 +144,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     try:
         with tempfile.TemporaryDirectory() as out:
             result = calibrate(capture, out, options)
-    except NotTrustedError as refusal:
+    except RejectedError as refusal:
         seconds = time.perf_counter() - begun
         return [
             Row(
@@ -152,7 +152,7 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
                 how,
                 f"0 of {len(capture)}",
                 seconds=seconds,
-                says=str(refusal),
+                message=str(refusal),
                 alone=board is None,
             )
         ]
@@ -188,12 +188,12 @@ def _rows(folder: Path, board: str | None) -> list[Row]:
     park = Row(folder.name, f"{how}, OpenCV's Park", f"{len(rows)} of {len(capture)}", off_mm, off_deg)
     return [
         row,
-        replace(park, held_out=_park_held_out(gripper, camera)),
-        *_lens_row(capture, board, reference),
+        replace(park, leave_one_out=_park_leave_one_out(gripper, camera)),
+        *_intrinsics_row(capture, board, reference),
     ]
 
 
-def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) -> list[Row]:
+def _intrinsics_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) -> list[Row]:
     """The same with the intrinsics found from the board: how much of the distance the stored intrinsics may explain."""
     if capture.intrinsics is None:
         return []
@@ -201,23 +201,23 @@ def _lens_row(capture: Capture, board: str, reference: Float[ndarray, "4 4"]) ->
     try:
         found = reconstruct_marker(blind, board)
         hand_eye = calibrate_stage(blind, found)
-    except NotTrustedError:
+    except RejectedError:
         return []
     off_mm, off_deg = _off(hand_eye.gripper_from_camera, reference)
     how = f"`{board}`, its intrinsics ({found.intrinsics.fx:.1f} px, stored {capture.intrinsics.fx:.1f})"
-    held = hand_eye.held_out
-    told = (
+    fixed = hand_eye.leave_one_out
+    error = (
         None
-        if held is None
-        else HeldOut(
-            translation_mm=held.translation_mm,
-            rotation_deg=held.rotation_deg,
+        if fixed is None
+        else LeaveOneOut(
+            translation_mm=fixed.translation_mm,
+            rotation_deg=fixed.rotation_deg,
             reprojection_px=None,
-            how=held.how,
+            how=fixed.how,
         )
     )
     images = f"{hand_eye.inliers.sum()} of {len(capture)}"
-    return [Row(capture.folder.name, how, images, off_mm, off_deg, held_out=told)]
+    return [Row(capture.folder.name, how, images, off_mm, off_deg, leave_one_out=error)]
 
 
 def _park(gripper: Transforms, camera: Transforms) -> Float[ndarray, "4 4"]:
@@ -225,9 +225,9 @@ def _park(gripper: Transforms, camera: Transforms) -> Float[ndarray, "4 4"]:
     return opencv("Park", gripper, camera, 1.0)[0]
 
 
-def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOut:
+def _park_leave_one_out(gripper: Transforms, camera: Transforms) -> LeaveOneOut:
     """Each gripper pose predicted by Park's method from the others, as `held_out` of a calibration has it."""
-    missed = []
+    errors = []
     for k in range(len(gripper)):
         others = np.arange(len(gripper)) != k
         x = _park(gripper[others], camera[others])
@@ -235,9 +235,9 @@ def _park_held_out(gripper: Transforms, camera: Transforms) -> HeldOut:
         middle = transform(
             nearest_rotation(base_from_board[:, :3, :3].mean(0)), base_from_board[:, :3, 3].mean(0)
         )
-        missed.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
-    mm, deg = np.mean(missed, axis=0)
-    return HeldOut(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
+        errors.append(_off(middle @ camera[k] @ inverse(x), gripper[k]))
+    mm, deg = np.mean(errors, axis=0)
+    return LeaveOneOut(translation_mm=mm, rotation_deg=deg, reprojection_px=None, how="each by the others")
 
 
 def _seen(
@@ -245,14 +245,14 @@ def _seen(
 ) -> tuple[float | None, float | None]:
     """mm: from where the reference, with the intrinsics that it was made with, places a point at the image's centre at
     the working distance, and what 95 % of its errors are said to be below; None where nobody says with which."""
-    lens, used = hand_eye.intrinsics, _intrinsics_of_reference(folder, capture)
-    if lens is None or used is None or hand_eye.in_use is None:
+    intrinsics, used = hand_eye.intrinsics, _intrinsics_of_reference(folder, capture)
+    if intrinsics is None or used is None or hand_eye.in_use is None:
         return None, None
     seen = hand_eye.in_use.seen
-    x_px = np.array([lens.width - 1.0, lens.height - 1.0]) / 2
+    x_px = np.array([intrinsics.width - 1.0, intrinsics.height - 1.0]) / 2
     ours, theirs = (
         apply(x, 1e-3 * seen.distance_mm * (ray := unproject(camera, x_px)) / np.linalg.norm(ray))
-        for x, camera in ((hand_eye.gripper_from_camera, lens), (reference, used))
+        for x, camera in ((hand_eye.gripper_from_camera, intrinsics), (reference, used))
     )
     return 1e3 * float(np.linalg.norm(ours - theirs)), seen.within_95_mm
 
@@ -276,10 +276,12 @@ def _line(row: Row) -> str:
     def shown(value: float | None, digits: int) -> str:
         return "" if value is None else f"{value:.{digits}f}"
 
-    held = (
-        "" if row.held_out is None else f"{row.held_out.translation_mm:.2f} / {row.held_out.rotation_deg:.2f}"
+    fixed = (
+        ""
+        if row.leave_one_out is None
+        else f"{row.leave_one_out.translation_mm:.2f} / {row.leave_one_out.rotation_deg:.2f}"
     )
-    judged = "" if row.seconds == 0 else ("yes" if row.trusted else "**no**")
+    judged = "" if row.seconds == 0 else ("yes" if row.accepted else "**no**")
     cells = (
         row.capture,
         row.how,
@@ -292,7 +294,7 @@ def _line(row: Row) -> str:
         shown(row.joint_sigmas, 1),
         shown(row.std_mm, 2),
         shown(row.std_deg, 3),
-        held,
+        fixed,
         judged,
         shown(row.seconds or None, 1),
     )

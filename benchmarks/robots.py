@@ -16,9 +16,9 @@ from benchmarks.figure import blank
 from benchmarks.peers import opencv
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import error
-from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
 from jcr.adjust.wrist import adjust_wrist, recon_frame
 from jcr.camera import parameters, with_parameters
 from jcr.files import write_bytes
@@ -107,7 +107,7 @@ def measure_intrinsics(
     rows = []
     for preset in presets:
         for count in counts:
-            held, measured = [], []
+            fixed, measured = [], []
             for arm in arms:
                 for seed in range(draws):
                     problem = bent_problem(arm_named(arm), preset, count, seed)
@@ -116,21 +116,21 @@ def measure_intrinsics(
                     given = _drawn(rng)
                     if len(tracks.image) < 100 * count:
                         continue
-                    held.append((problem, _adjusted(problem, tracks, given, prior_of(given, HELD))))
+                    fixed.append((problem, _adjusted(problem, tracks, given, prior_of(given, FIXED))))
                     measured.append((problem, _adjusted(problem, tracks, given, prior_of(given))))
             cell = tuple(arms), preset, count
             rows += [
-                _row_of(*cell, "intrinsics held", *_missed(held)),
-                _row_of(*cell, "intrinsics measured", *_missed(measured)),
+                _row_of(*cell, "intrinsics held", *_errors(fixed)),
+                _row_of(*cell, "intrinsics measured", *_errors(measured)),
             ]
     return rows
 
 
 def _drawn(rng: np.random.Generator) -> Intrinsics:
-    values = parameters(LENS)
+    values = parameters(INTRINSICS)
     values[:2] *= 1 + INTRINSICS_STD * rng.normal()
-    values[2:4] += INTRINSICS_STD * LENS.width * rng.normal(size=2)
-    return with_parameters(LENS, values)
+    values[2:4] += INTRINSICS_STD * INTRINSICS.width * rng.normal(size=2)
+    return with_parameters(INTRINSICS, values)
 
 
 def _adjusted(
@@ -145,7 +145,7 @@ def _adjusted(
     return found.placed.x[0], scale, found.covariance[:6, :6], True
 
 
-def _missed(
+def _errors(
     answers: list[tuple[BentProblem, tuple[Float[ndarray, "4 4"], float, Float[ndarray, "6 6"], bool]]],
 ) -> tuple[Float[ndarray, "k 6"], Float[ndarray, "k 6 6"], Bool[ndarray, " k"]]:
     off = np.array([error(problem, x, scale)[:6] for problem, (x, scale, _, _) in answers])
@@ -164,7 +164,7 @@ def _row(
         (problem, (solved.gripper_from_camera, solved.scale, solved.covariance[:6, :6], solved.converged))
         for problem, solved in answers
     ]
-    return _row_of(arms, preset, count, known, *_missed(parts))
+    return _row_of(arms, preset, count, known, *_errors(parts))
 
 
 def _row_of(
@@ -246,12 +246,12 @@ def _figure(rows: list[Row]) -> bytes:
 
 def page(rows: list[Row], draws: int, intrinsics: Sequence[Row] = (), image: str = "robots.png") -> str:
     """Markdown of measured rows; `draws` is how many of each arm."""
-    held = [row for row in rows if row.known in KNOWN and row.known != WHITE and row.accepted > 0]
+    fixed = [row for row in rows if row.known in KNOWN and row.known != WHITE and row.accepted > 0]
     white = [row for row in rows if row.known == WHITE and row.preset != "white" and row.accepted > 0]
     lines = [
-        f"> Simulated arms with systematic errors, {', '.join(rows[0].arms)}: {_pooled(held):.1f} % of the accepted "
-        f"results are beyond 3 of their own σ on an axis, {100 * max(row.beyond_3 for row in held):.0f} % in the worst "
-        f"row, {100 * max(row.beyond_5 for row in held):.0f} % beyond 5 there; where errors count as independent "
+        f"> Simulated arms with systematic errors, {', '.join(rows[0].arms)}: {_pooled(fixed):.1f} % of the accepted "
+        f"results are beyond 3 of their own σ on an axis, {100 * max(row.beyond_3 for row in fixed):.0f} % in the worst "
+        f"row, {100 * max(row.beyond_5 for row in fixed):.0f} % beyond 5 there; where errors count as independent "
         f"{_pooled(white):.0f} %, up to {100 * max((row.beyond_3 for row in white), default=np.nan):.0f} %.",
         "",
         f"{draws} draws of each arm (seeds 0 to {draws - 1}), against the effective hand-eye transform; cameras of "

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import BentProblem, bent_problem
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from jcr.adjust.intrinsics_prior import ESTIMATED, IntrinsicsPrior, prior_of
 from jcr.adjust.wrist import adjust_wrist
 from jcr.calibration.adjust import estimate_of
@@ -39,20 +39,20 @@ class Knowledge:
     name: str
     start: Callable[[np.random.Generator], Intrinsics]
     prior: Callable[[Intrinsics], IntrinsicsPrior]
-    camera: Intrinsics = LENS
+    camera: Intrinsics = INTRINSICS
 
 
 def _off(rng: np.random.Generator) -> Intrinsics:
-    values = parameters(LENS)
+    values = parameters(INTRINSICS)
     values[:2] *= 1 + OFF * rng.choice([-1.0, 1.0])
     values[2:4] += 3.0 * rng.choice([-1.0, 1.0], size=2)
-    return with_parameters(LENS, values)
+    return with_parameters(INTRINSICS, values)
 
 
 def _found(rng: np.random.Generator) -> Intrinsics:
     """As a reconstruction without given intrinsics begins with them: no tangential distortion, the centre the
     image's."""
-    return _guessed(LENS, rng)
+    return _guessed(INTRINSICS, rng)
 
 
 def _found_of_bent(rng: np.random.Generator) -> Intrinsics:
@@ -65,7 +65,7 @@ def _guessed(camera: Intrinsics, rng: np.random.Generator) -> Intrinsics:
 
 
 WAYS = (
-    Knowledge("given", lambda rng: LENS, prior_of),
+    Knowledge("given", lambda rng: INTRINSICS, prior_of),
     Knowledge("given, 0.5 % and 3 px off", _off, prior_of),
     Knowledge("not given", _found, lambda found: prior_of(found, ESTIMATED)),
     Knowledge(

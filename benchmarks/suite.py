@@ -11,7 +11,7 @@ from datetime import date
 from pathlib import Path
 
 import jcr
-from benchmarks.freshness import says_it_is_old
+from benchmarks.freshness import is_marked_old
 from benchmarks.table import BENCHES, LONG, PARTS, title_of
 from jcr.errors import InputError
 from jcr.files import write_text
@@ -165,7 +165,7 @@ def _row(name: str, pages: Mapping[str, Path]) -> str:
         return ""
     page = pages[stems[0]]
     links = [f"[{title_of(name)}]({page.name})", *(f"([short]({pages[stem].name}))" for stem in stems[1:])]
-    old = " *Older than the code.*" if says_it_is_old(page.read_text()) else ""
+    old = " *Older than the code.*" if is_marked_old(page.read_text()) else ""
     return f"| {' '.join(links)} | {_cell(' '.join(claims(page)))}{old} |"
 
 

@@ -25,7 +25,7 @@ BOXES = np.array(
         [[-0.06, 0.23, 0.0], [0.09, 0.35, 0.25]],
     ]
 )
-ROOM = np.array([[-1.5, -1.5, 0.0], [1.5, 1.5, 2.0]])
+ROWS_ABOVE = np.array([[-1.5, -1.5, 0.0], [1.5, 1.5, 2.0]])
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PairErrors:
     """Smooth over the image, along the line of sight."""
     bend: float = 0.0
     """Smooth over the image, across the line of sight (rad)."""
-    pair_turn_deg: float = 0.0
+    pair_rotation_deg: float = 0.0
     """Rigid rotation of second views about the first camera, per axis."""
     baseline_growth_deg: float = 60.0
     """Angle between the views at which the errors of second views are twice those of first ones."""
@@ -83,7 +83,7 @@ def synthetic_pairs(
     base_from_camera = _cameras(images, rng)
     depth = np.stack([_depth(pose, rays(k)) for pose in base_from_camera])
     return predicted_pairs(
-        edges, base_from_camera, depth, k, errors, rng, carries_lens=intrinsics is not None
+        edges, base_from_camera, depth, k, errors, rng, carries_intrinsics=intrinsics is not None
     )
 
 
@@ -94,7 +94,7 @@ def predicted_pairs(
     k: Intrinsics,
     errors: PairErrors,
     rng: np.random.Generator,
-    carries_lens: bool,
+    carries_intrinsics: bool,
 ) -> tuple[PairPredictions, PairTruth]:
     """What a network would predict of views of known depth (0: nothing there), each pair in a unit of its own."""
     height, width = depth.shape[1:]
@@ -107,8 +107,8 @@ def predicted_pairs(
     for e, (first, second) in enumerate(edges):
         first_from_second = inverse(base_from_camera[first]) @ base_from_camera[second]
         baseline_deg = float(np.degrees(rotation_angle(first_from_second[:3, :3])))
-        turn = rotation_exp(np.radians(rng.normal(0, 1, 3) * errors.pair_turn_deg))
-        first_from_second = transform(turn, np.zeros(3)) @ first_from_second
+        rotation = rotation_exp(np.radians(rng.normal(0, 1, 3) * errors.pair_rotation_deg))
+        first_from_second = transform(rotation, np.zeros(3)) @ first_from_second
         if e in spoilt[: errors.wrong_pairs]:
             first_from_second = (
                 transform(rotation_exp(rng.normal(0, 0.5, 3)), rng.normal(0, 0.3, 3)) @ first_from_second
@@ -132,7 +132,7 @@ def predicted_pairs(
         conf=confidence[0],
         pts3d_in_other_view=points[1],
         conf2=confidence[1],
-        intrinsics=k if carries_lens else None,
+        intrinsics=k if carries_intrinsics else None,
     )
     return predictions, PairTruth(base_from_camera, depth, k, unit, spoilt)
 
@@ -161,20 +161,20 @@ def pairs_of_capture(
     The images' size must be an odd multiple of `size`, so that the grid's pixels are pixels of the images.
     """
     truth = read_truth(folder)
-    lens, (width, height) = truth.intrinsics, size
-    factor = lens.width // width
-    if factor % 2 == 0 or (factor * width, factor * height) != (lens.width, lens.height):
+    intrinsics, (width, height) = truth.intrinsics, size
+    factor = intrinsics.width // width
+    if factor % 2 == 0 or (factor * width, factor * height) != (intrinsics.width, intrinsics.height):
         raise InputError(
-            f"{folder}: images of {lens.width}x{lens.height} are no odd multiple of {width}x{height}"
+            f"{folder}: images of {intrinsics.width}x{intrinsics.height} are no odd multiple of {width}x{height}"
         )
     count = len(truth.images)
     middle = factor // 2
     depth = np.stack([true_depth(truth, k)[middle::factor, middle::factor] for k in range(count)])
-    cx, cy = (lens.cx - middle) / factor, (lens.cy - middle) / factor
-    k = Intrinsics(lens.fx / factor, lens.fy / factor, cx, cy, width, height)
+    cx, cy = (intrinsics.cx - middle) / factor, (intrinsics.cy - middle) / factor
+    k = Intrinsics(intrinsics.fx / factor, intrinsics.fy / factor, cx, cy, width, height)
     edges, rng = complete_pairs(count), np.random.default_rng(seed)
     return predicted_pairs(
-        edges, truth.base_from_camera, depth, k, errors or PairErrors(), rng, carries_lens=True
+        edges, truth.base_from_camera, depth, k, errors or PairErrors(), rng, carries_intrinsics=True
     )
 
 
@@ -197,7 +197,7 @@ def _cameras(count: int, rng: np.random.Generator) -> Float[ndarray, "n 4 4"]:
 def _depth(base_from_camera: Float[ndarray, "4 4"], ray: Float[ndarray, "h w 3"]) -> Float[ndarray, "h w"]:
     """Depth of the nearest surface along rays of unit depth."""
     origin, direction = base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T
-    nearest = np.maximum(*((ROOM[:, None, None] - origin) / direction)).min(axis=-1)
+    nearest = np.maximum(*((ROWS_ABOVE[:, None, None] - origin) / direction)).min(axis=-1)
     for *center, radius in SPHERES:
         to_center = origin - center
         a, b = (direction**2).sum(axis=-1), direction @ to_center

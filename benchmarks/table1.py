@@ -13,7 +13,7 @@ from benchmarks.simulated.truth import read_truth
 from benchmarks.synthetic_pairs import PairErrors, pairs_of_capture
 from jcr.calibration.stage import calibrate
 from jcr.capture.read import read_capture
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import Transforms, fit_similarity, rotation_between_deg, rotation_log, scale_translation
 from jcr.handeye.residuals import paper_residuals
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, candidates, reconstruct
@@ -33,7 +33,7 @@ SEEDS, MANY_SEEDS = 1, 2
 it, too."""
 WEBCAM = {"noise": 3.0, "blur": 0.7, "vignetting": 0.35, "jpeg_quality": 75, "robot_noise": (0.5, 0.1)}
 """Grey levels, pixels, share, percent; mm and degrees per axis."""
-PUBLISHED = PairErrors(warp=0.04, bend=0.01, pair_turn_deg=0.6)
+PUBLISHED = PairErrors(warp=0.04, bend=0.01, pair_rotation_deg=0.6)
 """A mean relative depth error of 3.6 % over first and second views, where DUSt3R's paper has 3.5 % on DTU (arXiv
 2312.14132, its table of multi-view depth), and second views rotated by 1.0° (rms), where it has medians of 1.0° to
 1.3° on most of 7-Scenes; the lines of sight bend by 0.6°."""
@@ -62,7 +62,7 @@ class Cell:
     scale_percent: float = np.nan
     sigmas: float = np.nan
     """Largest error on an axis in reported standard deviations."""
-    trusted: bool | None = None
+    accepted: bool | None = None
     """What the method itself says; None: it says nothing."""
 
     @property
@@ -73,7 +73,7 @@ class Cell:
     @property
     def silent(self) -> bool:
         """Trusted, and farther off than it says."""
-        return bool(self.trusted) and self.sigmas > SURPRISE
+        return bool(self.accepted) and self.sigmas > SURPRISE
 
 
 Row = tuple[SceneName, int, str]
@@ -129,10 +129,10 @@ def _claims(cells: dict[Row, list[Cell]]) -> list[str]:
             said.append(f"{method} {right} of {len(chosen)} right, {mm:.2f} mm and {deg:.3f}° off")
         images = f"{counts[0]} to {counts[-1]} images"
         lines.append(f"> Few images of plain tables by a webcam, {images} (medians): {'; '.join(said)}.")
-    ours = [cell for many in cells.values() for cell in many if cell.trusted is not None]
+    ours = [cell for many in cells.values() for cell in many if cell.accepted is not None]
     silent = sum(cell.silent for cell in ours)
     lines.append(
-        f"> Of ours, {sum(bool(cell.trusted) for cell in ours)} of {len(ours)} are accepted, and {silent} of these are "
+        f"> Of ours, {sum(bool(cell.accepted) for cell in ours)} of {len(ours)} are accepted, and {silent} of these are "
         f"farther off on an axis than {SURPRISE:g} reported standard deviations; were every σ right, one in "
         f"{1 / (1 - (1 - 2 * norm.sf(SURPRISE)) ** 6):.0f} would be, of six axes, by chance."
     )
@@ -152,14 +152,14 @@ def _table(cells: dict[Row, list[Cell]], counts: tuple[int, ...]) -> list[str]:
             values = [getattr(cell, key) for cell in many if not np.isnan(getattr(cell, key))]
             return f"{np.median(values):.{digits}f}" if values else "NA"
 
-        told = [cell.trusted for cell in many if cell.trusted is not None]
-        says = f"{sum(told)} of {len(many)}" if told else "silent"
+        verdicts = [cell.accepted for cell in many if cell.accepted is not None]
+        message = f"{sum(verdicts)} of {len(many)}" if verdicts else "silent"
         if any(cell.silent for cell in many):
-            says += ", **one wrong**"
+            message += ", **one wrong**"
         found = [middle("delta_t", 4), middle("delta_r", 4), middle("off_mm", 2), middle("off_deg", 3)]
         found += [middle("scale_percent", 2), middle("sigmas", 1)]
         lines.append(
-            f"| {scene} | {count} | {method} | {sum(cell.converged for cell in many)} of {len(many)} | {says} | "
+            f"| {scene} | {count} | {method} | {sum(cell.converged for cell in many)} of {len(many)} | {message} | "
             f"{middle('registered', 0)} | {' | '.join(found)} |"
         )
     return lines
@@ -204,8 +204,8 @@ def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cel
     try:
         sparse = reconstruct_with_colmap(capture, ColmapOptions())
         on_colmap = _papers(capture, truth, sparse), _ours(capture, truth, sparse)
-    except NotTrustedError:
-        on_colmap = Cell(0), Cell(0, trusted=False)
+    except RejectedError:
+        on_colmap = Cell(0), Cell(0, accepted=False)
     cells = [(f"{PAPERS} on {ON_COLMAP}", on_colmap[0]), (f"ours on {ON_COLMAP}", on_colmap[1])]
     options: list[tuple[str, ReconstructOptions]] = [(ON_PREDICTIONS, ReconstructOptions(predictions=pairs))]
     options += [(name, ReconstructOptions(name)) for name in networks]
@@ -226,14 +226,14 @@ def _methods(capture: Capture, truth: Truth, pairs: Path) -> list[tuple[str, Cel
 def _ours(capture: Capture, truth: Truth, reconstruction: Reconstruction) -> Cell:
     try:
         found = calibrate(capture, reconstruction)
-    except NotTrustedError:
-        return Cell(len(reconstruction.image_index), trusted=False)
+    except RejectedError:
+        return Cell(len(reconstruction.image_index), accepted=False)
     unit = _metres_per_unit(truth, reconstruction)
     x, true = found.gripper_from_camera, truth.gripper_from_camera
     cell = _cell(capture, truth, reconstruction, x, found.scale, unit)
     off = np.concatenate([true[:3, 3] - x[:3, 3], rotation_log(true[:3, :3] @ x[:3, :3].T)])
     sigmas = float(np.abs(off / np.sqrt(np.diag(found.covariance)[:6])).max())
-    return replace(cell, sigmas=sigmas, trusted=found.converged)
+    return replace(cell, sigmas=sigmas, accepted=found.converged)
 
 
 def _papers(capture: Capture, truth: Truth, reconstruction: Reconstruction) -> Cell:

@@ -35,9 +35,9 @@ def signed_distance(
 
 def camera_centers(cameras: int) -> Float[ndarray, "m 3"]:
     """On a ring, alternately high and low."""
-    turn = 2 * np.pi * np.arange(cameras) / cameras
+    rotation = 2 * np.pi * np.arange(cameras) / cameras
     up = np.radians(np.where(np.arange(cameras) % 2, 35, 65))
-    return 0.7 * np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], -1)
+    return 0.7 * np.stack([np.cos(up) * np.cos(rotation), np.cos(up) * np.sin(rotation), np.sin(up)], -1)
 
 
 def true_color(x: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
@@ -93,12 +93,12 @@ def looking_at_table(cameras: int) -> Float[ndarray, "m 4 4"]:
     return poses
 
 
-def cast_depth(base_from_camera: Float[ndarray, "4 4"], lens: Intrinsics) -> Float[ndarray, "h w"]:
+def cast_depth(base_from_camera: Float[ndarray, "4 4"], intrinsics: Intrinsics) -> Float[ndarray, "h w"]:
     """Depth along the optical axis (m) at every pixel; 0 where nothing is hit."""
-    ray = rays(lens).reshape(-1, 3)
+    ray = rays(intrinsics).reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     reach, _ = _cast(base_from_camera[:3, 3], ray @ base_from_camera[:3, :3].T)
-    return np.where(np.isfinite(reach), reach * ray[:, 2], 0.0).reshape(lens.height, lens.width)
+    return np.where(np.isfinite(reach), reach * ray[:, 2], 0.0).reshape(intrinsics.height, intrinsics.width)
 
 
 def _cast(origin: ndarray, ray: ndarray) -> tuple[ndarray, ndarray]:

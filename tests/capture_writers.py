@@ -53,14 +53,14 @@ def copy_images(capture: Capture, folder: Path) -> None:
 
 
 def write_camera_info(capture: Capture, folder: Path) -> None:
-    lens = capture.intrinsics
+    intrinsics = capture.intrinsics
     content = {
-        "image_width": lens.width,
-        "image_height": lens.height,
+        "image_width": intrinsics.width,
+        "image_height": intrinsics.height,
         "camera_name": "wrist",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": lens.matrix.ravel().tolist()},
+        "camera_matrix": {"rows": 3, "cols": 3, "data": intrinsics.matrix.ravel().tolist()},
         "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(lens.distortion)},
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": list(intrinsics.distortion)},
     }
     (folder / "camera_info.yaml").write_text(yaml.safe_dump(content))
 
@@ -132,14 +132,27 @@ def write_industrial(folder: Path, capture: Capture) -> Path:
 
 def write_transforms(folder: Path, capture: Capture, recon_from_camera: np.ndarray) -> Path:
     copy_images(capture, folder)
-    lens = capture.intrinsics
-    k1, k2, p1, p2, k3 = lens.distortion
+    intrinsics = capture.intrinsics
+    k1, k2, p1, p2, k3 = intrinsics.distortion
     frames = [
         {"file_path": f"./{name}", "transform_matrix": (pose @ OPENGL_FROM_OPENCV).tolist()}
         for name, pose in zip(capture.images, recon_from_camera, strict=True)
     ]
-    numbers = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx + HALF_PIXEL, "cy": lens.cy + HALF_PIXEL}
-    numbers |= {"w": lens.width, "h": lens.height, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+    numbers = {
+        "fl_x": intrinsics.fx,
+        "fl_y": intrinsics.fy,
+        "cx": intrinsics.cx + HALF_PIXEL,
+        "cy": intrinsics.cy + HALF_PIXEL,
+    }
+    numbers |= {
+        "w": intrinsics.width,
+        "h": intrinsics.height,
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "k3": k3,
+    }
     content = {"camera_model": "OPENCV", **numbers, "aabb_scale": 4, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content))
     np.save(folder / "poses.npy", capture.base_from_gripper)
@@ -152,11 +165,20 @@ def write_colmap(folder: Path, capture: Capture, recon_from_camera: np.ndarray) 
 
     write_table(folder, capture)
     (folder / "camera_info.yaml").unlink()
-    lens = capture.intrinsics
-    params = [lens.fx, lens.fy, lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL, *lens.distortion, 0, 0, 0]
+    intrinsics = capture.intrinsics
+    params = [
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx + HALF_PIXEL,
+        intrinsics.cy + HALF_PIXEL,
+        *intrinsics.distortion,
+        0,
+        0,
+        0,
+    ]
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
-        model="FULL_OPENCV", width=lens.width, height=lens.height, params=params, camera_id=1
+        model="FULL_OPENCV", width=intrinsics.width, height=intrinsics.height, params=params, camera_id=1
     )
     model.add_camera_with_trivial_rig(camera)
     for k, pose in enumerate(inverse(recon_from_camera), start=1):
@@ -255,17 +277,17 @@ def assert_joints(capture: Capture, angles: np.ndarray) -> None:
     np.testing.assert_allclose(tool, np.broadcast_to(tool[0], tool.shape), atol=1e-6)
 
 
-def write_video(file: Path, pictures: list[np.ndarray], fps: int, codec: str) -> None:
+def write_video(file: Path, images: list[np.ndarray], fps: int, codec: str) -> None:
     import av
 
     file.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(file), "w") as container:
         stream = container.add_stream(codec, rate=fps)
-        stream.height, stream.width = pictures[0].shape[:2]
+        stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "20", "g": "10"} | ({"preset": "12"} if "av1" in codec else {"bf": "2"})
-        for picture in pictures:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
 
 
@@ -317,13 +339,13 @@ def write_lerobot(
         }
         if codec is None:
             columns[camera] = [
-                {"bytes": encode_png(picture), "path": f"{index}_{k}.png"}
+                {"bytes": encode_png(image), "path": f"{index}_{k}.png"}
                 for index, _ in rows
-                for k, picture in enumerate(episodes[index][0])
+                for k, image in enumerate(episodes[index][0])
             ]
-        for name, pictures in (further or {}).items():
+        for name, images in (further or {}).items():
             columns[name] = [
-                {"bytes": encode_png(np.ascontiguousarray(picture)), "path": "x.png"} for picture in pictures
+                {"bytes": encode_png(np.ascontiguousarray(image)), "path": "x.png"} for image in images
             ]
         return pa.table(columns)
 
@@ -332,20 +354,20 @@ def write_lerobot(
         pq.write_table(content, file)
 
     if not v3:
-        for index, (pictures, states) in enumerate(episodes):
+        for index, (images, states) in enumerate(episodes):
             save(table([(index, states)]), folder / f"data/chunk-000/episode_{index:06d}.parquet")
             if codec:
                 file = folder / f"videos/chunk-000/{camera}/episode_{index:06d}.mp4"
-                write_video(file, pictures, fps, codec)
+                write_video(file, images, fps, codec)
         return folder
     save(
         table([(k, states) for k, (_, states) in enumerate(episodes)]),
         folder / "data/chunk-000/file-000.parquet",
     )
     if codec:
-        everything = [picture for pictures, _ in episodes for picture in pictures]
+        everything = [image for images, _ in episodes for image in images]
         write_video(folder / f"videos/{camera}/chunk-000/file-000.mp4", everything, fps, codec)
-    starts = np.cumsum([0, *(len(pictures) for pictures, _ in episodes)])[:-1] / fps
+    starts = np.cumsum([0, *(len(images) for images, _ in episodes)])[:-1] / fps
     zeros = [0] * len(episodes)
     columns = {
         "episode_index": list(range(len(episodes))),

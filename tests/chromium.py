@@ -111,7 +111,7 @@ class Chromium:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def picture(self, selector: str) -> np.ndarray:
+    def image(self, selector: str) -> np.ndarray:
         """An element as it is seen (h,w,3), once it is drawn; a page that is emulated on a phone scrolls elsewhere."""
         self.draw()
         box = self.js(

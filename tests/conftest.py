@@ -28,19 +28,19 @@ def shrunk_capture(source: Path, folder: Path, images: int, width: int) -> Path:
     """The first images of a capture and their poses, in `folder`, reduced to a width in pixels."""
     (folder / "images").mkdir(parents=True)
     content = json.loads((source / "capture.json").read_text())
-    frames, lens = content["frames"][:images], content["intrinsics"]
+    frames, intrinsics = content["frames"][:images], content["intrinsics"]
     for frame in frames:
-        picture = Image.open(source / frame["image"])
-        scale = width / picture.width
-        size = width, round(picture.height * scale)
-        picture.resize(size, Image.Resampling.BOX).save(folder / frame["image"], quality=95)
-    lens = {
-        "fx": lens["fx"] * scale,
-        "fy": lens["fy"] * scale,
+        image = Image.open(source / frame["image"])
+        scale = width / image.width
+        size = width, round(image.height * scale)
+        image.resize(size, Image.Resampling.BOX).save(folder / frame["image"], quality=95)
+    intrinsics = {
+        "fx": intrinsics["fx"] * scale,
+        "fy": intrinsics["fy"] * scale,
         "cx": (size[0] - 1) / 2,
         "cy": (size[1] - 1) / 2,
     }
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     return folder
 
 

@@ -72,6 +72,6 @@ def xarm(pose: ndarray, joints: ndarray) -> Callable[[socket.socket], None]:
 
 
 if __name__ == "__main__":
-    address, told = sys.argv[1:]
-    numbers = np.array(json.loads(told))
+    address, as_json = sys.argv[1:]
+    numbers = np.array(json.loads(as_json))
     serve_each(address, 502, xarm(numbers[:16].reshape(4, 4), numbers[16:]))

@@ -65,8 +65,8 @@ def small_capture(folder: Path) -> Capture:
     for name in images:
         Image.fromarray(draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)).save(folder / name)
     poses = hand_eye_problem(draw, COUNT).base_from_gripper
-    lens = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
-    capture = Capture(folder, images, poses, SIZE, lens)
+    intrinsics = Intrinsics(15.0, 15.0, 7.5, 5.5, *SIZE, (0.01, 0.0, 0.0, 0.0, 0.0))
+    capture = Capture(folder, images, poses, SIZE, intrinsics)
     capture_json.write(folder, capture)
     return capture
 
@@ -108,7 +108,7 @@ def targets(folder: Path) -> dict[str, Target]:
     place.mkdir()
     writers.write_camera_info(capture, place)
     found["camera_info.yaml"] = Target(place / "camera_info.yaml", lambda file: read_camera_info(file, SIZE))
-    found |= pictures(folder / "pictures") | results(folder / "results", capture, cameras)
+    found |= images(folder / "pictures") | results(folder / "results", capture, cameras)
     found |= networks(folder / "networks") | recordings(folder / "recordings", capture)
     place = folder / "colmap"
     writers.write_colmap(place, capture, cameras)
@@ -117,7 +117,7 @@ def targets(folder: Path) -> dict[str, Target]:
     return found
 
 
-def pictures(folder: Path) -> dict[str, Target]:
+def images(folder: Path) -> dict[str, Target]:
     """An image in each format that cameras write."""
     folder.mkdir()
     pixels = np.random.default_rng(2).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
@@ -252,7 +252,7 @@ def sound_run(out: Path) -> Path:
         backend="colmap", images_registered=RUN_IMAGES, reconstruct_s=1.0, calibrate_s=0.5, why_not=None
     )
     content = calibration_file(pairs, pairs, calibrate_poses(pairs), {}, "0", [attempt]).model_dump()
-    lens = {
+    intrinsics = {
         "fx": 90.0,
         "fy": 90.0,
         "cx": 47.5,
@@ -261,7 +261,7 @@ def sound_run(out: Path) -> Path:
         "width": 96,
         "height": 72,
     }
-    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": lens}))
+    (out / "calibration.json").write_text(json.dumps(content | {"intrinsics": intrinsics}))
     write_calibration(out / "calibration.json", read_calibration(out))
     options = {"reconstruct": asdict(ReconstructOptions()), "calibrate": asdict(CalibrateOptions())}
     options["calibrate"] |= {"robot_noise": [0.1, 0.05], "known_length": ["0.png", 1.0, 2.0, 30.0, 4.0, 50.0]}

@@ -10,7 +10,7 @@ import numpy as np
 WIDTH, HEIGHT, FRAMES = 640, 480, 10
 
 
-def lens(rs: ModuleType) -> Any:
+def intrinsics(rs: ModuleType) -> Any:
     found = rs.intrinsics()
     found.width, found.height, found.fx, found.fy, found.ppx, found.ppy = (
         WIDTH,
@@ -37,7 +37,7 @@ def record(file: Path) -> None:
         stream = rs.video_stream()
         stream.type, stream.index, stream.uid, stream.fmt = kind, 0, number, form
         stream.width, stream.height, stream.fps, stream.bpp = WIDTH, HEIGHT, 30, size
-        stream.intrinsics = lens(rs)
+        stream.intrinsics = intrinsics(rs)
         sensor = device.add_sensor(name)
         plain.append(sensor)
         profiles.append(sensor.add_video_stream(stream))
@@ -52,10 +52,10 @@ def record(file: Path) -> None:
     for sensor, profile in zip(sensors, profiles, strict=True):
         sensor.open(profile)
         sensor.start(queue)
-    picture = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     depth = np.full((HEIGHT, WIDTH), 1001, np.uint16)
     for number in range(FRAMES):
-        for sensor, profile, pixels, size in zip(plain, profiles, (depth, picture), (2, 3), strict=True):
+        for sensor, profile, pixels, size in zip(plain, profiles, (depth, image), (2, 3), strict=True):
             frame = rs.software_video_frame()
             frame.pixels, frame.bpp, frame.stride = pixels, size, size * WIDTH
             frame.timestamp, frame.frame_number = 100.0 * (number + 1), number + 1

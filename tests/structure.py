@@ -30,7 +30,7 @@ from jcr.capture.camera_info import read_camera_info
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_source
 from jcr.capture.urdf_chain import read_chain
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.live.folder import LiveFolder
 from jcr.live.line_server import parsed, pose_of
 from jcr.reconstruct.reconstruction_npz import read_reconstruction, write_reconstruction
@@ -95,7 +95,7 @@ def tried(document: Document, place: Place, value: object) -> tuple[str, float]:
         ended = (
             "status 2" if "\0" not in str(error) and "Traceback" not in str(error) else "unreadable message"
         )
-    except NotTrustedError:
+    except RejectedError:
         ended = "status 3"
     except Exception as error:  # what a user would see as a traceback
         ended = f"status 1: {type(error).__name__}: {str(error)[:200]}"
@@ -194,8 +194,8 @@ def _of_others(folder: Path, capture: Capture, cameras: np.ndarray, in_file: Any
     alone = folder / "camera_info"
     alone.mkdir()
     writers.write_camera_info(capture, alone)
-    lens = alone / "camera_info.yaml"
-    in_file("camera_info.yaml, by itself", lens, lambda: read_camera_info(lens, SIZE), as_yaml)
+    intrinsics = alone / "camera_info.yaml"
+    in_file("camera_info.yaml, by itself", intrinsics, lambda: read_camera_info(intrinsics, SIZE), as_yaml)
     file = writers.write_moveit(folder / "moveit", capture.base_from_gripper, cameras)
     in_file("samples.yaml", file, source(file), as_yaml)
     other = writers.write_easy_handeye2(folder / "easy", capture.base_from_gripper, cameras)
@@ -285,10 +285,10 @@ def _archive(folder: Path, found: dict[str, Document]) -> None:
 
 def _of_robots(folder: Path, capture: Capture, in_file: Any, found: dict[str, Document], source: Any) -> None:
     pixels = [np.asarray(Image.open(capture.folder / name).convert("RGB")) for name in capture.images]
-    pictures = [picture for picture in pixels for _ in range(3)]
+    images = [image for image in pixels for _ in range(3)]
     states = np.repeat(writers.rows_as("rpy", capture.base_from_gripper), 3, axis=0)
     numbers = ["x", "y", "z", "roll", "pitch", "yaw"]
-    episode = [(pictures, states)]
+    episode = [(images, states)]
     for version in ("v2.1", "v3.0"):
         place = writers.write_lerobot(
             folder / version, episode, version, "observation.state", numbers, codec=None

@@ -133,7 +133,7 @@ def test_a_png_holds_the_same_pixels(
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"mapp": None}, "RunOptions: no option 'mapp'; did you mean map?"),
         ({"calibrate": {"reqire": (1, 1)}}, "CalibrateOptions: no option 'reqire'; did you mean require?"),
@@ -141,8 +141,8 @@ def test_a_png_holds_the_same_pixels(
         ({"reconstruct": {"backend": "colmp"}}, "did you mean colmap?"),
     ],
 )
-def test_wrong_options_are_input_errors_before_any_work(options, says: str, tmp_path: Path):
-    with pytest.raises(jcr.InputError, match=re.escape(says)):
+def test_wrong_options_are_input_errors_before_any_work(options, message: str, tmp_path: Path):
+    with pytest.raises(jcr.InputError, match=re.escape(message)):
         jcr.run("nowhere", tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 

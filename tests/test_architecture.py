@@ -40,8 +40,8 @@ LAYERS = [
     {"cli"},
     {"__main__"},
 ]
-LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-TORCH_ROOMS = {"match", "reconstruct", "represent", "segment"}
+LEVEL = {package: level for level, packages in enumerate(LAYERS) for package in packages}
+TORCH_PACKAGES = {"match", "reconstruct", "represent", "segment"}
 BACK_ENDS = ["backends", "from_pairs", "colmap", "marker", "predictions"]
 SOLVERS = [
     "least_squares",
@@ -88,19 +88,19 @@ def imports(file: Path) -> list[str]:
     ]
 
 
-def room(file: Path) -> str:
+def package(file: Path) -> str:
     return file.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
-def test_every_room_has_its_layer():
-    rooms = {room(file) for file in SOURCE.rglob("*.py")} - {"__init__"}
-    assert rooms == set(LEVEL)
+def test_every_space_has_its_layer():
+    packages = {package(file) for file in SOURCE.rglob("*.py")} - {"__init__"}
+    assert packages == set(LEVEL)
 
 
 def test_imports_run_one_way():
     against = []
     for file in SOURCE.rglob("*.py"):
-        mine = room(file)
+        mine = package(file)
         if mine == "__init__":
             continue
         for module in imports(file):
@@ -117,7 +117,7 @@ def is_under(module: str, parent: str) -> bool:
 
 
 @pytest.mark.parametrize("part", FORBIDDEN)
-def test_parts_of_rooms_do_not_know_one_another(part: str):
+def test_parts_of_packages_do_not_know_one_another(part: str):
     above = part.rpartition(".")[0]
     forbidden = [".".join(filter(None, ("jcr", above, name))) for name in FORBIDDEN[part]]
     assert not [name for name in forbidden if not any(is_under(module, name) for module in FILES)]
@@ -166,6 +166,7 @@ def test_torch_stays_where_networks_are():
     outside = [
         str(file.relative_to(SOURCE))
         for file in SOURCE.rglob("*.py")
-        if any(module.split(".")[0] == "torch" for module in imports(file)) and room(file) not in TORCH_ROOMS
+        if any(module.split(".")[0] == "torch" for module in imports(file))
+        and package(file) not in TORCH_PACKAGES
     ]
     assert not outside

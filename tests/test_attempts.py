@@ -17,7 +17,7 @@ from jcr.calibration import stage as calibration_stage
 from jcr.calibration.checks import capture as capture_checks
 from jcr.calibration.options import CalibrateOptions
 from jcr.cli import dispatch
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import rotation_exp, transform
 from jcr.handeye.solve import solve_hand_eye
 from jcr.reconstruct import backends
@@ -52,13 +52,13 @@ def present(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 
 def reconstruction(backend: str, poses: np.ndarray, observations: int = 0) -> Reconstruction:
-    lens = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+    intrinsics = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
     n = observations
     tracks = Tracks(np.zeros(n, int), np.zeros((n, 2)), np.arange(n), np.zeros((n, 3)))
     return Reconstruction(
         image_index=np.arange(len(poses)),
         recon_from_camera=poses,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=tracks,
         backend=backend,
     )
@@ -113,7 +113,7 @@ def auto_result(
     return choice.reconstruction, tried
 
 
-def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
+def test_a_second_one_runs_only_when_the_first_is_rejected(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
     present.add("mast3r")
@@ -131,7 +131,7 @@ def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
     assert "mast3r, the best whose weights are on this machine, is rejected (" in kept.notes[0]
     assert "colmap (leave-one-out error" in kept.notes[0] and "used instead of mast3r" in kept.notes[0]
 
-    nothing = NotTrustedError("0 of 8 images registered")
+    nothing = RejectedError("0 of 8 images registered")
     kept, _ = auto_result(problem, {"mast3r": nothing, "colmap": good}, monkeypatch)
     assert kept.backend == "colmap" and "failed (0 of 8" in kept.notes[0]
     kept, _ = auto_result(problem, {"mast3r": shuffled, "colmap": nothing}, monkeypatch)
@@ -139,7 +139,7 @@ def test_a_second_one_runs_only_when_the_first_is_not_to_be_trusted(
     damaged = InputError("model.safetensors: damaged")
     kept, _ = auto_result(problem, {"mast3r": damaged, "colmap": good}, monkeypatch)
     assert kept.backend == "colmap" and "damaged" in kept.notes[0]
-    with pytest.raises(NotTrustedError, match="0 of 8"):
+    with pytest.raises(RejectedError, match="0 of 8"):
         auto_result(problem, {"mast3r": damaged, "colmap": nothing}, monkeypatch)
 
 
@@ -158,7 +158,7 @@ def test_blurred_images_are_the_reason_and_not_what_follows(
 ):
     problem = hand_eye_problem(np.random.default_rng(0), 8, robot_noise=(2e-4, 5e-4))
     monkeypatch.setattr(attempts, "view_findings", lambda _: (BLUR,))
-    nothing = NotTrustedError("0 of 8 images registered (too little texture)", "put a newspaper on the table")
+    nothing = RejectedError("0 of 8 images registered (too little texture)", "put a newspaper on the table")
     with pytest.raises(attempts.NothingFoundError) as caught:
         auto_result(problem, {"colmap": nothing, "direct": nothing}, monkeypatch)
     assert str(caught.value).startswith("6 of 8 images are blurred") and "texture" not in str(caught.value)
@@ -179,7 +179,7 @@ def test_a_camera_at_rest_is_reconstructed_once(present: set[str], monkeypatch: 
 
     def nothing(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
         tried.append(options.features)
-        raise NotTrustedError("0 of 8 images registered")
+        raise RejectedError("0 of 8 images registered")
 
     monkeypatch.setattr(attempts, "reconstruct", nothing)
     with pytest.raises(attempts.NothingFoundError, match="all images show the same view"):
@@ -203,11 +203,11 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
         mend="intrinsics",
         details={"focal": 310.0, "focal_std": 2.0, "focal_given": 465.0},
     )
-    held_out = sound.held_out
-    assert held_out is not None
+    leave_one_out = sound.leave_one_out
+    assert leave_one_out is not None
     of_backend = {
         "mast3r": sound.with_findings(uncertain),
-        "colmap": replace(sound, held_out=replace(held_out, translation_mm=40.0)).with_findings(
+        "colmap": replace(sound, leave_one_out=replace(leave_one_out, translation_mm=40.0)).with_findings(
             uncertain, intrinsics
         ),
     }
@@ -219,7 +219,7 @@ def test_of_two_that_are_rejected_the_one_that_shows_the_cause_is_kept(
 
 
 @pytest.mark.slow
-def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
+def test_of_two_that_are_rejected_the_smaller_leave_one_out_error_is_kept(
     present: set[str], monkeypatch: pytest.MonkeyPatch
 ):
     present.add("dust3r")
@@ -238,13 +238,11 @@ def test_of_two_that_are_not_trusted_the_smaller_held_out_error_is_kept(
         assert f"and so is colmap; {name} (leave-one-out error" in kept.notes[0]
 
 
-def test_where_colmap_is_not_to_be_trusted_colours_are_asked(
-    present: set[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_where_colmap_is_rejected_colours_are_asked(present: set[str], monkeypatch: pytest.MonkeyPatch):
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     good = problem.recon_from_camera
     shuffled = good[np.random.default_rng(4).permutation(8)]
-    nothing = NotTrustedError("0 of 8 images registered")
+    nothing = RejectedError("0 of 8 images registered")
     kept, tried = auto_result(problem, {"colmap": good}, monkeypatch)
     assert tried == ["colmap"] and kept.backend == "colmap" and not kept.notes
     kept, tried = auto_result(problem, {"colmap": shuffled, "direct": good}, monkeypatch)
@@ -264,11 +262,11 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     shuffled = good[rng.permutation(8)]
     kept, tried = auto_result(problem, {"sift": good}, monkeypatch)
     assert tried == ["colmap"] and not kept.notes
-    kept, tried = auto_result(problem, {"sift": NotTrustedError("0 of 8"), "xfeat": good}, monkeypatch)
+    kept, tried = auto_result(problem, {"sift": RejectedError("0 of 8"), "xfeat": good}, monkeypatch)
     assert tried == ["colmap", "colmap"]
     assert "colmap with sift failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
     # Two that fail, and a third that does not: all three are told.
-    refused = NotTrustedError("1 of 8")
+    refused = RejectedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
     assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
 
@@ -289,10 +287,10 @@ def test_what_plenty_of_features_reject_colours_do_not_accept(
     _, tried = auto_result(problem, answers, monkeypatch, observations=79)
     assert tried == ["colmap", "colmap", "da3"]
     # A scene full of features that agree on nothing is none without features; one of too few of them is.
-    lost = NotTrustedError("0 of 8 images registered", despite_texture=True)
-    with pytest.raises(NotTrustedError, match="0 of 8.*da3 was not tried"):
+    lost = RejectedError("0 of 8 images registered", despite_texture=True)
+    with pytest.raises(RejectedError, match="0 of 8.*da3 was not tried"):
         auto_result(problem, answers | {"sift": lost, "xfeat": lost}, monkeypatch)
-    few = NotTrustedError("0 of 8 images registered").with_more("too little texture")
+    few = RejectedError("0 of 8 images registered").with_more("too little texture")
     _, tried = auto_result(problem, answers | {"sift": few, "xfeat": lost}, monkeypatch)
     assert tried == ["colmap", "colmap", "da3"]
 
@@ -332,9 +330,9 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert (colmap["calibrate_s"], direct["calibrate_s"]) == (3.0, 3.0)
     assert content["timings_s"] == {"reconstruct": 420.0, "calibrate": 6.0, "report": 0.0}
     assert result.calibration.model_dump()["attempts"] == content["attempts"]
-    told = (tmp_path / "log.txt").read_text().splitlines()
-    assert told[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (rejected: ")
-    assert told[2] == (
+    printed = (tmp_path / "log.txt").read_text().splitlines()
+    assert printed[1].startswith("attempt 1: colmap registered 12 of 12 images, not kept (rejected: ")
+    assert printed[2] == (
         "attempt 2: direct registered 12 of 12 images, kept; reconstruct 400.00 s, calibrate 3.00 s"
     )
 
@@ -346,7 +344,7 @@ def test_every_attempt_is_accounted_for_with_the_time_that_each_stage_took(
     assert again.timings_s == {"reconstruct": 0.0, "calibrate": 3.0, "report": 0.0}
 
 
-def test_where_nothing_is_found_each_attempt_says_why(
+def test_where_nothing_is_found_each_attempt_reports_why(
     present: set[str], tmp_path: Path, tabletop: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from jcr.capture.read import read_capture
@@ -354,10 +352,10 @@ def test_where_nothing_is_found_each_attempt_says_why(
     from jcr.run_folder import RunFolder
 
     def door(capture: Capture, options: ReconstructOptions, progress: object) -> Reconstruction:
-        raise NotTrustedError(f"{options.backend} saw nothing")
+        raise RejectedError(f"{options.backend} saw nothing")
 
     monkeypatch.setattr(attempts, "reconstruct", door)
-    with pytest.raises(NotTrustedError, match="direct saw nothing; back end colmap failed"):
+    with pytest.raises(RejectedError, match="direct saw nothing; back end colmap failed"):
         calibrate(read_capture(tabletop), tmp_path)
     tried = RunFolder(tmp_path).calibration().attempts
     assert [(attempt.backend, attempt.images_registered, attempt.why_not) for attempt in tried] == [
@@ -475,8 +473,8 @@ def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_
         cv2.imwrite(str(tmp_path / f"{k}.png"), grey)
         pose = transform(rotation_exp(np.array([0.3 * k, 0.2, 0.1 * k * k])), np.array([0.1 * k, 0.0, 0.3]))
         frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
-    lens = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0] * 5}
-    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    intrinsics = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0] * 5}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     for backend in ("auto", "dust3r"):
         out = tmp_path / backend
         command = ["run", str(tmp_path), str(out), "--weights", str(garbage_weights), "--backend", backend]
@@ -489,7 +487,7 @@ def test_where_no_back_end_finds_a_pose_the_run_folder_keeps_the_licence_of_the_
 
 
 @pytest.mark.slow
-def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_says_so(
+def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_reports_it(
     tabletop: Path, tmp_path: Path, garbage_weights: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -521,7 +519,7 @@ def test_one_network_that_sees_all_views_is_asked_between_colmap_and_direct_alig
 ):
     present |= {"da3", "mapanything"}
     problem = hand_eye_problem(np.random.default_rng(3), 8)
-    good, nothing = problem.recon_from_camera, NotTrustedError("0 of 8 images registered")
+    good, nothing = problem.recon_from_camera, RejectedError("0 of 8 images registered")
     answers = {"colmap": nothing, "da3": nothing, "direct": good}
     kept, tried = auto_result(problem, answers, monkeypatch)
     assert tried == ["colmap", "da3", "direct"] and kept.backend == "direct"

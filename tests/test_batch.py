@@ -29,8 +29,8 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
 
     root = tmp_path_factory.mktemp("captures")
     content = json.loads((tabletop / "capture.json").read_text())
-    lens = content["intrinsics"] | {key: content["intrinsics"][key] / 2 for key in ("fx", "fy")}
-    lens |= {"cx": 159.5, "cy": 119.5}
+    intrinsics = content["intrinsics"] | {key: content["intrinsics"][key] / 2 for key in ("fx", "fy")}
+    intrinsics |= {"cx": 159.5, "cy": 119.5}
     for name, rows in (("a", range(4)), ("b", range(5)), ("broken", range(4)), ("plain", range(4))):
         (root / name / "images").mkdir(parents=True)
         frames = [content["frames"][k] for k in rows]
@@ -39,7 +39,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory, tabletop: Path) -> list[P
             if name == "plain":
                 image = Image.new("RGB", (320, 240), (90 + 8 * k, 90, 90))
             image.save(root / name / frame["image"], quality=95)
-        (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+        (root / name / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     (root / "broken" / "images" / "01.jpg").write_bytes(b"no picture")
     return [root / name for name in ("a", "b", "broken", "plain")]
 
@@ -51,9 +51,9 @@ def test_a_bad_capture_fails_alone_and_what_is_finished_is_not_run_again(
     names = [str(path) for path in captures]
     command = ["batch", *names, str(out), "--calibrate-only", "--processes", "2", "--quiet"]
     assert dispatch([*command, "--json"]) == 3
-    told = capsys.readouterr()
-    rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(told.out)["captures"]}
-    assert "of 4 captures failed or are rejected" in told.err and told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    rows = {Path(row["capture"]).name: Row(**row) for row in json.loads(printed.out)["captures"]}
+    assert "of 4 captures failed or are rejected" in printed.err and printed.err.count("\n") == 1
     assert rows["broken"].status == "failed" and "01.jpg: not a readable image" in rows["broken"].reason
     assert rows["plain"].status == "rejected" and "registered" in rows["plain"].reason
     assert rows["a"].images == 4 and rows["b"].images == 5 and rows["b"].offset_std_mm is not None

@@ -20,7 +20,7 @@ from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Capture, Intrinsics, Kind, Reconstruction, Tracks
 
 RNG = np.random.default_rng(0)
-LENS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+INTRINSICS = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
 
 
 def written(folder: Path, images: list[np.ndarray], frames: list[dict]) -> Path:
@@ -83,7 +83,7 @@ def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     made = Reconstruction(
         image_index=np.arange(12),
         recon_from_camera=problem.recon_from_camera,
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
         backend="given",
     )

@@ -49,7 +49,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def rooms() -> set[str]:
+def stages() -> set[str]:
     """Packages as `name/` and modules as `name.py`, of the top of the source."""
     packages = {f"{path.parent.name}/" for path in SOURCE.glob("*/__init__.py")}
     modules = {path.name for path in SOURCE.glob("*.py") if not path.name.startswith("__")}
@@ -205,10 +205,10 @@ def test_architecture_names_what_there_is():
                 missing.append(name)
             seen.add(name)
     assert not missing
-    assert not rooms() - seen
+    assert not stages() - seen
 
 
-def test_picture_shows_what_there_is():
+def test_image_shows_what_there_is():
     drawn = (ROOT / "docs" / "explanation" / "rooms.svg").read_text()
     assert drawn == runpy.run_path(str(ROOT / "docs" / "explanation" / "rooms.py"))["picture"]()
     names = re.findall(r'<text class="name"[^>]*>([^<]*)<', drawn)
@@ -217,7 +217,7 @@ def test_picture_shows_what_there_is():
         for text in names
         for name in unescape(text).split(", ")
     }
-    assert not rooms() - shown
+    assert not stages() - shown
 
 
 def test_version_and_date_of_the_release_are_the_same_everywhere():

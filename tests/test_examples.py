@@ -82,7 +82,7 @@ def test_ompl_plans_an_arm_past_the_mapped_things_without_touching_them(
     assert not truly_touches(path, true_mesh).any()
 
 
-def told(name: str, where: Path, *arguments: object) -> str:
+def printed(name: str, where: Path, *arguments: object) -> str:
     """What an example prints, run in a folder that has the project's examples and nothing else."""
     if not (where / "examples").exists():
         (where / "examples").symlink_to(EXAMPLES)
@@ -100,7 +100,7 @@ def numbers(pattern: str, text: str) -> list[float]:
 
 def test_quick_start_prints_the_true_camera_and_the_things_on_the_table(done: Path, tmp_path: Path):
     shutil.copytree(done, tmp_path / "out" / "quick_start")  # its finished stages are taken from there
-    text = told("01_quick_start", tmp_path)
+    text = printed("01_quick_start", tmp_path)
     rows = re.search(r"\(m\):\n(.*?)\none sigma", text, re.DOTALL)
     assert rows is not None and "verdict: accepted" in text
     found = np.array(re.findall(r"-?\d+\.\d*", rows[1]), float).reshape(4, 4)
@@ -117,7 +117,7 @@ def true_hand_eye() -> np.ndarray:
 
 
 def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: Path):
-    text = told("02_own_camera_poses", tmp_path)
+    text = printed("02_own_camera_poses", tmp_path)
     sigma_mm, sigma_deg = numbers(r"one sigma: (.+) mm, (.+)°", text)
     off_mm, off_deg = numbers(r"off the truth: (.+) mm, (.+)°", text)
     assert off_mm < 3 * np.sqrt(3) * sigma_mm < 10 and off_deg < 3 * np.sqrt(3) * sigma_deg < 1
@@ -128,7 +128,7 @@ def test_own_camera_poses_are_solved_and_what_sliding_hides_is_named(tmp_path: P
 
 def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):
     pytest.importorskip("rosbags", reason="rosbags is not installed (extra ros)")
-    text = told("03_ros_bag", tmp_path)
+    text = printed("03_ros_bag", tmp_path)
     assert "took 12 frames, intrinsics given" in text and "show everything: True" in text
     halts = jcr.read_capture(EXAMPLES / "tabletop").base_from_gripper[:, :3, 3]
     taken = [np.array(row.split(), float) for row in re.findall(r"gripper at \[(.+)\] m", text)]
@@ -138,14 +138,14 @@ def test_a_bag_gives_the_views_at_which_the_arm_halted(tmp_path: Path):
 
 
 def test_a_simulated_ur_arm_gives_a_capture_of_its_stops(tmp_path: Path):
-    assert "5 images in out/ur_robot" in told("04_ur_robot", tmp_path)
+    assert "5 images in out/ur_robot" in printed("04_ur_robot", tmp_path)
     taken, table = (jcr.read_capture(path) for path in (tmp_path / "out/ur_robot", EXAMPLES / "tabletop"))
     np.testing.assert_allclose(taken.base_from_gripper, table.base_from_gripper[:5], atol=1e-9)
 
 
-def test_the_splat_s_cameras_are_where_the_robot_held_them(done: Path, tmp_path: Path):
+def test_the_splat_s_cameras_are_where_the_robot_fixed_them(done: Path, tmp_path: Path):
     shutil.copytree(done, tmp_path / "run")
-    text = told("06_splat_export", tmp_path, "run")
+    text = printed("06_splat_export", tmp_path, "run")
     table = jcr.read_capture(EXAMPLES / "tabletop")
     heights = (table.base_from_gripper @ true_hand_eye())[:, 2, 3]
     assert "12 cameras of 640 x 480 px" in text

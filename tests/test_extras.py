@@ -53,7 +53,7 @@ def test_the_lowest_versions_are_those_that_are_tested():
         assert shortest == version or pinned[name].startswith(f"{version}.0."), name
 
 
-def test_a_package_that_is_there_but_broken_says_why(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_a_package_that_is_there_but_broken_reports_why(tmp_path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "brokenpackage.py").write_text("raise ImportError('libmissing.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"cannot be imported \(libmissing.so: no such file\): pip install"):

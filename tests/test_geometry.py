@@ -173,8 +173,8 @@ def test_nearest_rotation_of_a_reflection_is_proper():
 
 
 def test_angle_between_rotations_is_accurate_near_zero():
-    turn = rotation_exp(np.array([0.0, 1e-7, 0.0]))
-    assert rotation_between_deg(np.eye(3), turn) == pytest.approx(np.degrees(1e-7), rel=1e-6)
+    rotation = rotation_exp(np.array([0.0, 1e-7, 0.0]))
+    assert rotation_between_deg(np.eye(3), rotation) == pytest.approx(np.degrees(1e-7), rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,9 @@ MOMENTS: dict[str, Callable[[int, Path], bool]] = {
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_an_interrupted_run_says_so_in_one_line_and_resumes(moment: str, small_capture: Path, tmp_path: Path):
+def test_an_interrupted_run_reports_it_in_one_line_and_resumes(
+    moment: str, small_capture: Path, tmp_path: Path
+):
     out, temporary = tmp_path / "out", tmp_path / "temporary"
     temporary.mkdir()
     command = [sys.executable, "-m", "jcr", "calibrate", str(small_capture), str(out), "--quiet", "--json"]
@@ -32,11 +34,11 @@ def test_an_interrupted_run_says_so_in_one_line_and_resumes(moment: str, small_c
     ) as running:
         until(lambda: running.poll() is not None or MOMENTS[moment](running.pid, temporary))
         running.send_signal(signal.SIGINT)
-        _, told = running.communicate(timeout=60)
+        _, printed = running.communicate(timeout=60)
     # Python itself ends by the signal, which shells show as 130, where it was interrupted in what it compiled from
     # a string, as dataclasses are.
-    assert running.returncode in (130, -signal.SIGINT), told
-    assert told.startswith("error: interrupted") and told.count("\n") == 1
+    assert running.returncode in (130, -signal.SIGINT), printed
+    assert printed.startswith("error: interrupted") and printed.count("\n") == 1
     assert not out.exists() and not list(temporary.iterdir()), "nothing came of it"
     finished = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert finished.returncode in (0, 3), finished.stderr

@@ -140,7 +140,7 @@ def test_pairs_left_in_their_file_align_and_match_to_the_same_bits(tmp_path: Pat
 
 
 @pytest.mark.parametrize("system", ["linux", "macos"])
-def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
+def test_pointmaps_in_a_file_have_their_space_before_they_are_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, system: str
 ) -> None:
     from jcr.reconstruct.dust3r import predictor
@@ -157,7 +157,7 @@ def test_pointmaps_in_a_file_have_their_room_before_they_are_written(
     assert array.sum() == 3.0
 
 
-def test_a_disk_without_room_for_the_pointmaps_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_space_for_the_pointmaps_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from jcr.reconstruct.dust3r import predictor
 
     def full(*arguments: int) -> None:

@@ -31,7 +31,7 @@ def test_within_reach_of_the_marker_reference(
     assert solved.converged
     assert 1e3 * np.linalg.norm(solved.gripper_from_camera[:3, 3] - reference[:3, 3]) < max_mm
     assert rotation_between_deg(solved.gripper_from_camera[:3, :3], reference[:3, :3]) < max_deg
-    assert solved.held_out is not None and solved.held_out.translation_mm < 6.0
+    assert solved.leave_one_out is not None and solved.leave_one_out.translation_mm < 6.0
     assert any("folds over" in text for text in found.warnings) == (name == "doosan_bench")
     assert len(found.image_index) == count
     # To within the few millimetres to which the references are good, and the poses of both robots.
@@ -51,7 +51,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
     found, given = solved.intrinsics, solved.with_given_intrinsics
     assert found is not None and found.fx == pytest.approx(found.fy, rel=2e-3)
     assert capture.intrinsics is not None and capture.intrinsics.fx > 1.005 * capture.intrinsics.fy
-    assert solved.held_out is not None and solved.held_out.translation_mm < 2.0
+    assert solved.leave_one_out is not None and solved.leave_one_out.translation_mm < 2.0
     reference = json.loads((capture.folder / "reference.json").read_text())["gripper_from_camera"]
     assert given is not None
     off = [
@@ -61,7 +61,7 @@ def test_nominal_intrinsics_are_contradicted_by_their_images(real_captures: Path
     assert off[0] < 10 < off[1]
 
 
-def test_a_plain_background_is_not_trusted(real_captures: Path):
+def test_a_plain_background_is_rejected(real_captures: Path):
     capture = jcr.read_capture(real_captures / "franka_plain_background")
-    with pytest.raises(jcr.NotTrustedError, match=r"0 of 8 images \(too little texture"):
+    with pytest.raises(jcr.RejectedError, match=r"0 of 8 images \(too little texture"):
         reconstruct(capture)

@@ -54,7 +54,7 @@ def test_points_that_are_where_the_truth_has_them_agree(done: Path, touched: Pat
     assert found.rms < 3 * found.expected
 
 
-def test_a_tip_that_is_off_is_told_by_status_3_and_its_mean(
+def test_a_tip_that_is_off_is_named_by_status_3_and_its_mean(
     done: Path, touched: Path, tmp_path: Path, capsys
 ):
     lines = [line.split(",") for line in touched.read_text().splitlines()]

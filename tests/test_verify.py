@@ -59,12 +59,12 @@ def cameras(capture: Capture, x: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def reconstruction(capture: Capture, x: np.ndarray) -> Reconstruction:
     """Of the old images, as a structure from motion without error would give."""
-    lens = capture.intrinsics
-    assert lens is not None
+    intrinsics = capture.intrinsics
+    assert intrinsics is not None
     return Reconstruction(
         image_index=np.arange(OLD),
         recon_from_camera=cameras(capture, x)[:OLD],
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
         backend="colmap",
     )
@@ -88,7 +88,7 @@ def test_new_images_are_located_to_a_fraction_of_a_millimetre(
         assert place.sigma_px < 0.6
 
 
-def test_a_picture_of_something_else_is_not_located(reconstruction: Reconstruction, capture: Capture):
+def test_a_image_of_something_else_is_not_located(reconstruction: Reconstruction, capture: Capture):
     images = [read_image(capture.folder / name) for name in capture.images]
     noise = np.random.default_rng(0).integers(0, 255, images[0].shape, dtype=np.uint8)
     other, plain = relocate(reconstruction, images[:OLD], [noise, np.full_like(noise, 90)])
@@ -192,7 +192,7 @@ def test_what_is_called_detectable_is_detected_nine_times_in_ten(capture: Captur
     assert sum(found) >= 22
 
 
-def test_a_moved_table_is_told_from_a_moved_camera(capture: Capture, x: np.ndarray):
+def test_a_moved_table_is_distinguished_from_a_moved_camera(capture: Capture, x: np.ndarray):
     exact = (0.05, 0.01)
     rows = [9, 10, 11]
     assert drifts(capture, x, 0, rows, exact, nudge=NUDGE).cause == "scene"
@@ -282,18 +282,18 @@ def test_the_new_images_may_come_with_a_table_of_poses(out: Path, capture: Captu
     assert json.loads(capsys.readouterr().out)["images"] == list(today.images)
 
 
-def test_the_command_finds_a_bump_from_one_image_and_says_what_to_do(
+def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(
     out: Path, capture: Capture, x: np.ndarray, tmp_path: Path, capsys
 ):
     poses = capture.base_from_gripper @ x @ inverse(x @ BUMP)
     write_capture(tmp_path / "today", capture, poses, [10])
     assert dispatch(["verify", str(out), str(tmp_path / "today"), "--quiet", "--json"]) == 3
-    told = capsys.readouterr()
-    found = json.loads(told.out)
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
     assert found["moved"] and found["p_value"] < 1e-3 and found["cause"] == "either"
     assert np.linalg.norm(found["drift_mm"]) == pytest.approx(3.0, abs=2.0)
     assert np.linalg.norm(found["drift_deg"]) == pytest.approx(1.0, abs=0.3)
-    assert "calibrate again" in told.err
+    assert "calibrate again" in printed.err
 
 
 def test_another_scene_with_few_images_cannot_tell(out: Path, capture: Capture, tmp_path: Path, capsys):

@@ -95,7 +95,7 @@ def test_calibrate_needs_no_option_for_it(capture: Path, calibrated: Path, tmp_p
     ],
     ids=lambda arguments: arguments[0],
 )
-def test_what_needs_torch_says_what_to_install_before_any_work(
+def test_what_needs_torch_shows_what_to_install_before_any_work(
     arguments: tuple[str, ...], capture: Path, calibrated: Path, tmp_path: Path
 ):
     mapped = tmp_path / "mapped"

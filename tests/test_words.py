@@ -11,7 +11,7 @@ from places import ROOT
 GENERATED = ("cli.md", "api.md", "formats.md")
 """From the source, when the site is built."""
 
-SAY = {
+WORDS = {
     r"\boffset (?:of the camera|in the gripper)\b|\bof the offset\b|\bthe offset is\b": "translation",
     r"\blens(?:es)?\b": "intrinsics, or distortion; the glass alone is a lens",
     r"\bpictures?\b": "image",
@@ -55,7 +55,7 @@ def faults(text: str) -> list[str]:
     """Every word that is not said, with what is."""
     text = MEANT.sub(" ", re.sub(r"\s+", " ", without_code(text)))
     return [
-        f"{found[0]!r}: {right}" for wrong, right in SAY.items() for found in re.finditer(wrong, text, re.I)
+        f"{found[0]!r}: {right}" for wrong, right in WORDS.items() for found in re.finditer(wrong, text, re.I)
     ]
 
 
@@ -80,11 +80,11 @@ MODULES = sorted([*(ROOT / "src" / "jcr").rglob("*.py"), *(ROOT / "benchmarks").
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_documents_say_it_in_the_words_of_the_field(page: Path):
+def test_documents_show_it_in_the_words_of_the_field(page: Path):
     assert faults(page.read_text()) == []
 
 
-def test_source_says_it_in_the_words_of_the_field():
+def test_source_shows_it_in_the_words_of_the_field():
     found = {
         str(file.relative_to(ROOT)): [f for text in strings(file) for f in faults(text)] for file in MODULES
     }

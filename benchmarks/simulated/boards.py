@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.simulated.faults import LENS, FaultyCapture
+from benchmarks.simulated.faults import INTRINSICS, FaultyCapture
 from jcr.camera import project
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.records import Boards, Body
@@ -39,8 +39,8 @@ def with_sheet(found: FaultyCapture, rng: np.random.Generator, sheet: Sheet) -> 
     tracks = found.tracks
     first, image, x_px = len(tracks.points_in_recon), [tracks.image], [tracks.x_px]
     for k, camera in enumerate(found.base_from_camera):
-        seen = project(found.lens, apply(inverse(camera), x_in_base))
-        if ((seen > 0) & (seen < [LENS.width, LENS.height])).all():
+        seen = project(found.intrinsics, apply(inverse(camera), x_in_base))
+        if ((seen > 0) & (seen < [INTRINSICS.width, INTRINSICS.height])).all():
             image.append(np.full(len(grid), k))
             x_px.append(seen + sheet.noise_px * rng.normal(size=seen.shape))
     row = first + np.arange(len(grid))

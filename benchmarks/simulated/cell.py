@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.simulated.arm_errors import PRESETS, PresetName
-from benchmarks.simulated.observations import LENS
+from benchmarks.simulated.observations import INTRINSICS
 from benchmarks.simulated.problem import disturbed
 from jcr.adjust.robots import ArmPoses
 from jcr.adjust.scene import Observations
@@ -107,7 +107,7 @@ class _Cell:
     """base_from_rig of each arm, then of fixed cameras."""
     mounts: list[Float[ndarray, "4 4"]] = field(default_factory=lambda: [np.eye(4)])
     """rig_from_camera of each camera."""
-    cameras: list[Intrinsics] = field(default_factory=lambda: [LENS])
+    cameras: list[Intrinsics] = field(default_factory=lambda: [INTRINSICS])
     images: list[tuple[int, int]] = field(default_factory=list)
     """Row of the rig and of the camera that took each."""
     truth: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)

@@ -19,7 +19,7 @@ from jcr.records import Intrinsics, Tracks
 from jcr.simulate.poses import gripper_poses, random_hand_eye
 from jcr.simulate.robots import EFFECTIVE_NOISE, EFFECTIVE_POSES
 
-LENS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
+INTRINSICS = Intrinsics(620.0, 620.0, 319.5, 239.5, 640, 480, NO_DISTORTION)
 """What the user believes the camera to be."""
 POINTS, NOISE_PX = 500, 0.4
 """On the table and what stands on it, and one sigma of their observations."""
@@ -36,7 +36,7 @@ class Faults:
     """Relative, one sigma, between images."""
     zoom: float = 0.0
     """Relative, in the second half of the capture."""
-    lens: tuple[tuple[str, float], ...] = ()
+    intrinsics: tuple[tuple[str, float], ...] = ()
     """Names of its parameters, and by how much the true one is more than the believed one."""
     rolling_px: float = 0.0
     """By how much the last row is shifted against the first in x."""
@@ -83,7 +83,7 @@ class FaultyCapture:
     """Before a slip; of poses that are bent the effective one."""
     gripper_from_camera_after: Float[ndarray, "4 4"]
     """After it; of poses that are bent that of the true ones."""
-    lens: Intrinsics
+    intrinsics: Intrinsics
     """As believed."""
 
 
@@ -105,18 +105,23 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
     share = (depth - depth.mean()) / max(float(np.ptp(depth)), 1e-9)
     focal = np.exp(faults.focal_by_distance * share + faults.focal_scatter * rng.normal(size=images))
     focal *= np.where(np.arange(images) < images / 2, 1.0, 1 + faults.zoom)
-    off = dict(faults.lens)
+    off = dict(faults.intrinsics)
     camera = with_parameters(
-        LENS, parameters(LENS) + np.array([off.get(name, 0.0) for name in parameter_names(LENS)])
+        INTRINSICS,
+        parameters(INTRINSICS) + np.array([off.get(name, 0.0) for name in parameter_names(INTRINSICS)]),
     )
     image, point, pixels = [], [], []
     for k in range(images):
         x_in_camera = apply(inverse(cameras[k]), points)
         x_px = project(zoomed(camera, float(focal[k])), x_in_camera)
-        x_px[:, 0] += faults.rolling_px * (x_px[:, 1] / LENS.height - 0.5)
+        x_px[:, 0] += faults.rolling_px * (x_px[:, 1] / INTRINSICS.height - 0.5)
         x_px += camera.fx * _through_prism(x_in_camera[:, :2] / x_in_camera[:, 2:], faults.prism)
         x_px -= faults.centre_sags_px * cameras[k, 2, :2]  # gravity, along -z of the base, in camera axes
-        inside = (x_px > 0).all(1) & (x_px < [LENS.width, LENS.height]).all(1) & (x_in_camera[:, 2] > 0)
+        inside = (
+            (x_px > 0).all(1)
+            & (x_px < [INTRINSICS.width, INTRINSICS.height]).all(1)
+            & (x_in_camera[:, 2] > 0)
+        )
         seen = np.flatnonzero(inside)
         image.append(np.full(len(seen), k))
         point.append(seen)
@@ -130,7 +135,7 @@ def faulty_capture(rng: np.random.Generator, images: int = 12, faults: Faults = 
         base_from_camera=cameras,
         gripper_from_camera=x,
         gripper_from_camera_after=slipped,
-        lens=LENS,
+        intrinsics=INTRINSICS,
     )
 
 

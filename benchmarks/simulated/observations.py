@@ -7,7 +7,7 @@ from jcr.camera import project
 from jcr.geometry import apply, inverse
 from jcr.records import Intrinsics, Tracks
 
-LENS = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (-0.08, 0.05, 1e-3, -5e-4, 0.01))
+INTRINSICS = Intrinsics(620.0, 618.0, 322.0, 236.0, 640, 480, (-0.08, 0.05, 1e-3, -5e-4, 0.01))
 
 
 def observed(
@@ -15,7 +15,7 @@ def observed(
     rng: np.random.Generator,
     points: int,
     noise_px: float,
-    camera: Intrinsics = LENS,
+    camera: Intrinsics = INTRINSICS,
 ) -> Tracks:
     """Points scattered over the table, seen with noise (px) by every camera that has them in its image."""
     low, high = np.array([0.25, -0.25, 0.0]), np.array([0.75, 0.25, 0.12])

@@ -8,10 +8,10 @@ from jcr.calibration.checks.views import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import robot_errors
 from jcr.calibration.stage import calibrate
-from jcr.calibration.words import missed
+from jcr.calibration.words import leave_one_out_text
 from jcr.depth.densify import densify
 from jcr.depth.options import DepthOptions
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.memory import give_back
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BACKENDS, ReconstructOptions, reconstruct, tries
@@ -21,8 +21,8 @@ from jcr.records import (
     Capture,
     Finding,
     HandEye,
-    HeldOut,
     Kind,
+    LeaveOneOut,
     Mend,
     Reconstruction,
     no_reconstruction,
@@ -31,11 +31,11 @@ from jcr.records import (
 from jcr.records.words import remedy, text
 
 
-class NothingFoundError(NotTrustedError):
+class NothingFoundError(RejectedError):
     """No back end that was tried came to a calibration; `findings` say why, strongest first."""
 
     def __init__(
-        self, failure: NotTrustedError, attempts: tuple[Attempt, ...], causes: tuple[Finding, ...] = ()
+        self, failure: RejectedError, attempts: tuple[Attempt, ...], causes: tuple[Finding, ...] = ()
     ) -> None:
         self.attempts = attempts
         self.findings = strongest_first((*causes, *no_reconstruction(failure)))
@@ -54,7 +54,7 @@ class Tried:
     """For the files."""
     made: Reconstruction | None = None
     calibrated: HandEye | None = None
-    failure: InputError | NotTrustedError | None = None
+    failure: InputError | RejectedError | None = None
     """Why there is no calibration."""
     before: tuple[Attempt, ...] = ()
     after: tuple[Attempt, ...] = ()
@@ -83,14 +83,14 @@ class Tried:
         return self.calibrated
 
     @property
-    def held_out(self) -> HeldOut | None:
+    def leave_one_out(self) -> LeaveOneOut | None:
         """The leave-one-out error; None where there were too few images, or nothing was found."""
-        return None if self.calibrated is None else self.calibrated.held_out
+        return None if self.calibrated is None else self.calibrated.leave_one_out
 
     @property
     def leave_one_out_m(self) -> float:
         """The leave-one-out error as one length; infinite where there is none."""
-        return float("inf") if self.held_out is None else self.held_out.length_m
+        return float("inf") if self.leave_one_out is None else self.leave_one_out.length_m
 
     @property
     def name(self) -> str:
@@ -107,9 +107,9 @@ class Tried:
     @property
     def with_error(self) -> str:
         """The name with the leave-one-out error."""
-        if self.held_out is None:
+        if self.leave_one_out is None:
             return f"{self.name} (too few images to leave one out)"
-        return f"{self.name} (leave-one-out error {missed(self.held_out)})"
+        return f"{self.name} (leave-one-out error {leave_one_out_text(self.leave_one_out)})"
 
     def noted(self, note: str) -> "Tried":
         """The same with one more note."""
@@ -118,13 +118,13 @@ class Tried:
 
     def kept_after(self, other: "Tried", why_not: str | None = None) -> "Tried":
         """This one kept, which was tried after another; `why_not` is why that is not, where it did not fail."""
-        return replace(self, before=(*other.before, other.turned_down(why_not), *other.after))
+        return replace(self, before=(*other.before, other.rejected_attempts(why_not), *other.after))
 
     def kept_before(self, other: "Tried", why_not: str | None = None) -> "Tried":
         """This one kept, which was tried before another; `why_not` is why that is not, where it did not fail."""
-        return replace(self, after=(*self.after, other.turned_down(why_not)))
+        return replace(self, after=(*self.after, other.rejected_attempts(why_not)))
 
-    def turned_down(self, why_not: str | None) -> Attempt:
+    def rejected_attempts(self, why_not: str | None) -> Attempt:
         """The account of one that is not kept; what failed has its own reason."""
         return self.account if why_not is None else replace(self.account, why_not=why_not)
 
@@ -174,7 +174,7 @@ def is_textured(tried: Tried, images: int) -> bool:
     if tried.account.backend != "colmap" or tried.account.features not in (None, "sift"):
         return False
     if tried.made is None:
-        return isinstance(tried.failure, NotTrustedError) and tried.failure.despite_texture
+        return isinstance(tried.failure, RejectedError) and tried.failure.despite_texture
     return len(tried.made.tracks.image) >= TEXTURED * images
 
 
@@ -251,7 +251,7 @@ def _not_overruled(kept: Tried, backend: str) -> Tried:
     )
     if kept.calibrated is not None:
         return kept.noted(note)
-    assert isinstance(kept.failure, NotTrustedError)
+    assert isinstance(kept.failure, RejectedError)
     return replace(kept, failure=kept.failure.with_more(note))
 
 
@@ -292,7 +292,7 @@ def _tried(
     features = None if options.features == "auto" else options.features
     try:
         reconstruction = reconstruct(capture, options, progress)
-    except (InputError, NotTrustedError) as error:
+    except (InputError, RejectedError) as error:
         seconds = round(time.perf_counter() - start, 3)
         account = Attempt(
             backend=options.backend,
@@ -360,7 +360,7 @@ def _calibrated(
 
     try:
         hand_eye = calibrate(capture, tried.reconstruction, options)
-    except NotTrustedError as error:
+    except RejectedError as error:
         return replace(tried, account=account(str(error)), failure=error.with_traceback(None))
     calibrated = replace(tried, account=account(None), calibrated=hand_eye)
     give_back()
@@ -384,7 +384,7 @@ def _better(one: Tried, other: Tried) -> Tried:
         if other.calibrated is None:
             # The licence of weights that were used belongs to this answer, too.
             why = other.failure
-            failure = why if isinstance(why, NotTrustedError) else NotTrustedError(str(why))
+            failure = why if isinstance(why, RejectedError) else RejectedError(str(why))
             return replace(other, failure=failure.with_more(nothing)).kept_after(one)
         return other.noted(f"{nothing}; {other.with_error} was used instead").kept_after(one)
     untrusted = f"rejected: {one.hand_eye.doubt}"

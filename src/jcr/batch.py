@@ -21,7 +21,7 @@ from typing import Literal, get_args
 from jcr.calibration.calibration_json import CalibrationFile
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.extras import extra
 from jcr.files import write_text
 from jcr.pipeline import RunOptions, calibrate, run
@@ -137,7 +137,7 @@ def run_one(task: Task) -> Row:
         try:
             result = (calibrate if task.calibrate_only else run)(capture, task.out, task.run)
             content, reason = result.calibration, ""
-        except NotTrustedError as error:
+        except RejectedError as error:
             content, reason = RunFolder(task.out).calibration(), str(error)
         row = replace(_row(task, content), seconds=round(time.perf_counter() - start, 2))
         named = next((sentence(one) for one in content.findings if one.severity != "informs"), "")

@@ -228,7 +228,7 @@ def fold_distance_px(camera: Intrinsics) -> float | None:
     return float(np.linalg.norm(at_fold - [camera.cx, camera.cy], axis=-1).min())
 
 
-def usable_lens(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
+def usable_intrinsics(camera: Intrinsics | None) -> tuple[Intrinsics | None, tuple[str, ...]]:
     """Given intrinsics, without a distortion that has no inverse, and a warning that says so.
 
     With such a distortion images do not register.

@@ -32,7 +32,7 @@ from jcr.calibration.stage import checked
 from jcr.camera import fold_distance_px
 from jcr.capture.images import brightness_and_sharpness, exposure_fault, read_image
 from jcr.capture.read import read_source
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import largest_motion
 from jcr.handeye.conventions import better_reading, convention_finding
 from jcr.handeye.observability import observability
@@ -67,7 +67,7 @@ class Examination:
     sharpness: Float[ndarray, " n"]
     """Variance of the Laplacian, relative to the median image's; empty where there are no images."""
     largest_move_m: float
-    largest_turn_rad: float
+    largest_rotation_rad: float
     """Between any two gripper poses."""
     observability: Observability
     expected: Expectation | None
@@ -140,7 +140,7 @@ def check(
     return Examination(
         sharpness=alone.sharpness,
         largest_move_m=alone.move_m,
-        largest_turn_rad=alone.turn_rad,
+        largest_rotation_rad=alone.rotation_rad,
         observability=seen,
         expected=ahead.expected(0) if len(counted) >= FEWEST else None,
         counted=counted,
@@ -163,7 +163,7 @@ class _Alone:
 
     robot: RobotErrors
     move_m: float
-    turn_rad: float
+    rotation_rad: float
     """The largest between two gripper poses."""
     clear: Int[ndarray, " c"]
     """Rows of the images that are sharp and well exposed."""
@@ -175,20 +175,20 @@ class _Alone:
 
 def _examine_alone(capture: Capture | PosePairs) -> _Alone:
     gripper = capture.base_from_gripper
-    move_m, turn_rad = largest_motion(gripper)
+    move_m, rotation_rad = largest_motion(gripper)
     alone = _Alone(
         robot=errors_of(gripper),
         move_m=move_m,
-        turn_rad=turn_rad,
+        rotation_rad=rotation_rad,
         clear=np.arange(len(gripper)),
         sharpness=np.zeros(0),
         views=(),
         remarks=tuple(capture.notes),
     )
-    if alone.move_m < 5e-3 and alone.turn_rad > np.radians(5):
+    if alone.move_m < 5e-3 and alone.rotation_rad > np.radians(5):
         divided = (
             f"the gripper moves by at most {1e3 * alone.move_m:.2g} mm while it rotates by "
-            f"{np.degrees(alone.turn_rad):.0f}°: the positions may have been divided by 1000"
+            f"{np.degrees(alone.rotation_rad):.0f}°: the positions may have been divided by 1000"
         )
         alone = replace(alone, remarks=(*alone.remarks, divided))
     return _with_images(alone, capture) if isinstance(capture, Capture) else alone
@@ -294,7 +294,7 @@ def _compare_registered(
         options = replace(options, working_size_px=size_px)
     try:
         found = reconstruct(capture, options, progress)
-    except NotTrustedError as error:
+    except RejectedError as error:
         board = None
         if size_px is None:
             board = proposed([read_image(capture.folder / name) for name in capture.images])

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from jcr.arrays_json import Part, Spreads
 from jcr.geometry import HUGE
-from jcr.records import COEFFICIENTS, Intrinsics, LensModel, coefficients_of
+from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics, coefficients_of
 
 LARGEST = 100_000
 """Pixels across; no camera's image is wider."""
@@ -26,7 +26,7 @@ class IntrinsicsJson(Part):
     distortion: Annotated[list[float], Field(min_length=4, max_length=8)]
     width: Pixels
     height: Pixels
-    model: LensModel = "pinhole"
+    model: DistortionModel = "pinhole"
 
     @model_validator(mode="after")
     def _as_many_as_the_model_has(self) -> "IntrinsicsJson":

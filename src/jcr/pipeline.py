@@ -18,7 +18,7 @@ from jcr.calibration.poses import is_one
 from jcr.capture.added import read_added, with_images
 from jcr.capture.read import read_capture
 from jcr.cell.added import camera_of, keep_camera, read_added_cameras
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.reconstruct.backends import BackendName
@@ -187,7 +187,7 @@ def add_camera(
     before, report = RunFolder(Path(out)), progress or silent
     options, capture = RunOptions.of(before.options(), map=None), before.capture()
     if (doubt := before.calibration().doubt) is not None:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{out}: its calibration is rejected, so no camera can be located with it: {doubt}"
         )
     with locked(Path(out)) as folder:
@@ -199,7 +199,7 @@ def add_camera(
         located = stages.cameras(result, (*added, camera), folder, options, report)
         assert located is not None
         if (found := located.cameras[-1]).doubt is not None:
-            raise NotTrustedError(f"{name}: {found.doubt}")
+            raise RejectedError(f"{name}: {found.doubt}")
         keep_camera(folder.path, capture, camera)
         result = stages.located(result, folder, options, report)
         if folder.has_map():

@@ -18,7 +18,7 @@ from jcr.capture.images import read_image
 from jcr.capture.read import read_source
 from jcr.cell.added import camera_of, read_added_cameras
 from jcr.distributions import chi2
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import step_between
 from jcr.handeye.equation import Poses
 from jcr.handeye.fit import PoseFit, PoseProblem, fit_poses
@@ -146,7 +146,7 @@ def verify(
             (calibration, capture, reconstruction, options_then.calibrate), new, located, lost, options
         )
     if len(new) < MIN_TO_RECALIBRATE:
-        raise NotTrustedError(
+        raise RejectedError(
             f"cannot tell: {'; '.join(lost)}; take images of the scene that was calibrated on, or "
             f"{MIN_TO_RECALIBRATE} or more of another one"
         )
@@ -257,7 +257,7 @@ def verify_camera(
     found = place_cameras(capture, [then, now], reconstruction, hand_eye, made_with.calibrate, progress)
     for camera in found.cameras:
         if camera.parent_from_camera is None:
-            raise NotTrustedError(f"cannot tell: {camera.doubt}")
+            raise RejectedError(f"cannot tell: {camera.doubt}")
     assert found.answer is not None
     before, after = found.of[name], found.of[now.name]
     j = found.answer.derivative(after) - found.answer.derivative(before)
@@ -372,7 +372,7 @@ def _by_recalibration(
     reconstruction = reconstruct(new, reconstruct_options, progress)
     hand_eye = calibrate(new, reconstruction)
     if not hand_eye.converged:
-        raise NotTrustedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
+        raise RejectedError(f"cannot tell: a new calibration from these images failed ({hand_eye.doubt})")
     before = np.array(calibration.gripper_from_camera)
     offset = step_between(before, hand_eye.gripper_from_camera)
     covariance = np.array(calibration.uncertainty.covariance)[:6, :6] + hand_eye.covariance[:6, :6]

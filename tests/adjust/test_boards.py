@@ -9,7 +9,7 @@ from benchmarks.simulated.boards import Sheet, with_sheet
 from benchmarks.simulated.faults import Faults, FaultyCapture, faulty_capture
 from jcr.adjust.boards import shapes_of
 from jcr.adjust.images import ImageEvidence, adjust_images
-from jcr.adjust.intrinsics_prior import HELD, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, prior_of
 from jcr.adjust.projection import derivatives, shape_residuals
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.scene import Freedom, Observations, Scene, similarities, stepped
@@ -22,8 +22,8 @@ def adjusted(seed: int, sheet: Sheet, images: int = 8) -> Adjusted:
     found = with_sheet(faulty_capture(rng, images, Faults(robot_noise=(1e-5, 1e-5))), rng, sheet)
     cameras = found.base_from_camera
     start = found.gripper_from_camera, 1.0, np.eye(4)
-    prior = prior_of(found.lens, HELD)
-    return adjust_wrist(found.base_from_gripper, start, cameras, found.lens, found.tracks, prior=prior)
+    prior = prior_of(found.intrinsics, FIXED)
+    return adjust_wrist(found.base_from_gripper, start, cameras, found.intrinsics, found.tracks, prior=prior)
 
 
 def test_the_derivatives_of_corners_are_those_of_their_residuals():
@@ -105,10 +105,10 @@ def images_alone(found: FaultyCapture) -> ImageEvidence:
     scene = Scene(
         world_from_rig=np.concatenate([found.base_from_camera, bodies]),
         rig_from_camera=np.eye(4)[None],
-        cameras=(found.lens,),
+        cameras=(found.intrinsics,),
         points_in_world=points,
     )
-    freedom = Freedom.of((found.lens,), (prior_of(found.lens, HELD),), each)
+    freedom = Freedom.of((found.intrinsics,), (prior_of(found.intrinsics, FIXED),), each)
     return adjust_images(scene, Observations.of_one_camera(tracks, each, boards), freedom)
 
 

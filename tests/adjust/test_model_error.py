@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import hand_eye_problem
-from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.model_error import TYPICAL, displacements
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.wrist import adjust_wrist
@@ -23,7 +23,7 @@ def adjusted(warp_px: float) -> Adjusted:
     rng = np.random.default_rng(3)
     problem = hand_eye_problem(rng, 12, robot_noise=(1e-4, np.radians(0.01)))
     tracks = observed(problem, rng, 400, 0.1)
-    u, v = (2 * np.pi * tracks.x_px / [LENS.width, LENS.height]).T
+    u, v = (2 * np.pi * tracks.x_px / [INTRINSICS.width, INTRINSICS.height]).T
     tracks = replace(tracks, x_px=tracks.x_px + warp_px * np.stack([np.sin(v), np.sin(u)], axis=1))
     start = solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     guess = Intrinsics(619.0, 619.0, 319.5, 239.5, 640, 480)
@@ -39,13 +39,15 @@ def adjusted(warp_px: float) -> Adjusted:
 
 def test_displacements_are_beside_what_the_intrinsics_express():
     rng = np.random.default_rng(0)
-    x_px, prior = rng.uniform([0, 0], [640, 480], (500, 2)), prior_of(LENS, ESTIMATED)
-    by = displacements((LENS,), (prior,), x_px, np.zeros(500, int)).reshape(1000, -1)
-    of_intrinsics = (by_parameters(LENS, unproject(LENS, x_px)) @ prior.directions).reshape(1000, -1)
+    x_px, prior = rng.uniform([0, 0], [640, 480], (500, 2)), prior_of(INTRINSICS, ESTIMATED)
+    by = displacements((INTRINSICS,), (prior,), x_px, np.zeros(500, int)).reshape(1000, -1)
+    of_intrinsics = (by_parameters(INTRINSICS, unproject(INTRINSICS, x_px)) @ prior.directions).reshape(
+        1000, -1
+    )
     size = np.linalg.norm(by, axis=0).max() * np.linalg.norm(of_intrinsics, axis=0)
     assert np.abs(by.T @ of_intrinsics / size).max() < 1e-9
-    exact = prior_of(LENS, HELD)
-    assert displacements((LENS,), (exact,), x_px, np.zeros(500, int)).shape == (500, 2, 0)
+    exact = prior_of(INTRINSICS, FIXED)
+    assert displacements((INTRINSICS,), (exact,), x_px, np.zeros(500, int)).shape == (500, 2, 0)
 
 
 def test_the_size_of_what_the_model_leaves_is_found():

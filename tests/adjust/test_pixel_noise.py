@@ -7,10 +7,10 @@ import pytest
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.adjust.images import ImageEvidence, adjust_images
-from jcr.adjust.intrinsics_prior import HELD, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, prior_of
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.geometry import step_between
 from jcr.records import Tracks
@@ -34,13 +34,13 @@ def adjusted(seed: int, stated: str) -> tuple[ImageEvidence, Float[ndarray, "11 
         Scene(
             world_from_rig=problem.recon_from_camera,
             rig_from_camera=np.eye(4)[None],
-            cameras=(LENS,),
+            cameras=(INTRINSICS,),
             points_in_world=exact.points_in_recon,
         ),
         Observations.of_one_camera(
             Tracks(exact.image, x_px, exact.point, exact.points_in_recon, std_px=of[stated]), 12
         ),
-        Freedom.of((LENS,), (prior_of(LENS, HELD),), 12),
+        Freedom.of((INTRINSICS,), (prior_of(INTRINSICS, FIXED),), 12),
     )
     return found, step_between(problem.recon_from_camera, found.scene.world_from_rig)[1:, 3:]
 
@@ -65,9 +65,9 @@ def test_better_observations_count_more():
 def test_covariance_is_that_of_the_errors():
     squares = []
     for seed in SEEDS:
-        found, missed = adjusted(seed, "size")
+        found, errors = adjusted(seed, "size")
         of_rotations = found.rig_covariance().reshape(12, 6, 12, 6)[1:, 3:, 1:, 3:].reshape(33, 33)
-        squares.append(missed.ravel() ** 2 / np.diag(of_rotations))
+        squares.append(errors.ravel() ** 2 / np.diag(of_rotations))
     assert np.mean(squares) == pytest.approx(1.0, abs=0.4)
     assert adjusted(0, "size")[0].noise.sigma_px[0] == pytest.approx(np.sqrt(0.05 * 0.5), rel=0.2)
 

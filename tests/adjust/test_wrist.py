@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 import jcr
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.adjust import together
 from jcr.adjust.images import median_reprojection_px
@@ -17,13 +17,15 @@ from jcr.geometry import step_between
 from jcr.records import Intrinsics, Tracks
 
 
-def solved(problem: HandEyeProblem, tracks: Tracks, lens: Intrinsics = LENS, **options) -> Adjusted:
+def solved(
+    problem: HandEyeProblem, tracks: Tracks, intrinsics: Intrinsics = INTRINSICS, **options
+) -> Adjusted:
     start = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
     return adjust_wrist(
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),
         problem.recon_from_camera,
-        lens,
+        intrinsics,
         tracks,
         **options,
     )
@@ -48,9 +50,9 @@ def test_a_focal_length_off_by_five_percent_is_found():
     rng = np.random.default_rng(2)
     problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)), camera_noise=(5e-3, 0.01))
     tracks = observed(problem, rng, 600, 0.3)
-    guess = Intrinsics(LENS.fx * 1.05, LENS.fy * 1.05, 319.5, 239.5, 640, 480)
+    guess = Intrinsics(INTRINSICS.fx * 1.05, INTRINSICS.fy * 1.05, 319.5, 239.5, 640, 480)
     adjusted = solved(problem, tracks, guess, prior=prior_of(guess, ESTIMATED))
-    assert adjusted.placed.scene.cameras[0].fx == pytest.approx(LENS.fx, rel=2e-3)
+    assert adjusted.placed.scene.cameras[0].fx == pytest.approx(INTRINSICS.fx, rel=2e-3)
     assert np.linalg.norm(error(problem, adjusted.placed.x[0], problem.scale)[:3]) < 1e-3
 
 
@@ -65,7 +67,7 @@ def test_wrong_matches_do_not_pull():
 
 
 @pytest.mark.parametrize("views", [2, 3, 8])
-def test_noise_of_the_pictures_is_found_from_short_tracks_too(views: int):
+def test_noise_of_the_images_is_found_from_short_tracks_too(views: int):
     # A point seen twice takes up three of its four errors.
     rng = np.random.default_rng(5)
     problem = hand_eye_problem(rng, 8, robot_noise=(1e-4, np.radians(0.01)))
@@ -89,8 +91,8 @@ def test_robot_noise_is_found_and_the_ellipsoid_covers():
         problem = hand_eye_problem(rng, 10, robot_noise=noise)
         tracks = observed(problem, rng, 80, 0.3)
         adjusted = solved(problem, tracks)
-        missed = error(problem, adjusted.placed.x[0], recon_frame(adjusted, tracks)[0])
-        inside += missed @ np.linalg.solve(adjusted.covariance[:7, :7], missed) < chi2.ppf(0.95, 7)
+        errors = error(problem, adjusted.placed.x[0], recon_frame(adjusted, tracks)[0])
+        inside += errors @ np.linalg.solve(adjusted.covariance[:7, :7], errors) < chi2.ppf(0.95, 7)
         # A part of a few random errors looks smooth.
         estimates.append(np.hypot(adjusted.noise, adjusted.systematic_left))
     assert inside / runs >= 0.88
@@ -101,15 +103,17 @@ def test_intrinsics_go_as_far_from_what_was_given_as_their_standard_deviation_le
     rng = np.random.default_rng(5)
     problem = hand_eye_problem(rng, 8, robot_noise=(2e-4, np.radians(0.03)))
     tracks = observed(problem, rng, 300, 0.3)
-    off = with_parameters(LENS, parameters(LENS) + np.r_[3.0, 3.0, 4.0, 4.0, np.zeros(5)])
+    off = with_parameters(INTRINSICS, parameters(INTRINSICS) + np.r_[3.0, 3.0, 4.0, 4.0, np.zeros(5)])
     exact, usual = (solved(problem, tracks, off, prior=prior_of(off, std)) for std in (np.zeros(9), MEASURED))
     assert exact.placed.scene.cameras[0] == off
     std = np.sqrt(np.diag(usual.intrinsics_covariance(0)))
-    assert abs(usual.placed.scene.cameras[0].fx - LENS.fx) < 3 * std[0] < abs(off.fx - LENS.fx) * 3
-    missed = [error(problem, found.placed.x[0], problem.scale)[:6] for found in (exact, usual)]
+    assert (
+        abs(usual.placed.scene.cameras[0].fx - INTRINSICS.fx) < 3 * std[0] < abs(off.fx - INTRINSICS.fx) * 3
+    )
+    errors = [error(problem, found.placed.x[0], problem.scale)[:6] for found in (exact, usual)]
     sigmas = [
         np.abs(gap / np.sqrt(np.diag(found.covariance)[:6])).max()
-        for gap, found in zip(missed, (exact, usual), strict=True)
+        for gap, found in zip(errors, (exact, usual), strict=True)
     ]
     assert sigmas[1] < 3 < sigmas[0]
     assert usual.budget.intrinsics[2, 2] > 0 and not exact.budget.intrinsics.any()
@@ -128,11 +132,11 @@ def test_an_adjustment_goes_on_until_it_stays(monkeypatch):
     tracks = observed(problem, rng, 300, 0.4)
     # Errors of matches have long tails, and their size and the weights then depend on each other for long.
     tracks.x_px[:] += rng.standard_t(2, size=tracks.x_px.shape)
-    found = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
+    found = solved(problem, tracks, prior=prior_of(INTRINSICS, MEASURED))
     monkeypatch.setattr(together, "STEP_SETTLED", 1e-5)
     monkeypatch.setattr(together, "SIZES_SETTLED", 1e-5)
     monkeypatch.setattr(together, "ROUNDS", 200)
-    settled = solved(problem, tracks, prior=prior_of(LENS, MEASURED))
+    settled = solved(problem, tracks, prior=prior_of(INTRINSICS, MEASURED))
     off = step_between(found.placed.x[0], settled.placed.x[0])
     assert (np.abs(off) < 0.05 * np.sqrt(np.diag(settled.covariance)[:6])).all()
 
@@ -141,7 +145,7 @@ def test_an_adjustment_that_begins_near_ends_where_one_from_poses_does(monkeypat
     rng = np.random.default_rng(7)
     problem = hand_eye_problem(rng, 10, robot_noise=(3e-4, np.radians(0.05)))
     tracks = observed(problem, rng, 300, 0.4)
-    off = with_parameters(LENS, parameters(LENS) + np.r_[2.0, 2.0, 2.0, -2.0, np.zeros(5)])
+    off = with_parameters(INTRINSICS, parameters(INTRINSICS) + np.r_[2.0, 2.0, 2.0, -2.0, np.zeros(5)])
     near = solved(problem, tracks, off, prior=prior_of(off, MEASURED))
     calls = counted(monkeypatch)
     from_poses = solved(problem, tracks, off, prior=prior_of(off, ESTIMATED))

@@ -16,8 +16,8 @@ from benchmarks.freshness import (
     changed_since_measured,
     essence,
     has_history,
+    is_marked_old,
     marked,
-    says_it_is_old,
 )
 from benchmarks.peers import grid_search
 from benchmarks.simulated.problem import hand_eye_problem
@@ -58,7 +58,7 @@ def test_the_manual_quotes_the_dense_depth_that_was_measured():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(RESULTS.glob("*.md")), ids=lambda page: page.stem)
-def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page: Path):
+def test_a_page_of_results_shows_where_it_is_older_than_the_code_it_measures(page: Path):
     paths = paths_of(page.stem)
     if paths is None:
         assert page.name == "README.md", "a page of no bench"
@@ -69,10 +69,10 @@ def test_a_page_of_results_says_where_it_is_older_than_the_code_it_measures(page
     if not has_history():
         pytest.skip("a shallow clone, or no repository: git cannot tell what changed since")
     old = bool(changed_since_measured(page, paths, at_most=1))
-    assert old is says_it_is_old(text), "measure it again, or: python -m benchmarks stale --write"
+    assert old is is_marked_old(text), "measure it again, or: python -m benchmarks stale --write"
 
 
-def test_what_code_says_does_not_make_a_page_old():
+def test_what_code_shows_does_not_make_a_page_old():
     code = (
         "def f(x):\n    'Two.'\n    if x < 0:\n        raise ValueError(f'{x} too low')\n    return x + 1\n"
     )
@@ -81,39 +81,39 @@ def test_what_code_says_does_not_make_a_page_old():
     assert essence(code) != essence(code.replace("x + 1", "x + 2"))
 
 
-def test_a_page_says_that_it_is_old_below_its_commit_and_once():
+def test_a_page_shows_that_it_is_old_below_its_commit_and_once():
     page = "# python -m benchmarks map\n\n2026-11-22, commit `abcdef0`. A machine.\n\n> found\n"
     once = marked(page, ["src/jcr/a.py"])
-    assert says_it_is_old(once) and once.splitlines()[4].endswith("`src/jcr/a.py` changed since.")
+    assert is_marked_old(once) and once.splitlines()[4].endswith("`src/jcr/a.py` changed since.")
     assert marked(once, ["src/jcr/a.py"]) == once and marked(once, []) == page
 
 
-def test_every_page_of_results_says_which_command_writes_it():
+def test_every_page_of_results_shows_which_command_writes_it():
     named = set(re.findall(r"\((\w+)\.md\)", (RESULTS / "README.md").read_text()))
     assert named == {page.stem for page in RESULTS.glob("*.md")} - {"README"}
     for page in named:
         text, name = (RESULTS / f"{page}.md").read_text(), page.removesuffix(LONG)
         assert name in BENCHES and claims(RESULTS / f"{page}.md"), page
         assert f"\n    python -m benchmarks {name}" in text, page
-        pictures = re.findall(r"\]\((\w+\.png)\)", text)
-        assert all((RESULTS / picture).is_file() for picture in pictures)
+        images = re.findall(r"\]\((\w+\.png)\)", text)
+        assert all((RESULTS / image).is_file() for image in images)
 
 
 @pytest.mark.slow
 def test_a_bench_that_fails_is_named_and_loses_no_other(tmp_path: Path):
     (tmp_path / "map.md").write_text(f"{CLAIM}the map is good\n")
-    told: list[Outcome] = []
+    printed: list[Outcome] = []
     outcomes = run(
         {"nonsense": False, "real": True, "map": True},
         tmp_path,
         {"real": [str(tmp_path / "nowhere")]},
         True,
-        told.append,
+        printed.append,
     )
     assert [outcome.name for outcome in outcomes] == ["nonsense", "real", "map"]
     assert "nonsense" in outcomes[0].trouble and "nowhere" in outcomes[1].trouble
     assert outcomes[2].seconds is None and not outcomes[2].trouble  # newer than the sources: left out
-    assert len(told) == 2
+    assert len(printed) == 2
     write_index(outcomes, tmp_path, "python -m benchmarks all", "a machine.", ["a network: no weights"], 90.0)
     index = (tmp_path / "README.md").read_text()
     assert "2 of 3 benches were run this time, in 1.5 minutes" in index
@@ -177,7 +177,7 @@ def test_a_bench_refuses_what_it_does_not_use(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", sorted(BENCHES))
-def test_a_bench_takes_what_its_row_of_the_table_says(name: str):
+def test_a_bench_takes_what_its_row_of_the_table_shows(name: str):
     row, run_one = BENCHES[name], import_module(f"benchmarks.{name}").run
     asks = {"captures": row.of_captures, "boards": row.of_boards, "runs": row.keeps_runs}
     asks |= {"out": row.draws, "long": bool(row.long)}

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 import jcr
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import error, hand_eye_problem
 from jcr.adjust.intrinsics_prior import prior_of
 from jcr.calibration.consider import with_intrinsics_considered
@@ -20,10 +20,10 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
         rng = np.random.default_rng(seed)
         problem = hand_eye_problem(rng, 10, robot_noise=(1e-4, np.radians(0.01)))
         tracks = observed(problem, rng, 120, 0.1)
-        values = parameters(LENS)
+        values = parameters(INTRINSICS)
         values[:2] *= 1 + 0.005 * rng.normal()
-        values[2:4] += 0.005 * LENS.width * rng.normal(size=2)
-        given = with_parameters(LENS, values)
+        values[2:4] += 0.005 * INTRINSICS.width * rng.normal(size=2)
+        given = with_parameters(INTRINSICS, values)
         k = np.array([[given.fx, 0, given.cx], [0, given.fy, given.cy], [0, 0, 1.0]])
         camera = []
         for row in range(10):

@@ -32,7 +32,7 @@ from jcr.records import (
 )
 from jcr.represent.measured_depth import with_measured_depth
 
-LENS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
+INTRINSICS = Intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 OFF, NOISE_PER_M, SCALE = 1.03, 0.004, 0.1
 """Too long by 3 %; sigma 2 mm at 0.7 m."""
 X = transform(rotation_exp(np.array([0.1, -0.2, 1.5])), np.array([0.05, -0.02, 0.08]))
@@ -48,7 +48,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconst
     """A capture with depth images, its features, the calibration, and the true depth."""
     folder, draw = tmp_path_factory.mktemp("depth"), np.random.default_rng(0)
     base_from_camera = looking_at_table(12)
-    true = np.stack([cast_depth(pose, LENS) for pose in base_from_camera])
+    true = np.stack([cast_depth(pose, INTRINSICS) for pose in base_from_camera])
     wrong = OFF * true + NOISE_PER_M * true**2 * draw.normal(size=true.shape)
     wrong[:, 50:60, 100:120] = 0
     names = tuple(f"depth/{k}.png" for k in range(len(true)))
@@ -57,7 +57,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Reconst
     gripper = base_from_camera @ inverse(X)
     gripper[:, :3, 3] += 3e-4 * draw.normal(size=(12, 3))
     images = tuple(f"{k}.png" for k in range(12))
-    capture = Capture(folder, images, gripper, (WIDTH, HEIGHT), LENS, depths=names)
+    capture = Capture(folder, images, gripper, (WIDTH, HEIGHT), INTRINSICS, depths=names)
     base_from_recon = transform(rotation_exp(np.array([0.3, -2.0, 0.5])), np.array([0.4, 0.2, -0.7]))
     cameras = inverse(base_from_recon) @ base_from_camera
     cameras[:, :3, 3] /= SCALE
@@ -71,11 +71,13 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
     hit = true[image, v, u] > 0
     image, v, u = image[hit], v[hit], u[hit]
     z = true[image, v, u] / SCALE * (1 + 1e-3 * draw.normal(size=len(u)))
-    points = np.stack([apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(LENS)[v, u], strict=True)])
+    points = np.stack(
+        [apply(cameras[i], d * r) for i, d, r in zip(image, z, rays(INTRINSICS)[v, u], strict=True)]
+    )
     tracks = Tracks(image, np.stack([u, v], 1).astype(float), np.arange(len(image)), points)
     nothing = np.zeros(true.shape)
     pointmaps = Pointmaps(
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         points_in_recon=np.zeros((*true.shape, 3)),
         confidence=nothing,
         colors=np.zeros((*true.shape, 3), np.uint8),
@@ -85,14 +87,14 @@ def _reconstruction(cameras: np.ndarray, true: np.ndarray, draw: np.random.Gener
     return Reconstruction(
         image_index=np.arange(len(true)),
         recon_from_camera=cameras,
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         tracks=tracks,
         backend="cast",
         pointmaps=pointmaps,
     )
 
 
-def test_the_robot_says_that_the_depth_is_too_long_and_how_noisy(measured: tuple):
+def test_the_robot_shows_that_the_depth_is_too_long_and_how_noisy(measured: tuple):
     capture, reconstruction, hand_eye, _ = measured
     check = depth_check(capture, reconstruction, hand_eye)
     assert check is not None and check.images == 12 and check.features > 500
@@ -129,7 +131,7 @@ def test_the_map_gets_the_depth_with_the_robots_scale_and_its_own_sigma(measured
     assert (np.abs(off) < sigma).mean() > 0.6 and (np.abs(off) < 3 * sigma).mean() > 0.97
 
 
-def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(measured: tuple):
+def test_what_several_images_show_stays_where_the_depth_camera_shows_otherwise(measured: tuple):
     capture, reconstruction, hand_eye, true = measured
     hand_eye = with_depth(capture, reconstruction, hand_eye)
     # A sheet that depth cameras see through: half of the matched depth lies 10 cm nearer; filled planes elsewhere.
@@ -138,7 +140,7 @@ def test_what_several_images_say_stays_where_the_depth_camera_says_otherwise(mea
     matched = (true > 0.2).astype(float)
     points = np.stack(
         [
-            apply(c, d[..., None] / SCALE * rays(LENS))
+            apply(c, d[..., None] / SCALE * rays(INTRINSICS))
             for c, d in zip(reconstruction.recon_from_camera, nearer, strict=True)
         ]
     )

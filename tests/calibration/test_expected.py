@@ -121,7 +121,7 @@ def test_proposed_poses_keep_their_promise_and_stay_in_reach():
     assert proposed[2].within_95_mm < proposed[0].within_95_mm
 
 
-def test_a_planar_capture_is_told_to_tilt():
+def test_a_planar_capture_is_asked_to_tilt():
     problem = hand_eye_problem(np.random.default_rng(3), 8, "planar")
     now, proposed = expected_with(problem, None, 2)
     down = problem.base_from_gripper[0, 2, :3]

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.attack import calibrated, outcome, reconstructed
 from benchmarks.simulated.arm_errors import PresetName
 from benchmarks.simulated.bent import bent_problem
-from benchmarks.simulated.faults import LENS, Faults, faulty_capture
-from benchmarks.simulated.observations import LENS as OBSERVED_BY
+from benchmarks.simulated.faults import INTRINSICS, Faults, faulty_capture
+from benchmarks.simulated.observations import INTRINSICS as OBSERVED_BY
 from benchmarks.simulated.observations import observed
 from benchmarks.simulated.problem import hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
@@ -44,9 +44,9 @@ NAMED: dict[str, tuple[Faults, str, list[float], float]] = {
     ),
     "zoom": (Faults(zoom=0.03), r"changes by \+([\d.]+) ± \S+ % after 05.png", [3.0], 0.2),
     "principal point": (
-        Faults(lens=(("cx", 12.0),)),
+        Faults(intrinsics=(("cx", 12.0),)),
         r"a principal point of \(([\d.]+), ([\d.]+)\)",
-        [LENS.cx + 12, LENS.cy],
+        [INTRINSICS.cx + 12, INTRINSICS.cy],
         3.0,
     ),
     "rolling shutter": (Faults(rolling_px=15.0), r"sheared by ([\d.]+) ± \S+ px", [15.0], 0.5),
@@ -121,7 +121,7 @@ def test_a_silent_fault_is_named_with_its_size_and_counts_as_uncertainty(name: s
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_given_intrinsics_may_be_off_is_within_sigma_unsaid(seed: int):
-    found, hand_eye = calibrated(Faults(lens=(("k1", -0.03),)), seed)
+    found, hand_eye = calibrated(Faults(intrinsics=(("k1", -0.03),)), seed)
     assert hand_eye.converged and outcome(found, hand_eye).is_sound
 
 
@@ -210,7 +210,7 @@ def test_positions_that_are_all_too_long_are_said_to_be_beyond_what_images_show_
     assert alone not in calibration_file(capture, reconstruction, metric, {}, "").notes
 
 
-def test_of_many_images_the_camera_is_tested_by_as_many_observations_as_memory_has_room_for():
+def test_of_many_images_the_camera_is_tested_by_as_many_observations_as_memory_has_space_for():
     problem = hand_eye_problem(np.random.default_rng(0), 40)
     tracks = observed(problem, np.random.default_rng(0), 900, 0.1)
     few = of_some(tracks, 5000)

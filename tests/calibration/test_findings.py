@@ -41,7 +41,9 @@ from places import ROOT
 GOLDEN = ROOT / "tests" / "golden"
 """Files as the version before findings wrote them."""
 AT = {"frame": "gripper", "x": 0.0, "y": 0.6, "z": 0.8}
-LENS = {f"{name}{of}": 600.0 + k for name in ("fx", "fy", "cx", "cy") for k, of in enumerate(("", "_given"))}
+INTRINSICS = {
+    f"{name}{of}": 600.0 + k for name in ("fx", "fy", "cx", "cy") for k, of in enumerate(("", "_given"))
+}
 SIZE = {"rotation": 0.01}
 EXAMPLES: dict[Kind, dict] = {
     Kind.UNOBSERVABLE: {"details": {"motion": "planar"} | AT, "value": 0.01},
@@ -65,7 +67,7 @@ EXAMPLES: dict[Kind, dict] = {
         }
     },
     Kind.ZOOM: {"value": 0.01, "std": 0.001, "p": 1e-9, "images": ("a.png", "b.png")},
-    Kind.INTRINSICS: {"p": 1e-9, "details": LENS | {"fx_std": 0.1, "fy_std": 0.1, "cx_std": 0.1}},
+    Kind.INTRINSICS: {"p": 1e-9, "details": INTRINSICS | {"fx_std": 0.1, "fy_std": 0.1, "cx_std": 0.1}},
     Kind.SLIP: {
         "value": 0.01,
         "p": 1e-9,

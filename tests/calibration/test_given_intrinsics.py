@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import HandEyeProblem, error, hand_eye_problem
 from jcr.calibration.calibration_json import calibration_file
 from jcr.calibration.options import CalibrateOptions
@@ -16,7 +16,7 @@ from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 
 
 def pictured(
-    seed: int, images: int, lens: Intrinsics | None, **motion
+    seed: int, images: int, intrinsics: Intrinsics | None, **motion
 ) -> tuple[HandEyeProblem, Capture, Reconstruction]:
     """Images that LENS made, of which it is told that `lens` did; None: told nothing."""
     rng = np.random.default_rng([seed, images])
@@ -25,12 +25,12 @@ def pictured(
     )
     tracks = observed(problem, rng, 250, 0.5)
     capture = Capture(
-        Path("."), tuple(f"{k}.png" for k in range(images)), problem.base_from_gripper, (640, 480), lens
+        Path("."), tuple(f"{k}.png" for k in range(images)), problem.base_from_gripper, (640, 480), intrinsics
     )
     reconstruction = Reconstruction(
         image_index=np.arange(images),
         recon_from_camera=problem.recon_from_camera,
-        intrinsics=lens or LENS,
+        intrinsics=intrinsics or INTRINSICS,
         tracks=tracks,
         backend="test",
     )
@@ -38,14 +38,14 @@ def pictured(
 
 
 def calibrated(
-    seed: int, images: int, lens: Intrinsics | None, options: CalibrateOptions | None = None, **motion
+    seed: int, images: int, intrinsics: Intrinsics | None, options: CalibrateOptions | None = None, **motion
 ) -> tuple[HandEyeProblem, HandEye]:
-    problem, capture, reconstruction = pictured(seed, images, lens, **motion)
+    problem, capture, reconstruction = pictured(seed, images, intrinsics, **motion)
     return problem, calibrate(capture, reconstruction, options)
 
 
 def scaled(factor: float) -> Intrinsics:
-    return replace(LENS, fx=LENS.fx * factor, fy=LENS.fy * factor)
+    return replace(INTRINSICS, fx=INTRINSICS.fx * factor, fy=INTRINSICS.fy * factor)
 
 
 def said(hand_eye: HandEye) -> str:
@@ -56,9 +56,9 @@ def said(hand_eye: HandEye) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("images", [3, 5, 10])
 @pytest.mark.parametrize("motion", [{}, {"pattern": "translation", "deviation": np.radians(6.0)}])
-def test_a_true_lens_is_never_named(images: int, motion: dict) -> None:
+def test_a_true_intrinsics_is_never_named(images: int, motion: dict) -> None:
     for seed in range(6):
-        assert said(calibrated(seed, images, LENS, **motion)[1]) == ""
+        assert said(calibrated(seed, images, INTRINSICS, **motion)[1]) == ""
 
 
 @pytest.mark.slow
@@ -70,11 +70,13 @@ def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images:
         r"the images show a focal length of ([\d.]+) ± \S+ px where ([\d.]+) is given", said(hand_eye)
     )
     assert found is not None
-    assert float(found[1]) == pytest.approx(LENS.fx, rel=0.01)
-    assert float(found[2]) == pytest.approx(LENS.fx * factor, abs=0.5)
+    assert float(found[1]) == pytest.approx(INTRINSICS.fx, rel=0.01)
+    assert float(found[2]) == pytest.approx(INTRINSICS.fx * factor, abs=0.5)
     assert hand_eye.warnings[0] == said(hand_eye)
     # The calibration is that of the intrinsics which the images show.
-    assert hand_eye.intrinsics is not None and hand_eye.intrinsics.fx == pytest.approx(LENS.fx, rel=0.01)
+    assert hand_eye.intrinsics is not None and hand_eye.intrinsics.fx == pytest.approx(
+        INTRINSICS.fx, rel=0.01
+    )
     off = error(problem, hand_eye.gripper_from_camera, hand_eye.scale)
     assert (np.abs(off) < 3 * np.sqrt(np.diag(hand_eye.covariance))).all()
 
@@ -91,10 +93,10 @@ def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.03, 0.95, 1.2])
-def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) -> None:
+def test_more_views_are_not_promised_to_make_up_for_a_wrong_intrinsics(factor: float) -> None:
     offset, promised, reported = [], [], []
-    for lens in (LENS, scaled(factor)):
-        _, capture, reconstruction = pictured(0, 5, lens)
+    for intrinsics in (INTRINSICS, scaled(factor)):
+        _, capture, reconstruction = pictured(0, 5, intrinsics)
         hand_eye = calibrate(capture, reconstruction)
         content = calibration_file(capture, reconstruction, hand_eye, {}, "")
         offset.append(hand_eye.gripper_from_camera[:3, 3])
@@ -105,15 +107,15 @@ def test_more_views_are_not_promised_to_make_up_for_a_wrong_lens(factor: float) 
 
 
 @pytest.mark.slow
-def test_other_faults_of_the_lens_are_not_called_its_focal_length() -> None:
-    k1, *others = LENS.distortion
-    turned = said(calibrated(0, 10, replace(LENS, distortion=(-k1, *others)))[1])
-    assert "distortion" in turned and "focal" not in turned and "principal" not in turned
-    shifted = said(calibrated(0, 10, replace(LENS, cx=LENS.cx + 30))[1])
+def test_other_faults_of_the_intrinsics_are_not_called_its_focal_length() -> None:
+    k1, *others = INTRINSICS.distortion
+    rotated = said(calibrated(0, 10, replace(INTRINSICS, distortion=(-k1, *others)))[1])
+    assert "distortion" in rotated and "focal" not in rotated and "principal" not in rotated
+    shifted = said(calibrated(0, 10, replace(INTRINSICS, cx=INTRINSICS.cx + 30))[1])
     found = re.match(r"the images show a principal point of \(([\d.]+), ([\d.]+)\) ± ", shifted)
     assert found is not None and "focal" not in shifted and "distortion" not in shifted
-    assert [float(found[1]), float(found[2])] == pytest.approx([LENS.cx, LENS.cy], abs=4)
+    assert [float(found[1]), float(found[2])] == pytest.approx([INTRINSICS.cx, INTRINSICS.cy], abs=4)
 
 
-def test_an_estimated_lens_is_not_doubted() -> None:
+def test_an_estimated_intrinsics_is_not_doubted() -> None:
     assert said(calibrated(0, 10, None)[1]) == ""

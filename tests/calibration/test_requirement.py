@@ -19,7 +19,7 @@ from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.cli.output import Output
 from jcr.cli.result import show, show_calibration
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import inverse, scale_translation, step_between
 from jcr.records import Finding, HandEye, Kind, PosePairs
 from jcr.records.words import sentence
@@ -112,8 +112,8 @@ def test_the_images_that_are_missing_are_counted_and_proposed():
     assert len(hand_eye.next_poses) == max(2, required.more_images)
     content, html = page(given, hand_eye)
     assert content.short is not None and content.verdict == "rejected" and not hand_eye.converged
-    say = sentence(content.short)
-    assert f"add {required.more_images} image" in say
+    show = sentence(content.short)
+    assert f"add {required.more_images} image" in show
     assert "within what is needed" in summary(content)
     assert 'class="verdict bad"' in html and "Rejected:" in html
     assert CalibrationFile.model_validate_json(json.dumps(content.model_dump()), strict=True) == content
@@ -166,7 +166,7 @@ def test_the_command_ends_with_3_where_what_was_asked_is_not_reached(capsys: pyt
             said = capsys.readouterr()
             assert said.out.startswith("accepted\nnext: jcr export out urdf\n") and not said.err
             continue
-        with pytest.raises(NotTrustedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
+        with pytest.raises(RejectedError, match="not as exact as needed: .* 0.5 mm and 0.1° are asked for"):
             show(result, Output())
 
 
@@ -204,7 +204,7 @@ def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         (CalibrateOptions(require=(-1.0, 2.0)), "--require -1 2: give two positive numbers"),
         (
@@ -217,9 +217,9 @@ def test_a_requirement_is_two_positive_numbers(asked: tuple[float, float]):
     ],
 )
 def test_options_that_cannot_be_are_refused_before_any_work(
-    options: CalibrateOptions, says: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: CalibrateOptions, message: str, tabletop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(stages, "choose", lambda *_: pytest.fail("images were reconstructed"))
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         pipeline.calibrate(read_capture(tabletop), tmp_path / "out", RunOptions(calibrate=options))
     assert not (tmp_path / "out").exists()

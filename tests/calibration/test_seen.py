@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.seen import BENT, WAYS, measure
-from benchmarks.simulated.observations import LENS, observed
+from benchmarks.simulated.observations import INTRINSICS, observed
 from benchmarks.simulated.problem import HandEyeProblem, hand_eye_problem
 from jcr.adjust.intrinsics_prior import ESTIMATED, prior_of
 from jcr.adjust.points import points_in_base
@@ -40,9 +40,9 @@ def adjusted(problem: HandEyeProblem, seed: int) -> tuple[Adjusted, Tracks, Hand
         problem.base_from_gripper,
         (start.gripper_from_camera, start.scale, start.base_from_recon),
         problem.recon_from_camera,
-        LENS,
+        INTRINSICS,
         tracks,
-        prior=prior_of(LENS, ESTIMATED),
+        prior=prior_of(INTRINSICS, ESTIMATED),
     )
     return found, tracks, start
 

@@ -34,6 +34,6 @@ def test_of_many_observations_whole_tracks_are_adjusted_up_to_a_number(monkeypat
     chosen = np.unique(tracks.point)
     assert np.array_equal(np.bincount(tracks.point)[chosen], np.bincount(given.point)[chosen])
     assert np.array_equal(hand_eye.gripper_from_camera, again.gripper_from_camera)
-    missed = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
+    errors = step_between(hand_eye.gripper_from_camera, found.gripper_from_camera)
     assert hand_eye.before is not None
-    assert (np.abs(missed) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()
+    assert (np.abs(errors) < 3 * np.sqrt(np.diag(hand_eye.covariance)[:6])).all()

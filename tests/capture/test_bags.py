@@ -82,7 +82,7 @@ def test_depth_that_is_aligned_comes_with_the_frames(tmp_path: Path, capture: Ca
 
 
 @pytest.mark.slow
-def test_further_cameras_of_a_bag_are_told_by_tf_or_by_name(tmp_path: Path, capture: Capture):
+def test_further_cameras_of_a_bag_are_named_by_tf_or_by_name(tmp_path: Path, capture: Capture):
     """Four stops; a fixed camera's image, and one of a second camera on the gripper for each stop."""
     for k, name in enumerate(capture.images[:9]):
         small = cv2.resize(cv2.imread(str(capture.folder / name)), (80, 60))
@@ -203,9 +203,9 @@ def test_raw_images_come_out_as_they_went_in(tmp_path: Path, capture: Capture):
     got = jcr.read_capture(bag, FRAMES, into=tmp_path / "frames")
     *_, view = nearest_view(got.base_from_gripper, capture.base_from_gripper)
     for name, k in zip(got.images, view, strict=True):
-        picture = cv2.imread(str(got.folder / name)).astype(int)
+        image = cv2.imread(str(got.folder / name)).astype(int)
         original = cv2.imread(str(capture.folder / capture.images[k])).astype(int)
-        assert np.abs(picture - original).max() <= 1  # the noise that the bag adds
+        assert np.abs(image - original).max() <= 1  # the noise that the bag adds
 
 
 @pytest.mark.slow
@@ -287,9 +287,9 @@ def test_interpolation_is_exact_on_a_screw_and_refuses_what_lies_outside():
     """A steady rotate with a steady advance along x is its own interpolation."""
     start = 1_700_000_000_000_000_001
     time_s = np.arange(5.0)
-    turn = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
+    rotation = rotation_exp(np.outer(time_s, [0.1, 0.3, -0.2]))
     track = pose_track(
-        start + (1e9 * time_s).astype(np.int64), transform(turn, np.outer(time_s, [1.0, 0, 0]))
+        start + (1e9 * time_s).astype(np.int64), transform(rotation, np.outer(time_s, [1.0, 0, 0]))
     )
     at, gap = track.at(start + np.array([1_500_000_000, 3_000_000_000, -1, 4_000_000_001]))
     assert np.allclose(at[0, :3, 3], [1.5, 0, 0]) and np.allclose(
@@ -328,22 +328,22 @@ def test_the_best_frames_are_still_sharp_and_spread():
 def test_colours_of_raw_images(encoding: str):
     """An image that is red above and blue below stays so, with rows padded to a multiple of 64 bytes."""
     height, width = 8, 16
-    picture = np.zeros((height, width, 3), np.uint8)
-    picture[:4, :, 0] = picture[4:, :, 2] = 200
+    image = np.zeros((height, width, 3), np.uint8)
+    image[:4, :, 0] = image[4:, :, 2] = 200
     if encoding == "mono8":
-        raw = picture.max(2)
+        raw = image.max(2)
     elif encoding.startswith("bayer"):
         pattern = encoding.split("_")[1][:4]
         raw = np.zeros((height, width), np.uint8)
         for k, letter in enumerate(pattern):
-            raw[k // 2 :: 2, k % 2 :: 2] = picture[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)]
+            raw[k // 2 :: 2, k % 2 :: 2] = image[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)]
     elif encoding == "yuv422_yuy2":
         # ITU-R BT.601, studio range.
         weights = np.array([[0.257, 0.504, 0.098], [-0.148, -0.291, 0.439], [0.439, -0.368, -0.071]])
-        y, u, v = np.moveaxis(picture @ weights.T + [16, 128, 128], -1, 0)
+        y, u, v = np.moveaxis(image @ weights.T + [16, 128, 128], -1, 0)
         raw = np.stack([y, np.where(np.arange(width) % 2, v, u)], -1).astype(np.uint8)
     else:
-        raw = picture if encoding == "rgb8" else picture[..., ::-1]
+        raw = image if encoding == "rgb8" else image[..., ::-1]
     rows = raw.reshape(height, -1)
     padded = np.zeros((height, 64), np.uint8)
     padded[:, : rows.shape[1]] = rows
@@ -382,7 +382,7 @@ def test_images_that_are_listed_and_not_there_are_refused_in_one_line(tmp_path: 
 
     poses = np.tile(np.eye(4), (30, 1, 1))
     poses[:, 0, 3] = 0.02 * np.arange(30)
-    picture = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     with pytest.raises(jcr.InputError, match="scan.mcap: .* are not where its index says; it is damaged"):
         capture_of_recording(
             Recording(
@@ -392,7 +392,7 @@ def test_images_that_are_listed_and_not_there_are_refused_in_one_line(tmp_path: 
                 base_from_gripper=poses,
                 speed=np.zeros(30),
                 gap_ns=np.zeros(30, int),
-                images_of_rows=lambda rows: ((row, picture, ".png") for row in rows.tolist()[::2]),
+                images_of_rows=lambda rows: ((row, image, ".png") for row in rows.tolist()[::2]),
                 intrinsics_of_size=lambda size: None,
             ),
             tmp_path / "out",

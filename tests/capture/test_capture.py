@@ -109,7 +109,7 @@ def test_exif_rotation_is_honoured(capture: Path):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_what_exif_turns_is_said(capture: Path, orientation: int):
+def test_what_exif_rotates_is_said(capture: Path, orientation: int):
     exif = Image.Exif()
     exif[0x0112] = orientation
     for file in sorted((capture / "images").glob("*.jpg")):
@@ -137,7 +137,7 @@ def test_the_bits_that_are_used_are_read(tmp_path: Path, bits: int, shape: tuple
 
 
 @pytest.mark.parametrize("ending", [".png", ".tif"])
-def test_a_defective_pixel_does_not_say_how_many_bits_are_used(tmp_path: Path, ending: str):
+def test_a_defective_pixel_does_not_show_how_many_bits_are_used(tmp_path: Path, ending: str):
     """And a TIFF is read as a PNG is: Pillow keeps of its colours the upper eight bits, which are black here."""
     deep = np.broadcast_to(np.arange(64, dtype=np.uint16)[:, None] << 6, (48, 64, 3)).copy()
     deep[5, 7, 0] = 65535

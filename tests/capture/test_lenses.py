@@ -20,39 +20,43 @@ RATIONAL = Intrinsics(
     420.0, 421.0, 322.0, 238.0, *SIZE, (0.3, -0.1, 1e-3, -2e-3, 0.01, 0.25, -0.05, 0.02), "rational"
 )
 FISHEYE = Intrinsics(260.0, 261.0, 318.0, 241.0, *SIZE, (-0.01, 0.02, -0.01, 0.002), "fisheye")
-LENSES = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1, -0.2, 1e-3, 2e-3, 0.05))]
+CAMERAS = [RATIONAL, FISHEYE, Intrinsics(500.0, 500.0, 320.0, 240.0, *SIZE, (0.1, -0.2, 1e-3, 2e-3, 0.05))]
 
 
-@pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_survives_capture_json_camera_info_and_calibration_json(lens: Intrinsics, tmp_path: Path):
+@pytest.mark.parametrize("intrinsics", CAMERAS)
+def test_a_intrinsics_survives_capture_json_camera_info_and_calibration_json(
+    intrinsics: Intrinsics, tmp_path: Path
+):
     read = camera_json.read_intrinsics(
-        json.loads(json.dumps(camera_json.intrinsics_as_json(lens))), SIZE, tmp_path
+        json.loads(json.dumps(camera_json.intrinsics_as_json(intrinsics))), SIZE, tmp_path
     )
-    assert read == lens
+    assert read == intrinsics
     mount = ros.camera_mount(np.eye(4), np.eye(7))
-    (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount, lens))
-    assert camera_info.read_camera_info(tmp_path / "camera_info.yaml", SIZE) == lens
-    told = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
-    assert told["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
-    file = IntrinsicsAndStd.model_validate(vars(lens) | {"distortion": list(lens.distortion)})
-    assert IntrinsicsAndStd.model_validate_json(file.model_dump_json()).record() == lens
+    (tmp_path / "camera_info.yaml").write_text(ros.camera_info(mount, intrinsics))
+    assert camera_info.read_camera_info(tmp_path / "camera_info.yaml", SIZE) == intrinsics
+    printed = yaml.safe_load((tmp_path / "camera_info.yaml").read_text())
+    assert printed["distortion_model"] in ("plumb_bob", "rational_polynomial", "equidistant")
+    file = IntrinsicsAndStd.model_validate(vars(intrinsics) | {"distortion": list(intrinsics.distortion)})
+    assert IntrinsicsAndStd.model_validate_json(file.model_dump_json()).record() == intrinsics
 
 
-@pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_survives_colmap(lens: Intrinsics, tmp_path: Path):
+@pytest.mark.parametrize("intrinsics", CAMERAS)
+def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
     import pycolmap
 
     from jcr.reconstruct.sfm import camera_of
 
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera_of(lens, known=True))
+    model.add_camera_with_trivial_rig(camera_of(intrinsics, known=True))
     image = pycolmap.Image(name="0.png", camera_id=1, image_id=1)
     image.frame_id = 1
     model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     model.write_text(str(tmp_path))
     found = colmap_model.read_intrinsics(tmp_path, SIZE)
-    assert found.model == lens.model and np.allclose(found.distortion, lens.distortion)
-    assert np.allclose([found.fx, found.fy, found.cx, found.cy], [lens.fx, lens.fy, lens.cx, lens.cy])
+    assert found.model == intrinsics.model and np.allclose(found.distortion, intrinsics.distortion)
+    assert np.allclose(
+        [found.fx, found.fy, found.cx, found.cy], [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
+    )
 
 
 @pytest.mark.parametrize(
@@ -70,41 +74,41 @@ def test_other_lenses_are_refused_by_name(model: str, count: int, words: str):
 
 
 def test_a_capture_names_the_models_that_there_are():
-    lens = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    intrinsics = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
     with pytest.raises(
         jcr.InputError, match="distortion model 'omni' is not known; give one of pinhole, rational, fisheye"
     ):
-        camera_json.read_intrinsics(lens | {"model": "omni"}, SIZE, Path("capture.json"))
+        camera_json.read_intrinsics(intrinsics | {"model": "omni"}, SIZE, Path("capture.json"))
     with pytest.raises(jcr.InputError, match="5 numbers, not the 4 of a fisheye intrinsics, k1,k2,k3,k4"):
         camera_json.read_intrinsics(
-            lens | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json")
+            intrinsics | {"model": "fisheye", "distortion": [0] * 5}, SIZE, Path("capture.json")
         )
 
 
-def through(lens: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:
+def through(intrinsics: Intrinsics, image: np.ndarray, original: Intrinsics) -> np.ndarray:
     """The image that a camera with another intrinsics takes from the same place."""
     from jcr.camera import project, unproject
 
-    u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
-    x_px = project(original, unproject(lens, np.stack([u, v], -1).astype(float))).astype(np.float32)
+    u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
+    x_px = project(original, unproject(intrinsics, np.stack([u, v], -1).astype(float))).astype(np.float32)
     return cv2.remap(image, x_px[..., 0], x_px[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["rational", "fisheye"])
-def test_a_capture_through_another_lens_gives_the_same_calibration(
+def test_a_capture_through_another_intrinsics_gives_the_same_calibration(
     model: str, tabletop: Path, tmp_path: Path
 ):
     capture = jcr.read_capture(tabletop)
     original = capture.intrinsics
     assert original is not None
     distortion = {"rational": RATIONAL.distortion, "fisheye": FISHEYE.distortion}[model]
-    lens = Intrinsics(520.0, 520.0, 322.0, 239.0, *SIZE, distortion, model)
+    intrinsics = Intrinsics(520.0, 520.0, 322.0, 239.0, *SIZE, distortion, model)
     for name in capture.images:
-        picture = through(lens, cv2.imread(str(tabletop / name)), original)
+        image = through(intrinsics, cv2.imread(str(tabletop / name)), original)
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / name), picture)
-    capture_json.write(tmp_path, replace(capture, intrinsics=lens))
+        cv2.imwrite(str(tmp_path / name), image)
+    capture_json.write(tmp_path, replace(capture, intrinsics=intrinsics))
     result = jcr.calibrate(jcr.read_capture(tmp_path), tmp_path / "out", backend="colmap")
     truth = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     off = np.linalg.inv(truth) @ result.hand_eye.gripper_from_camera

@@ -42,7 +42,7 @@ def walked(states: np.ndarray) -> np.ndarray:
 def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
     """The bundled images, small, each as often as its view lasts; row and view are told by grey bars."""
     capture = jcr.read_capture(tabletop)
-    pictures = []
+    images = []
     for k in range(count):
         small = cv2.resize(
             read_image(capture.folder / capture.images[k]), (160, 120), interpolation=cv2.INTER_AREA
@@ -51,8 +51,8 @@ def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
             shown = small if step < HOLD else cv2.blur(small, (25, 1))
             shown = shown.copy()
             shown[:16, :80] = 15 * (k + first)  # which view
-            pictures.append(shown)
-    return pictures
+            images.append(shown)
+    return images
 
 
 def view_of(capture: Capture) -> np.ndarray:
@@ -85,7 +85,7 @@ def test_cartesian_states_give_still_frames_with_their_poses(
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_pictures_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
+def test_images_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Path, problem: HandEyeProblem):
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -99,8 +99,8 @@ def test_pictures_may_be_in_the_table(version: str, tmp_path: Path, tabletop: Pa
         table = pq.read_table(file)
         emptied = [{"bytes": None, "path": "x.png"}] * len(table)
         at = table.column_names.index("observation.images.wrist")
-        pictures = pa.array(emptied, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
-        pq.write_table(table.set_column(at, "observation.images.wrist", pictures), file)
+        images = pa.array(emptied, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+        pq.write_table(table.set_column(at, "observation.images.wrist", images), file)
     with pytest.raises(jcr.InputError, match="holds no observation.images.wrist of frame .*embedded"):
         jcr.read_capture(path, ReadOptions(episode=(1,), frames=6), into=tmp_path / "again")
 
@@ -109,7 +109,7 @@ def test_further_cameras_of_a_set_come_with_it(tmp_path: Path, tabletop: Path, p
     states = writers.rows_as("rpy", problem.base_from_gripper[:6])
     episode = pictured(tabletop, 6), walked(states)
     mirrored = {
-        f"observation.images.{name}": [picture[:, ::-1] for picture in episode[0]] for name in ("top", "left")
+        f"observation.images.{name}": [image[:, ::-1] for image in episode[0]] for name in ("top", "left")
     }
     path = writers.write_lerobot(
         tmp_path / "set", [episode], "v3.0", DROID, XYZRPY, codec=None, further=mirrored

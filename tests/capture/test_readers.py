@@ -33,8 +33,8 @@ def problem() -> HandEyeProblem:
 def capture(tabletop: Path, problem: HandEyeProblem) -> Capture:
     """The bundled images, with poses whose cameras are known exactly and a intrinsics with distortion."""
     bundled = jcr.read_capture(tabletop)
-    lens = replace(bundled.intrinsics, distortion=(0.01, -0.02, 1e-3, -2e-3, 0.003))
-    return replace(bundled, base_from_gripper=problem.base_from_gripper, intrinsics=lens)
+    intrinsics = replace(bundled.intrinsics, distortion=(0.01, -0.02, 1e-3, -2e-3, 0.003))
+    return replace(bundled, base_from_gripper=problem.base_from_gripper, intrinsics=intrinsics)
 
 
 def assert_same(got: Capture, capture: Capture) -> None:
@@ -43,10 +43,13 @@ def assert_same(got: Capture, capture: Capture) -> None:
     for name, expected in zip(got.images, capture.images, strict=True):
         assert (got.folder / name).read_bytes() == (capture.folder / expected).read_bytes()
     assert np.allclose(got.base_from_gripper, capture.base_from_gripper, rtol=0, atol=1e-9)
-    lens, expected = got.intrinsics, capture.intrinsics
-    assert lens is not None and (lens.width, lens.height) == (expected.width, expected.height)
-    assert np.allclose([lens.matrix.ravel()], [expected.matrix.ravel()], rtol=0, atol=1e-9)
-    assert np.allclose(lens.distortion, expected.distortion, rtol=0, atol=1e-12)
+    intrinsics, expected = got.intrinsics, capture.intrinsics
+    assert intrinsics is not None and (intrinsics.width, intrinsics.height) == (
+        expected.width,
+        expected.height,
+    )
+    assert np.allclose([intrinsics.matrix.ravel()], [expected.matrix.ravel()], rtol=0, atol=1e-9)
+    assert np.allclose(intrinsics.distortion, expected.distortion, rtol=0, atol=1e-12)
 
 
 def assert_same_calibration(gripper: np.ndarray, camera: np.ndarray, problem: HandEyeProblem) -> None:
@@ -382,7 +385,7 @@ def test_faults_of_given_cameras_are_named(tmp_path: Path, capture: Capture, pro
         jcr.read_capture(tmp_path / "model")
 
 
-def test_what_is_no_capture_is_told_what_would_be_one(tmp_path: Path):
+def test_what_is_no_capture_is_named_what_would_be_one(tmp_path: Path):
     with pytest.raises(jcr.InputError, match="holds no capture.json, nor anything else"):
         jcr.read_capture(tmp_path)
     (tmp_path / "notes.md").write_text("hello")

@@ -13,7 +13,7 @@ import pytest
 import jcr
 from benchmarks.simulated.cell import CellProblem, Kind, cell_problem
 from jcr.adjust.images import evidence, noise_of
-from jcr.adjust.intrinsics_prior import HELD, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, prior_of
 from jcr.adjust.projection import ImageProblem, view_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.scene import Freedom, Scene, at_start, similarities
@@ -32,7 +32,7 @@ from jcr.cell.found import CameraFound, CellFound, ImageFound
 from jcr.cell.images import CellImages
 from jcr.cell.place_checks import far_from_gripper
 from jcr.cell.stage import place_cameras
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, rotation_exp, scale_translation, step_between, transform
 from jcr.progress import silent
 from jcr.reconstruct.backends import ReconstructOptions
@@ -46,15 +46,15 @@ OLD = 9
 SCALE = 0.37
 
 
-def adjusted(problem: CellProblem, world: np.ndarray | None = None, lens_off: bool = True) -> Adjusted:
+def adjusted(problem: CellProblem, world: np.ndarray | None = None, intrinsics_off: bool = True) -> Adjusted:
     """As the stage does it, from starts that are near; intrinsics off by what is usual."""
     rng = np.random.default_rng(5)
     cameras, priors = [], []
     for camera in problem.cameras:
         free = prior_of(camera)
-        off = free.std * rng.normal(size=len(free.std)) if lens_off else 0 * free.std
+        off = free.std * rng.normal(size=len(free.std)) if intrinsics_off else 0 * free.std
         cameras.append(with_parameters(camera, parameters(camera) + free.directions @ off))
-        priors.append(prior_of(cameras[-1]) if lens_off else prior_of(cameras[-1], HELD))
+        priors.append(prior_of(cameras[-1]) if intrinsics_off else prior_of(cameras[-1], FIXED))
     move = np.eye(4) if world is None else world
     scene = Scene(
         world_from_rig=move @ problem.world_from_rig,
@@ -97,11 +97,11 @@ def test_the_truth_lies_within_what_is_said_of_the_error(kind: Kind, preset):
     assert np.sqrt(np.diag(covariance)[:3]).max() < 0.012
 
 
-def test_exact_robots_and_pictures_give_the_exact_answer():
+def test_exact_robots_and_images_give_the_exact_answer():
     for kind, (name, of) in WANTED.items():
         problem = cell_problem(kind, "white", COUNT, seed=4, noise_px=1e-4, points=120)
         exact = replace(problem, reported=truly(problem))
-        answer = adjusted(exact, lens_off=False)
+        answer = adjusted(exact, intrinsics_off=False)
         found = of(answer.placed)
         assert np.abs(step_between(found, problem.truth[name])).max() < 2e-5, kind
 
@@ -116,7 +116,7 @@ def truly(problem: CellProblem) -> tuple[np.ndarray, ...]:
     return tuple(poses)
 
 
-def test_the_frame_of_the_pictures_does_not_matter():
+def test_the_frame_of_the_images_does_not_matter():
     problem = cell_problem("fixed", "typical", COUNT, seed=6, points=150)
     elsewhere = transform(rotation_exp(np.array([0.4, -1.0, 0.3])), np.array([3.0, -2.0, 1.0]))
     of = WANTED["fixed"][1]
@@ -129,7 +129,7 @@ def test_the_frame_of_the_pictures_does_not_matter():
 
 def test_images_alone_leave_one_similarity_open():
     problem = cell_problem("wrists", "white", COUNT, seed=2, points=100)
-    priors = [prior_of(camera, HELD) for camera in problem.cameras]
+    priors = [prior_of(camera, FIXED) for camera in problem.cameras]
     freedom = Freedom.of(problem.cameras, priors, len(problem.observations.rig), [False, True])
     scene = Scene(
         world_from_rig=problem.world_from_rig,
@@ -144,9 +144,9 @@ def test_images_alone_leave_one_similarity_open():
     assert unseen.shape[1] == 7
     # Along it there is what keeps the world in place, alike in all directions, and nothing else.
     along = unseen.T @ found.information @ unseen
-    held = along[0, 0]
-    assert np.allclose(along, held * np.eye(7), rtol=1e-6, atol=1e-6 * held)
-    values = np.linalg.eigvalsh(found.information - held * unseen @ unseen.T)
+    fixed = along[0, 0]
+    assert np.allclose(along, fixed * np.eye(7), rtol=1e-6, atol=1e-6 * fixed)
+    values = np.linalg.eigvalsh(found.information - fixed * unseen @ unseen.T)
     assert (np.abs(values) > 1e-8 * values[-1]).sum() == len(values) - 7
 
 
@@ -157,13 +157,13 @@ def calibrated(tabletop: Path) -> tuple[Capture, Reconstruction, HandEye]:
     x = np.array(json.loads((tabletop / "reference.json").read_text())["gripper_from_camera"])
     recon_from_base = transform(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([0.2, 0.1, -0.4]))
     poses = scale_translation(recon_from_base @ capture.base_from_gripper[:OLD] @ x, 1 / SCALE)
-    lens = capture.intrinsics
-    assert lens is not None
+    intrinsics = capture.intrinsics
+    assert intrinsics is not None
     nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
     reconstruction = Reconstruction(
         image_index=np.arange(OLD),
         recon_from_camera=poses,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=nothing,
         backend="test",
     )
@@ -182,7 +182,7 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
-def test_a_picture_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool):
+def test_a_image_of_the_scene_places_a_fixed_camera(tabletop: Path, calibrated, known: bool):
     old, reconstruction, hand_eye = calibrated
     capture = jcr.read_capture(tabletop)
     found = place_cameras(old, [fixed(capture, capture.images[10], known=known)], reconstruction, hand_eye)
@@ -227,7 +227,7 @@ def test_given_intrinsics_that_a_camera_s_image_contradicts_are_named_and_not_us
 
 
 @pytest.mark.slow
-def test_exact_intrinsics_are_kept_for_a_camera_that_is_held_against_itself(tabletop: Path, calibrated):
+def test_exact_intrinsics_are_kept_for_a_camera_that_is_fixed_against_itself(tabletop: Path, calibrated):
     old, reconstruction, hand_eye = calibrated
     capture = jcr.read_capture(tabletop)
     assert capture.intrinsics is not None
@@ -328,7 +328,7 @@ def test_a_camera_that_moves_or_sees_another_scene_is_refused_with_the_reason(ca
     assert "rejected" in untrusted.cameras[0].warnings[0]
 
 
-def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictures(
+def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_images(
     calibrated, monkeypatch, tabletop: Path, tmp_path: Path
 ):
     """Its reconstruction has a frame and a unit of its own; two of its images were left out."""
@@ -373,7 +373,7 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
     assert "shares nothing with the wrist camera" in found.warnings[-1] and len(found.images) == len(frame)
 
     def refuse(*_: object) -> Reconstruction:
-        raise NotTrustedError("2 of 7 images could be registered")
+        raise RejectedError("2 of 7 images could be registered")
 
     monkeypatch.setattr(alone, "reconstruct", refuse)
     refused = alone.calibrated_elsewhere(
@@ -390,7 +390,7 @@ def test_a_second_camera_that_sees_another_scene_is_calibrated_by_its_own_pictur
     assert [one["verdict"] for one in written] == ["accepted with warnings", "rejected"]
     assert [one["kind"] for one in written[1]["findings"]] == kinds
     assert written[1]["warnings"] == list(refused.warnings) and not written[1]["converged"]
-    assert [picture["image"] for picture in written[0]["pictures"]] == list(second.images)
+    assert [image["image"] for image in written[0]["pictures"]] == list(second.images)
     written[0]["converged"] = False
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": written, "arms": [], "version": "0"}))
     with pytest.raises(jcr.InputError, match="contradict one another"):
@@ -425,45 +425,47 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
     assert [image.image for image in found.images] == list(front.images)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, turned: bool):
+@pytest.mark.parametrize("rotated", [False, True])
+def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, rotated: bool):
     """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board turned by 180°."""
     rng = np.random.default_rng(3)
-    lens = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
+    intrinsics = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
     ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))
     poses = np.stack([np.eye(4), transform(rotation_exp(np.array([0, 0.1, 0])), np.array([-0.1, 0, 0]))])
     place = transform(rotation_exp(np.array([0.0, -0.1, 0.3])), np.array([0.1, 0.02, 0.05]))
-    shown = project(lens, apply(inverse(place), ahead))
-    in_rows = [project(lens, apply(inverse(pose), ahead)) for pose in poses]
+    shown = project(intrinsics, apply(inverse(place), ahead))
+    in_rows = [project(intrinsics, apply(inverse(pose), ahead)) for pose in poses]
 
     def by_sift(x_px: np.ndarray) -> Features:
-        return Features(x_px[:40], unproject(lens, x_px[:40])[:, :2], np.eye(128, dtype=np.float32)[:40])
+        return Features(
+            x_px[:40], unproject(intrinsics, x_px[:40])[:, :2], np.eye(128, dtype=np.float32)[:40]
+        )
 
-    half_turn = [lens.cx, lens.cy] - (shown[40:] - [lens.cx, lens.cy])
+    half_rotation = [intrinsics.cx, intrinsics.cy] - (shown[40:] - [intrinsics.cx, intrinsics.cy])
     learned = SimpleNamespace(
         matched=lambda *_: (
-            half_turn if turned else shown[40:],
+            half_rotation if rotated else shown[40:],
             [(np.arange(60), x_px[40:]) for x_px in in_rows],
         )
     )
     monkeypatch.setattr(localise, "features", lambda *_: by_sift(shown))
-    known = localise.Known(lens, poses, tuple(map(by_sift, in_rows)), learned)  # type: ignore[arg-type]
-    found = localise.localised(known, np.zeros((480, 640, 3), np.uint8), lens, True)
-    assert isinstance(found, localise.Shared) and len(found.x_px) == (40 if turned else 100)
+    known = localise.Known(intrinsics, poses, tuple(map(by_sift, in_rows)), learned)  # type: ignore[arg-type]
+    found = localise.localised(known, np.zeros((480, 640, 3), np.uint8), intrinsics, True)
+    assert isinstance(found, localise.Shared) and len(found.x_px) == (40 if rotated else 100)
     assert np.abs(step_between(found.recon_from_camera, place)).max() < 1e-6
     # Without a place by SIFT there is none, whatever the network finds.
     few = replace(
         known, found=tuple(Features(f.x_px[:9], f.rays[:9], f.descriptors[:9]) for f in known.found)
     )
-    assert localise.localised(few, np.zeros((480, 640, 3), np.uint8), lens, True) == 9
+    assert localise.localised(few, np.zeros((480, 640, 3), np.uint8), intrinsics, True) == 9
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Images of two sizes, all different."""
     for k in range(8):
-        picture = np.full((48, 64, 3) if k < 7 else (24, 32, 3), 20 * k, np.uint8)
-        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
+        image = np.full((48, 64, 3) if k < 7 else (24, 32, 3), 20 * k, np.uint8)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
     return tmp_path
 
 
@@ -478,14 +480,19 @@ def content(**cameras: object) -> dict[str, object]:
     return {"frames": frames, "intrinsics": None, "cameras": cameras}
 
 
-LENS = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0, 0, 0, 0, 0]}
+INTRINSICS = {"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "distortion": [0, 0, 0, 0, 0]}
 
 
 def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
     frames = [{"image": "6.png", "base_from_gripper": np.eye(4).tolist()}]
     said = content(
         eye={"mount": "gripper"},
-        overhead={"mount": "base", "images": ["3.png"], "intrinsics": LENS, "intrinsics_std": {"fx": 0.5}},
+        overhead={
+            "mount": "base",
+            "images": ["3.png"],
+            "intrinsics": INTRINSICS,
+            "intrinsics_std": {"fx": 0.5},
+        },
         second={"mount": "gripper", "images": ["4.png", None, "5.png"]},
         right={"mount": "gripper", "arm": "right", "frames": frames},
     )
@@ -511,27 +518,29 @@ def test_cameras_of_a_capture_are_read_and_written_alike(folder: Path):
 
 
 @pytest.mark.parametrize(
-    ("camera", "says"),
+    ("camera", "message"),
     [
         ({"mount": "table", "images": ["3.png"]}, "write gripper or base"),
         ({"mount": "base", "images": []}, "no images"),
         ({"mount": "base", "images": ["3.png", "7.png"]}, "all images of a camera must have one size"),
         ({"mount": "base", "images": ["0.png"]}, "is one of the frames' own"),
         ({"mount": "gripper", "images": ["3.png"]}, "1 images for 3 frames"),
-        ({"mount": "base", "images": ["7.png"], "intrinsics": LENS}, "another resolution"),
+        ({"mount": "base", "images": ["7.png"], "intrinsics": INTRINSICS}, "another resolution"),
         ({"mount": "base", "images": ["3.png"], "arm": "right"}, "frames of its own"),
         ({"mount": "base", "watches": "scene"}, "what the gripper carries"),
         ({"mount": "base", "imagse": ["3.png"], "images": ["3.png"]}, "imagse is not known"),
     ],
 )
-def test_cameras_that_cannot_be_are_refused_in_one_line(folder: Path, camera: dict[str, object], says: str):
+def test_cameras_that_cannot_be_are_refused_in_one_line(
+    folder: Path, camera: dict[str, object], message: str
+):
     (folder / "capture.json").write_text(json.dumps(content(overhead=camera)))
-    with pytest.raises(jcr.InputError, match=says) as refusal:
+    with pytest.raises(jcr.InputError, match=message) as refusal:
         read(folder)
     assert "\n" not in str(refusal.value)
 
 
-def test_pictures_of_two_sizes_are_not_one_camera(folder: Path):
+def test_images_of_two_sizes_are_not_one_camera(folder: Path):
     with pytest.raises(jcr.InputError, match="one size"):
         camera_of("a", [folder / "0.png", folder / "7.png"], None, ())
     with pytest.raises(jcr.InputError, match="choose another"):

@@ -201,7 +201,7 @@ def test_every_option_that_help_puts_first_is_one_of_some_command():
     assert set(COMMON) <= known
 
 
-def test_help_lists_what_users_set_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]):
+def test_help_lists_what_users_set_and_shows_where_the_rest_is(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["run", "--help"]) == 0
     few = capsys.readouterr().out
     assert dispatch(["run", "--help-all"]) == 0
@@ -251,13 +251,13 @@ def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list
     assert not list(tmp_path.iterdir())
 
 
-def test_wrong_arguments_are_told_in_full_on_an_ascii_terminal_too(tmp_path: Path):
+def test_wrong_arguments_are_named_in_full_on_an_ascii_terminal_too(tmp_path: Path):
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     finished = run_jcr("run", "a", "b", "--backend", "magic", cwd=tmp_path, env=environment)
     assert "magic" in finished.stderr and "--backend" in finished.stderr and finished.stderr.count("\n") == 1
 
 
-def test_pictures_without_features_are_not_trusted_and_say_what_to_do(tmp_path: Path, tabletop: Path):
+def test_images_without_features_are_rejected_and_show_what_to_do(tmp_path: Path, tabletop: Path):
     from PIL import Image
 
     shutil.copytree(tabletop, tmp_path / "plain")

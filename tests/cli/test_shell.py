@@ -69,40 +69,40 @@ def test_json_is_one_object_and_quiet_is_silence(
 ):
     for name, line in commands.items():
         assert dispatch([*line, "--quiet", "--json"]) == 0, name
-        told = capsys.readouterr()
-        assert isinstance(json.loads(told.out), dict), name
-        assert told.err == "", name
+        printed = capsys.readouterr()
+        assert isinstance(json.loads(printed.out), dict), name
+        assert printed.err == "", name
     for name in ("check", "query", "export", "measure", "compare", "models"):
         assert dispatch([*commands[name], "--quiet"]) == 0, name
-        told = capsys.readouterr()
-        assert told.out and told.err == "", name
+        printed = capsys.readouterr()
+        assert printed.out and printed.err == "", name
 
 
-def test_what_decides_is_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Of four samples a wrong one cannot be identified: a warning, and no word else."""
     problem = hand_eye_problem(np.random.default_rng(0), 4, robot_noise=(2e-4, 5e-4))
     cameras = scale_translation(problem.recon_from_camera, problem.scale)
     samples = write_easy_handeye2(tmp_path, problem.base_from_gripper, cameras)
     assert dispatch(["calibrate", str(samples), str(tmp_path / "out"), "--quiet"]) == 0
-    told = capsys.readouterr()
-    assert told.err.startswith("warning: with 4 images") and told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert printed.err.startswith("warning: with 4 images") and printed.err.count("\n") == 1
     rejected = ROOT / "tests" / "golden" / "calibration_rejected.json"
     shutil.copy(rejected, tmp_path / "out" / "calibration.json")
     assert dispatch(["export", str(tmp_path / "out"), "urdf", "--force", "--quiet"]) == 0
-    told = capsys.readouterr()
-    assert told.err.startswith("warning: the calibration is rejected") and told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert printed.err.startswith("warning: the calibration is rejected") and printed.err.count("\n") == 1
 
 
-def test_a_query_says_on_what_its_points_lie():
+def test_a_query_shows_on_what_its_points_lie():
     said = labelled(np.array([0, 2, 2, 1, 2, 0]), ("none", "table", "object 1", "object 2"))
     assert said == "; by label: table 1, object 1 3"
     assert labelled(np.zeros(3, int), ("none",)) == ""
 
 
-def test_errors_are_told_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_errors_are_named_quiet_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert dispatch(["measure", str(tmp_path), "--quiet", "--json"]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.startswith("error: ") and told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith("error: ") and printed.err.count("\n") == 1
 
 
 def test_every_export_format_is_in_the_table():
@@ -112,12 +112,12 @@ def test_every_export_format_is_in_the_table():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.CaptureFixture[str]):
     assert dispatch([name, "--help-all"]) == 0
-    told = capsys.readouterr().out
-    listed = set(re.findall(r"^  (--[a-z][a-z0-9-]*)", told, re.MULTILINE))
+    printed = capsys.readouterr().out
+    listed = set(re.findall(r"^  (--[a-z][a-z0-9-]*)", printed, re.MULTILINE))
     offered = {argument.flag for group in groups(_arguments(name), "jcr") for argument in group.arguments}
     assert listed == offered - {""}
     # Arguments are told by their own names, and None is no word of a command line.
-    assert "{None" not in told and " PATH PATH" not in told.splitlines()[0]
+    assert "{None" not in printed and " PATH PATH" not in printed.splitlines()[0]
 
 
 TYPED = {
@@ -148,8 +148,10 @@ def test_bash_completes(tmp_path: Path):
             '((${#COMPREPLY[@]})) || COMPREPLY=($(compgen -f -S / -- "${COMP_WORDS[COMP_CWORD]}")); '
             'printf "%s\\n" "${COMPREPLY[@]}"'
         )
-        told = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, timeout=10)
-        assert set(told.stdout.split()) == offered, (line, told.stderr)
+        printed = subprocess.run(
+            ["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, timeout=10
+        )
+        assert set(printed.stdout.split()) == offered, (line, printed.stderr)
 
 
 def test_fish_completes(tmp_path: Path):
@@ -158,12 +160,12 @@ def test_fish_completes(tmp_path: Path):
     (tmp_path / "images").mkdir()
     (tmp_path / "jcr.fish").write_text(script("fish", COMMANDS))
     for line, offered in TYPED.items():
-        told = subprocess.run(
+        printed = subprocess.run(
             ["fish", "-c", f"source jcr.fish; complete -C '{line}'"],
             cwd=tmp_path, capture_output=True, text=True, timeout=30, check=True,
         )  # fmt: skip
-        found = {row.split("\t")[0] for row in told.stdout.splitlines()}
-        assert found == offered, (line, told.stderr)
+        found = {row.split("\t")[0] for row in printed.stdout.splitlines()}
+        assert found == offered, (line, printed.stderr)
 
 
 def test_zsh_completes(tmp_path: Path):
@@ -178,12 +180,12 @@ def test_zsh_completes(tmp_path: Path):
     try:
         os.write(asking, b"unsetopt beep; autoload -U compinit; compinit -u -D; source ./jcr.zsh\n")
         # Tab completes, then the line's start (Ctrl-A) becomes an echo of what stands there.
-        told, deadline = "", time.monotonic() + 30
+        printed, deadline = "", time.monotonic() + 30
         os.write(asking, b"jcr run --backe\t\x01echo told: \n")
-        while not re.search(r"^told: jcr run --backend", told, re.MULTILINE):
-            assert time.monotonic() < deadline, told
+        while not re.search(r"^told: jcr run --backend", printed, re.MULTILINE):
+            assert time.monotonic() < deadline, printed
             if select.select([asking], [], [], 1)[0]:
-                told += os.read(asking, 4096).decode(errors="replace")
+                printed += os.read(asking, 4096).decode(errors="replace")
     finally:
         zsh.kill()
         zsh.wait()
@@ -193,5 +195,5 @@ def test_zsh_completes(tmp_path: Path):
 
 def test_there_is_no_script_for_other_shells(capsys: pytest.CaptureFixture[str]):
     assert dispatch(["--completion", "tcsh"]) == 2
-    told = capsys.readouterr().err
-    assert all(shell in told for shell in SHELLS)
+    printed = capsys.readouterr().err
+    assert all(shell in printed for shell in SHELLS)

@@ -27,7 +27,7 @@ from jcr.camera import project, unproject
 from jcr.capture.images import read_image
 from jcr.capture.options import ReadOptions
 from jcr.cli import dispatch
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.export import ros
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.provenance import Provenance
@@ -118,15 +118,15 @@ def of_calib(path: Path) -> np.ndarray:
     assert named["calibration_type"] == "eye_in_hand" and named["name"] == path.stem
     assert (named["robot_base_frame"], named["robot_effector_frame"]) == ("base_link", "tool0")
     assert named["tracking_base_frame"] == "optical"
-    at, turn = content["transform"]["translation"], content["transform"]["rotation"]
-    return of_quat(*(at[axis] for axis in "xyz"), *(turn[axis] for axis in "xyzw"))
+    at, rotation = content["transform"]["translation"], content["transform"]["rotation"]
+    return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
 
 
 def of_pose(path: Path) -> np.ndarray:
     content = yaml.safe_load(path.read_text())
     assert content["header"]["frame_id"] == "tool0"
-    at, turn = content["pose"]["pose"]["position"], content["pose"]["pose"]["orientation"]
-    return of_quat(*(at[axis] for axis in "xyz"), *(turn[axis] for axis in "xyzw"))
+    at, rotation = content["pose"]["pose"]["position"], content["pose"]["pose"]["orientation"]
+    return of_quat(*(at[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw"))
 
 
 READERS = {
@@ -194,8 +194,8 @@ def test_covariance_is_six_by_six_in_the_order_of_ros():
 
 
 def test_camera_info_is_what_image_proc_reads():
-    lens = Intrinsics(601.5, 602.5, 318.0, 244.0, 640, 480, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
-    content = yaml.safe_load(ros.camera_info(mount(), lens))
+    intrinsics = Intrinsics(601.5, 602.5, 318.0, 244.0, 640, 480, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
+    content = yaml.safe_load(ros.camera_info(mount(), intrinsics))
     assert (content["image_width"], content["image_height"]) == (640, 480)
     assert content["distortion_model"] == "plumb_bob"
 
@@ -203,15 +203,17 @@ def test_camera_info_is_what_image_proc_reads():
         part = content[name]
         return np.reshape(part["data"], (part["rows"], part["cols"]))
 
-    np.testing.assert_array_equal(matrix("camera_matrix"), lens.matrix)
-    np.testing.assert_array_equal(matrix("projection_matrix"), np.column_stack([lens.matrix, np.zeros(3)]))
+    np.testing.assert_array_equal(matrix("camera_matrix"), intrinsics.matrix)
+    np.testing.assert_array_equal(
+        matrix("projection_matrix"), np.column_stack([intrinsics.matrix, np.zeros(3)])
+    )
     np.testing.assert_array_equal(matrix("rectification_matrix"), np.eye(3))
     # OpenCV, whose order of coefficients plumb_bob takes, projects where our lens does.
     x = np.array([[0.2, -0.15, 1.0]])
     seen, _ = cv2.projectPoints(
         x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")
     )
-    np.testing.assert_allclose(seen[0, 0], project(lens, x[0]), atol=1e-9)
+    np.testing.assert_allclose(seen[0, 0], project(intrinsics, x[0]), atol=1e-9)
 
 
 def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path: Path):
@@ -223,15 +225,15 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
     }
     stated = jcr.read_capture(ROOT / "examples" / "tabletop").intrinsics
     assert stated is not None and kept["intrinsics"]["fx"] == stated.fx
-    for which, (transform_of_pair, lens) in pairs.items():
+    for which, (transform_of_pair, intrinsics) in pairs.items():
         file = export_run(done, "camera_info", tmp_path / f"{which}.yaml", {"intrinsics": which})
         written = yaml.safe_load(file.read_text())["camera_matrix"]["data"]
-        assert written[0] == pytest.approx(lens["fx"]) and written[2] == pytest.approx(lens["cx"])
+        assert written[0] == pytest.approx(intrinsics["fx"]) and written[2] == pytest.approx(intrinsics["cx"])
         file = export_run(done, "covariance", tmp_path / f"{which}.covariance.yaml", {"intrinsics": which})
         text = file.read_text()
         position = yaml.safe_load(text)["pose"]["pose"]["position"]
         assert [position[axis] for axis in "xyz"] == pytest.approx([row[3] for row in transform_of_pair[:3]])
-        assert f"belongs to these intrinsics (640 x 480 px): fx {lens['fx']:.6g}" in text
+        assert f"belongs to these intrinsics (640 x 480 px): fx {intrinsics['fx']:.6g}" in text
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
     with pytest.raises(InputError, match="--intrinsics given"):
@@ -239,7 +241,7 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": kept}))
 
 
-def test_a_run_says_how_exactly_a_seen_point_is_placed(done: Path):
+def test_a_run_shows_how_exactly_a_seen_point_is_placed(done: Path):
     content = json.loads((done / "calibration.json").read_text())
     seen, joint = content["uncertainty"]["seen"], content["uncertainty"]["joint"]
     assert 300 < seen["distance_mm"] < 800
@@ -250,8 +252,11 @@ def test_a_run_says_how_exactly_a_seen_point_is_placed(done: Path):
     # The truth of the bundled capture: at the centre and in a corner of its images, at the distance of the scene.
     truth, found = read_truth(ROOT / "examples" / "tabletop"), read_calibration(done).intrinsics
     assert found is not None
-    lens = found.record()
-    pairs = (np.array(content["gripper_from_camera"]), lens), (truth.gripper_from_camera, truth.intrinsics)
+    intrinsics = found.record()
+    pairs = (
+        (np.array(content["gripper_from_camera"]), intrinsics),
+        (truth.gripper_from_camera, truth.intrinsics),
+    )
     for x_px, below in (([319.5, 239.5], seen), ([2.0, 2.0], seen["corners"])):
         rays = [unproject(camera, np.array(x_px)) for _, camera in pairs]
         found_at, true_at = (
@@ -274,7 +279,7 @@ def test_a_frame_cannot_be_its_own_parent():
         ros.on_root(mount(), "optical")
 
 
-LENS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3, -2e-3, 0.02))
+INTRINSICS = Intrinsics(300.0, 305.0, 161.0, 118.0, 320, 240, (-0.2, 0.06, 1e-3, -2e-3, 0.02))
 
 
 @pytest.fixture
@@ -299,7 +304,7 @@ def views(tmp_path: Path) -> "PosedImages":
     x_px = []
     for base_from_camera in poses:
         x = apply(inverse(base_from_camera), points)
-        x_px.append(project(LENS, x))
+        x_px.append(project(INTRINSICS, x))
     x_px = np.concatenate(x_px)
     inside = ((x_px > 0) & (x_px < [319, 239])).all(1)
     assert inside.sum() > 100
@@ -310,7 +315,7 @@ def views(tmp_path: Path) -> "PosedImages":
         folder=folder,
         images=images,
         base_from_camera=poses,
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         tracks=tracks,
         points_in_base=points,
     )
@@ -347,7 +352,7 @@ def test_colmap_model_reprojects_its_points_exactly(
 
 
 @pytest.mark.parametrize("undistorted", [False, True])
-def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
+def test_nerfstudio_cameras_see_the_points_where_the_images_do(
     views: "PosedImages", undistorted: bool, tmp_path: Path
 ):
     import trimesh
@@ -379,7 +384,7 @@ def test_nerfstudio_cameras_see_the_points_where_the_pictures_do(
         seen = cv2.projectPoints(x, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
         x_px = views.tracks.x_px[mine]
         if undistorted:
-            rays = unproject(LENS, x_px)[:, :2]
+            rays = unproject(INTRINSICS, x_px)[:, :2]
             x_px = rays @ np.diag([content["fl_x"], content["fl_y"]]) + [content["cx"], content["cy"]] - 0.5
         # There the first pixel's centre is at (0.5, 0.5).
         np.testing.assert_allclose(seen, x_px + 0.5, atol=1e-6)
@@ -398,7 +403,7 @@ def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
         (views.base_from_camera[[0, 2]] @ second),
     )
     nothing = Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3)))
-    lens = replace(LENS, distortion=(0.02, 0.0, 0.0, 0.0, 0.0))
+    intrinsics = replace(INTRINSICS, distortion=(0.02, 0.0, 0.0, 0.0, 0.0))
     images = []
     for name in ("fixed", "second"):
         images.append(tuple(f"{name}/{k}.png" for k in range(2)))
@@ -409,7 +414,7 @@ def with_others(views: "PosedImages", tmp_path: Path) -> "list[PosedImages]":
             folder=tmp_path,
             images=of,
             base_from_camera=pose,
-            intrinsics=lens,
+            intrinsics=intrinsics,
             tracks=nothing,
             points_in_base=np.zeros((0, 3)),
             beside=beside,
@@ -452,7 +457,7 @@ def test_exports_of_several_cameras_come_back(
     assert (
         len(got) == 3
         and got.intrinsics is not None
-        and got.intrinsics.distortion == pytest.approx(LENS.distortion)
+        and got.intrinsics.distortion == pytest.approx(INTRINSICS.distortion)
     )
     by_mount = {camera.mount: camera for camera in got.others}
     assert by_mount["base"].intrinsics is not None and len(by_mount["base"].images) == 2
@@ -464,7 +469,7 @@ def test_exports_of_several_cameras_come_back(
         assert any("neither of one place nor of a rig" in note for note in got.notes)
 
 
-def test_pictures_turned_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):
+def test_images_rotated_by_a_tag_are_copied_upright(views: "PosedImages", tmp_path: Path):
     from jcr.export.views import write_colmap
 
     tag = Image.Exif()
@@ -614,10 +619,10 @@ def test_command_gives_the_root_link_asked_for(
     path = export(done, "urdf", tmp_path / "a.urdf", *options)
     found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")
     np.testing.assert_allclose(found @ ros.ROOT_FROM_OPTICAL, gripper_from_camera, atol=1e-9)
-    told = [0.0, 0.015, -0.002, -0.4977, 0.5023, -0.4977, 0.5023]
-    path = export(done, "urdf", tmp_path / "b.urdf", *options, "--root-from-optical", *told)
+    root_pose = [0.0, 0.015, -0.002, -0.4977, 0.5023, -0.4977, 0.5023]
+    path = export(done, "urdf", tmp_path / "b.urdf", *options, "--root-from-optical", *root_pose)
     found = yourdfpy.URDF.load(path).get_transform("camera_link", "flange")
-    np.testing.assert_allclose(found @ of_quat(*told), gripper_from_camera, atol=1e-9)
+    np.testing.assert_allclose(found @ of_quat(*root_pose), gripper_from_camera, atol=1e-9)
     export(done, "ros2", tmp_path / "c.launch.xml", *options)
     assert "--frame-id flange --child-frame-id camera_link" in capsys.readouterr().out
 
@@ -644,7 +649,7 @@ def test_a_rejected_calibration_is_exported_by_force_alone_with_its_reason_in_ev
         assert dispatch(["export", str(run), row.name]) == 3 and not path.exists()
         complaint = capsys.readouterr().err
         assert DOUBT in complaint and "rejected" in complaint and "--force" in complaint
-        with pytest.raises(NotTrustedError, match="rejected"):
+        with pytest.raises(RejectedError, match="rejected"):
             export_run(run, row.name)
         assert dispatch(["export", str(run), row.name, "--force"]) == 0
         assert DOUBT in capsys.readouterr().err

@@ -87,8 +87,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pixels = draw.integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
         Image.fromarray(pixels).save(folder / f"images/{k}.png")
         frames.append({"image": f"images/{k}.png", "base_from_gripper": poses[k].tolist()})
-    lens = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "distortion": [0.0] * 5}
-    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    intrinsics = {"fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5, "distortion": [0.0] * 5}
+    (folder / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     return folder
 
 
@@ -102,7 +102,7 @@ def case(tmp_path: Path, sound: Path, done: Path) -> Case:
 Plant = Callable[[Case], list[str]]
 
 
-def picture(change: Callable[[Path], Any]) -> Plant:
+def image(change: Callable[[Path], Any]) -> Plant:
     """A fault of the first image."""
 
     def plant(case: Case) -> list[str]:
@@ -154,7 +154,7 @@ def animated(path: Path) -> None:
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:])
 
 
-def turned(degrees: float) -> Callable[[np.ndarray], np.ndarray]:
+def rotated(degrees: float) -> Callable[[np.ndarray], np.ndarray]:
     def change(pose: np.ndarray) -> np.ndarray:
         return pose @ np.diag([degrees, degrees, degrees, 1.0])
 
@@ -298,36 +298,36 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         r"[45]\.\d ± \d\.\d % too long for a ur5e",
     ),
     # The pictures.
-    "zero-byte image": (picture(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
-    "truncated image": (picture(cut), 2, "not a readable image"),
-    "text file named .png": (picture(lambda p: p.write_text("hello")), 2, "not a readable image"),
+    "zero-byte image": (image(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
+    "truncated image": (image(cut), 2, "not a readable image"),
+    "text file named .png": (image(lambda p: p.write_text("hello")), 2, "not a readable image"),
     "16-bit image": (
-        picture(lambda p: Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96)).save(p)),
+        image(lambda p: Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96)).save(p)),
         3,
         "registered 0 of 6",  # read as it should be: the other pictures are noise
     ),
     "CMYK image": (
-        by_colmap(picture(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),
+        by_colmap(image(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),
         3,
         "registered 0 of 6",
     ),
-    "animated image": (picture(animated), 2, "holds 2 images"),
+    "animated image": (image(animated), 2, "holds 2 images"),
     "100-megapixel image": (
-        picture(lambda p: Image.new("1", (10_000, 10_000)).save(p)),
+        image(lambda p: Image.new("1", (10_000, 10_000)).save(p)),
         2,
         "million pixels",
     ),
     "image of fractions": (
-        picture(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")),
+        image(lambda p: Image.new("F", SIZE, 0.5).save(p, format="TIFF")),
         2,
         "fractions",
     ),
     "32-bit image": (
-        picture(lambda p: Image.new("I", SIZE, 1 << 20).save(p, format="TIFF")),
+        image(lambda p: Image.new("I", SIZE, 1 << 20).save(p, format="TIFF")),
         2,
         "more than 16 bits",
     ),
-    "decompression bomb": (picture(bomb), 2, "million pixels"),
+    "decompression bomb": (image(bomb), 2, "million pixels"),
     "one image under two names": (
         written(lambda c: shutil.copy(c.first, c.first.with_name("1.png"))),
         2,
@@ -339,21 +339,21 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         "same image",
     ),
     "one black image": (
-        by_colmap(picture(lambda p: Image.new("RGB", SIZE).save(p))),
+        by_colmap(image(lambda p: Image.new("RGB", SIZE).save(p))),
         3,
         "registered 0 of 6",
     ),
     "one image of another size": (
-        picture(lambda p: Image.new("RGB", (48, 36)).save(p)),
+        image(lambda p: Image.new("RGB", (48, 36)).save(p)),
         2,
         "96x72|48x36",
     ),
-    "missing image": (picture(Path.unlink), 2, "no such image"),
-    "image that is a folder": (picture(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
-    "image that is a pipe": (picture(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
-    "image that is a link to itself": (picture(linked_to_itself), 2, "leads back to itself"),
+    "missing image": (image(Path.unlink), 2, "no such image"),
+    "image that is a folder": (image(lambda p: (p.unlink(), p.mkdir())), 2, "a folder, a pipe"),
+    "image that is a pipe": (image(lambda p: (p.unlink(), os.mkfifo(p))), 2, "a folder, a pipe"),
+    "image that is a link to itself": (image(linked_to_itself), 2, "leads back to itself"),
     "folder of images that is a link to itself": (
-        picture(lambda p: (shutil.rmtree(p.parent), linked_to_itself(p.parent))),
+        image(lambda p: (shutil.rmtree(p.parent), linked_to_itself(p.parent))),
         2,
         "leads back to itself",
     ),
@@ -361,7 +361,7 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
     "NaN in a pose": (posed(lambda p: p * np.nan, only=2), 2, "NaN or infinity"),
     "infinity in a pose": (posed(lambda p: p + np.inf, only=2), 2, "NaN or infinity"),
     "reflected pose": (posed(lambda p: p @ np.diag([1, 1, -1, 1]), only=2), 2, "reflection"),
-    "scaled pose": (posed(turned(2.0), only=2), 2, "scaled by 2"),
+    "scaled pose": (posed(rotated(2.0), only=2), 2, "scaled by 2"),
     "transposed pose": (posed(lambda p: p.T, only=2), 2, "transposed"),
     "poses in millimetres": (
         posed(lambda p: np.vstack([np.column_stack([p[:3, :3], 1e3 * p[:3, 3]]), p[3:]])),
@@ -559,7 +559,7 @@ ARRAYS = {
 }  # fmt: skip
 
 
-def test_a_reconstruction_of_another_version_is_told_apart(
+def test_a_reconstruction_of_another_version_is_distinguished(
     tmp_path: Path, done: Path, tabletop: Path, capsys
 ):
     """And the name of the format changes with what it holds."""
@@ -596,7 +596,7 @@ def in_degrees(pose: np.ndarray) -> np.ndarray:
         pytest.param(lambda poses: np.repeat(poses[:1], len(poses), axis=0), id="one pose for all"),
     ],
 )
-def test_poses_that_read_well_and_mean_nothing_are_not_trusted(done: Path, tabletop: Path, change):
+def test_poses_that_read_well_and_mean_nothing_are_rejected(done: Path, tabletop: Path, change):
     capture = read_capture(tabletop)
     wrong = replace(capture, base_from_gripper=change(capture.base_from_gripper))
     found = calibrate(wrong, read_reconstruction(done / "reconstruction.npz"))

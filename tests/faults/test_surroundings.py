@@ -83,7 +83,7 @@ def test_a_command_ends_as_it_should_wherever_it_is_started(name: str, tmp_path:
     assert case.check(out) and not list(out.glob("*.part*"))
 
 
-def test_a_run_that_is_told_to_end_leaves_nothing_half_written_and_goes_on(
+def test_a_run_that_is_asked_to_end_leaves_nothing_half_written_and_goes_on(
     small_capture: Path, tmp_path: Path
 ):
     out = tmp_path / "out"

@@ -17,10 +17,10 @@ def main() -> None:
     sys.path.remove(str(TESTS / "fuzz"))  # where this very file has the module's name
     from structure import TOO_LONG_S, VALUES, documents, places, tried
 
-    say = sys.stdout.write
+    show = sys.stdout.write
     with tempfile.TemporaryDirectory(prefix="jcr-structure-") as folder:
         total, slowest, bad = Counter[str](), (0.0, ""), []
-        say(
+        show(
             f"{'file':<28} {'places':>6} {'tries':>6} {'read':>6} {'status 2':>8} {'status 1':>8} {'slowest':>8}\n"
         )
         for name, document in documents(Path(folder)).items():
@@ -38,9 +38,9 @@ def main() -> None:
             document.write(document.content)
             total += ended
             row = f"{ended['read']:>6} {ended['status 2']:>8} {ended['status 1']:>8} {longest:>6.2f} s"
-            say(f"{name:<28} {count:>6} {sum(ended.values()):>6} {row}\n")
-        say(f"all: {total.total()} tries, {dict(total)}; slowest {slowest[0]:.2f} s ({slowest[1]})\n")
-        say("".join(f"BAD {line}\n" for line in bad))
+            show(f"{name:<28} {count:>6} {sum(ended.values()):>6} {row}\n")
+        show(f"all: {total.total()} tries, {dict(total)}; slowest {slowest[0]:.2f} s ({slowest[1]})\n")
+        show("".join(f"BAD {line}\n" for line in bad))
 
 
 main()

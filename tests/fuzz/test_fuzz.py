@@ -130,9 +130,9 @@ def poses(draw: st.DrawFn) -> tuple[HandEyeProblem, bool]:
     problem = hand_eye_problem(rng, count, pattern, (robot[0], robot[1]), (camera[0], camera[1]), deviation)
     gripper, cameras = problem.base_from_gripper.copy(), problem.recon_from_camera.copy()
     for wrong in rng.permutation(len(gripper))[: draw(st.integers(0, max(0, (count - 1) // 3)))]:
-        turn = rotation_exp(rng.normal(size=3) * draw(st.sampled_from([0, 0.05, 1])))
+        rotation = rotation_exp(rng.normal(size=3) * draw(st.sampled_from([0, 0.05, 1])))
         off = rng.normal(size=3) * draw(st.sampled_from([0.005, 0.05, 0.5]))
-        gripper[wrong] = gripper[wrong] @ transform(turn, off)
+        gripper[wrong] = gripper[wrong] @ transform(rotation, off)
     if draw(st.booleans()):
         gripper[0], cameras[0] = gripper[-1], cameras[-1]
     unit = draw(st.sampled_from([1.0, 1.0, 1e-9, 1e9]))

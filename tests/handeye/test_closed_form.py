@@ -89,7 +89,7 @@ def test_an_image_without_weight_is_as_if_it_were_not_there(seed, count):
 
 @repeatable
 @given(seeds, st.integers(4, 9), st.sampled_from([0.0, 1e-12, 1e-7, 1e-3]))
-def test_half_turns_between_images_are_like_any_other_motion(seed, count, short_of):
+def test_half_rotates_between_images_are_like_any_other_motion(seed, count, short_of):
     rng = np.random.default_rng(seed)
     problem = hand_eye_problem(rng, count)
     gripper, x = problem.base_from_gripper.copy(), problem.gripper_from_camera
@@ -102,11 +102,11 @@ def test_half_turns_between_images_are_like_any_other_motion(seed, count, short_
 
 @repeatable
 @given(seeds)
-def test_half_turns_alone_are_solved(seed):
+def test_half_rotates_alone_are_solved(seed):
     """About axes at right angles, which makes all motions rotations by 180°: the sines of all vanish together."""
-    turns = np.pi * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    rotations = np.pi * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     rng = np.random.default_rng(seed)
-    gripper = any_rigid(rng, 1.0) @ transform(rotation_exp(turns), rng.normal(size=(3, 3)))
+    gripper = any_rigid(rng, 1.0) @ transform(rotation_exp(rotations), rng.normal(size=(3, 3)))
     x, z = any_rigid(rng, rng.uniform(0, np.pi)), any_rigid(rng, 1.0)
     camera = inverse(z) @ gripper @ x
     gripper = retract(gripper, 1e-6 * rng.normal(size=(3, 6)))
@@ -140,7 +140,7 @@ def test_small_noise_makes_small_errors():
     assert scale == pytest.approx(problem.scale, rel=1e-2)
 
 
-def test_a_camera_that_only_turns_has_no_scale_and_gets_one():
+def test_a_camera_that_only_rotates_has_no_scale_and_gets_one():
     problem = hand_eye_problem(np.random.default_rng(2), 6, "camera-centre")
     assert closed_form(problem.base_from_gripper, problem.recon_from_camera)[1] == 0
     assert initial_estimate(problem.base_from_gripper, problem.recon_from_camera)[1] == 1.0

@@ -49,8 +49,10 @@ def test_smooth_errors_are_a_covariance_that_the_choice_of_the_base_does_not_cha
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)
     assert np.linalg.eigvalsh(alike).min() > -1e-9
     other = transform(rotation_exp(np.array([0.4, -1.0, 2.0])), np.array([1.0, 2.0, 3.0]))
-    turned = np.kron(np.eye(2 * 9), other[:3, :3])
-    np.testing.assert_allclose(smooth_errors(other @ base_from_gripper), turned @ alike @ turned.T, atol=1e-9)
+    rotated = np.kron(np.eye(2 * 9), other[:3, :3])
+    np.testing.assert_allclose(
+        smooth_errors(other @ base_from_gripper), rotated @ alike @ rotated.T, atol=1e-9
+    )
 
 
 def test_the_sizes_are_found_from_many_poses():
@@ -128,8 +130,8 @@ def test_answers_of_a_bent_arm_are_within_their_sigma(joints_known: bool):
         alike = arm_errors(arm, problem.joints) if joints_known else None
         fit, used = robust_fit(problem.base_from_gripper, problem.recon_from_camera, systematic=alike)
         assert used.sum() >= 28
-        missed = error(problem, fit.gripper_from_camera, fit.scale)[:6]
-        worst.append(np.abs(missed / np.sqrt(np.diag(fit.covariance)[:6])).max())
+        errors = error(problem, fit.gripper_from_camera, fit.scale)[:6]
+        worst.append(np.abs(errors / np.sqrt(np.diag(fit.covariance)[:6])).max())
     assert max(worst) < 3.5 and (np.array(worst) > 3).sum() <= 1
 
 

@@ -24,20 +24,20 @@ def examined(preset: PresetName, seed: int):
 
 
 @pytest.mark.slow
-def test_offsets_are_right_within_their_sigma_and_a_bent_arm_is_told_from_a_straight_one():
-    off, told = [], []
+def test_offsets_are_right_within_their_sigma_and_a_bent_arm_is_distinguished_from_a_straight_one():
+    off, printed = [], []
     for seed in range(8):
         true, found, p = examined("typical", seed)
         off.append((found.offset - true) / found.std)
-        told.append(found.std / found.prior_std)
+        printed.append(found.std / found.prior_std)
         assert p < 1e-3
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
     # The first and the last joint turn base and gripper, which nothing shows.
-    assert (np.median(told, axis=0)[[0, 5]] > 0.95).all() and (np.median(told, axis=0)[1:5] < 0.7).all()
+    assert (np.median(printed, axis=0)[[0, 5]] > 0.95).all() and (np.median(printed, axis=0)[1:5] < 0.7).all()
     assert sum(examined("white", seed)[2] < 0.05 for seed in range(12)) <= 2
 
 
-def test_angles_of_cameras_and_grippers_agree_unless_the_cameras_are_turned_by_more():
+def test_angles_of_cameras_and_grippers_agree_unless_the_cameras_are_rotated_by_more():
     rng = np.random.default_rng(1)
     vectors = 0.5 * rng.normal(size=(9, 3))
     x = transform(rotation_exp(np.array([0.4, 1.0, -0.3])), np.array([0.1, 0.0, 0.05]))

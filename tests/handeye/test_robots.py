@@ -196,8 +196,8 @@ def test_arm_agrees_with_its_mujoco_model(name, atol):
         pose, angles = np.eye(4), iter(row)
         for position, quat_wxyz, axis in MUJOCO_FORMS[name]:
             body = Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()
-            turn = np.zeros(3) if axis is None else next(angles) * np.array(axis, float)
-            pose = pose @ transform(body @ rotation_exp(turn), np.array(position, float))
+            rotation = np.zeros(3) if axis is None else next(angles) * np.array(axis, float)
+            pose = pose @ transform(body @ rotation_exp(rotation), np.array(position, float))
         other.append(pose)
     poses = forward_kinematics(arm, joints)
     # Bases differ by a rotation about z at most.

@@ -29,14 +29,14 @@ def test_exact_poses_give_the_exact_answer(count, pattern):
         assert np.abs(error(problem, solved.gripper_from_camera, solved.scale)).max() < 1e-8
 
 
-def test_half_turns_do_not_flip_the_answer():
+def test_half_rotates_do_not_flip_the_answer():
     rng = np.random.default_rng(3)
     problem = hand_eye_problem(rng, 8)
     # Every second view is half a turn (to 1e-9) about a skew axis from its neighbour.
-    turns = np.pi * rng.normal(size=(8, 3))
-    turns *= (np.pi - 1e-9) / np.linalg.norm(turns, axis=1, keepdims=True)
+    rotations = np.pi * rng.normal(size=(8, 3))
+    rotations *= (np.pi - 1e-9) / np.linalg.norm(rotations, axis=1, keepdims=True)
     gripper = problem.base_from_gripper.copy()
-    gripper[1::2] = gripper[0::2] @ transform(rotation_exp(turns[1::2]), rng.normal(size=(4, 3)))
+    gripper[1::2] = gripper[0::2] @ transform(rotation_exp(rotations[1::2]), rng.normal(size=(4, 3)))
     x = problem.gripper_from_camera
     camera = scale_translation(gripper @ x, 1 / problem.scale)
     found, scale, _ = closed_form(gripper, camera, np.ones(8))
@@ -126,9 +126,9 @@ def test_the_95_percent_ellipsoid_covers_95_percent(given):
         solved = jcr.solve_hand_eye(
             problem.base_from_gripper, problem.recon_from_camera, robot_noise=NOISE if given else None
         )
-        missed = error(problem, solved.gripper_from_camera, solved.scale)
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
         for k, part in enumerate((slice(0, 7), slice(0, 6))):
-            squared = missed[part] @ np.linalg.solve(solved.covariance[part, part], missed[part])
+            squared = errors[part] @ np.linalg.solve(solved.covariance[part, part], errors[part])
             inside[k] += squared < chi2.ppf(0.95, part.stop)
         _, jacobian = residuals(
             solved.gripper_from_camera,
@@ -155,8 +155,8 @@ def test_three_images_do_not_promise_too_much():
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([7, seed]), 3, robot_noise=(5e-4, np.radians(0.01)))
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera)
-        missed = error(problem, solved.gripper_from_camera, solved.scale)
-        inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += errors @ np.linalg.solve(solved.covariance, errors) < chi2.ppf(0.95, 7)
     # One count of degrees of freedom for both noises gives 70.
     assert inside >= 93
 
@@ -177,8 +177,8 @@ def test_a_robot_noise_that_the_poses_contradict_is_not_believed():
     for seed in range(runs):
         problem = hand_eye_problem(np.random.default_rng([8, seed]), 6, "varied", given, NOISE)
         solved = jcr.solve_hand_eye(problem.base_from_gripper, problem.recon_from_camera, robot_noise=given)
-        missed = error(problem, solved.gripper_from_camera, solved.scale)
-        inside += missed @ np.linalg.solve(solved.covariance, missed) < chi2.ppf(0.95, 7)
+        errors = error(problem, solved.gripper_from_camera, solved.scale)
+        inside += errors @ np.linalg.solve(solved.covariance, errors) < chi2.ppf(0.95, 7)
         # Whether at random or alike, six images hardly tell.
         assert min(np.divide(solved.robot_noise.together, given)) > 1.5
         assert any("more than the given robot noise" in warning for warning in solved.warnings)
@@ -229,7 +229,7 @@ def test_covariance_matches_a_jackknife_over_images():
     assert (ratio > 0.6).all() and (ratio < 1.6).all()
 
 
-def test_held_out_error_is_that_of_a_fit_without_the_image():
+def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
     """Of errors that poses near each other share, the others tell a part of the one that is left out."""
     problem = hand_eye_problem(np.random.default_rng(9), 8, robot_noise=NOISE)
     gripper, camera = problem.base_from_gripper, problem.recon_from_camera
@@ -249,7 +249,7 @@ def test_held_out_error_is_that_of_a_fit_without_the_image():
         )
 
     everything = of_rows(np.arange(48))
-    missed, covariance = left_out(solve(everything, sizes), NOISE)
+    errors, covariance = left_out(solve(everything, sizes), NOISE)
     v = everything.covariance(sizes)
     for k in range(8):
         mine, others = np.arange(6 * k, 6 * k + 6), np.delete(np.arange(48), np.arange(6 * k, 6 * k + 6))
@@ -259,10 +259,14 @@ def test_held_out_error_is_that_of_a_fit_without_the_image():
         expected = residual[mine, 0] - gain @ residual[others, 0] + by_unknown @ without.step
         own = v[np.ix_(mine, mine)] - gain @ v[np.ix_(others, mine)]
         spread = own + by_unknown @ without.covariance @ by_unknown.T
-        assert np.allclose(missed[k], expected, rtol=1e-4, atol=1e-9)
+        assert np.allclose(errors[k], expected, rtol=1e-4, atol=1e-9)
         assert np.allclose(covariance[k], spread, rtol=1e-4, atol=1e-4 * np.abs(spread).max())
-    assert full.held_out is not None
-    assert 0.5 * 1e3 * np.sqrt(3) * NOISE[0] < full.held_out.translation_mm < 4 * 1e3 * np.sqrt(3) * NOISE[0]
+    assert full.leave_one_out is not None
+    assert (
+        0.5 * 1e3 * np.sqrt(3) * NOISE[0]
+        < full.leave_one_out.translation_mm
+        < 4 * 1e3 * np.sqrt(3) * NOISE[0]
+    )
 
 
 UNSEEN = {
@@ -322,7 +326,7 @@ def test_a_known_offset_cures_planar_motion_and_a_known_scale_cures_an_orbit():
     assert np.linalg.norm(error(orbit, solved.gripper_from_camera, solved.scale)[:3]) < 5e-3
 
 
-def test_poses_that_belong_to_other_pictures_are_not_trusted():
+def test_poses_that_belong_to_other_images_are_rejected():
     rng = np.random.default_rng(12)
     problem = hand_eye_problem(rng, 10)
     solved = jcr.solve_hand_eye(problem.base_from_gripper[rng.permutation(10)], problem.recon_from_camera)
@@ -350,13 +354,13 @@ def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
 def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
     """The larger half of what three images leave open is how far the robot's poses scatter."""
     noise = (5e-4, np.radians(0.1))
-    trusted, surer = {"estimated": 0, "given": 0}, []
+    accepted, surer = {"estimated": 0, "given": 0}, []
     for seed in range(12):
         problem = hand_eye_problem(np.random.default_rng(seed), 3, robot_noise=noise)
         poses = problem.base_from_gripper, problem.recon_from_camera
         estimated, given = jcr.solve_hand_eye(*poses), jcr.solve_hand_eye(*poses, robot_noise=noise)
-        trusted["estimated"] += estimated.converged
-        trusted["given"] += given.converged
+        accepted["estimated"] += estimated.converged
+        accepted["given"] += given.converged
         for answer in (estimated, given):
             uncertain = [warning for warning in answer.warnings if "is known to ±" in warning]
             assert all(("--robot-noise" in warning) == (answer is estimated) for warning in uncertain)
@@ -364,7 +368,7 @@ def test_three_images_ask_for_the_robots_noise_and_are_the_surer_for_it():
                 off = error(problem, answer.gripper_from_camera, answer.scale)
                 assert (np.abs(off) < 5 * np.sqrt(np.diag(answer.covariance))).all()
         surer.append(np.sqrt(np.trace(given.covariance[:3, :3]) / np.trace(estimated.covariance[:3, :3])))
-    assert trusted["given"] >= trusted["estimated"] and np.median(surer) < 0.9
+    assert accepted["given"] >= accepted["estimated"] and np.median(surer) < 0.9
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def test_numbers_of_poses_lead_back(convention: str, units: str):
     assert np.allclose(poses_from_numbers(numbers, convention, units, "here"), POSES, atol=1e-12)
 
 
-def test_a_ur_is_told_what_its_pendant_shows_and_a_line_to_run():
+def test_a_ur_is_named_what_its_pendant_shows_and_a_line_to_run():
     shown, line = pose_lines(POSES[0], ArmWords("ur"))
     numbers = [float(text) for text in re.findall(r"-?\d+\.\d+", line.split("]")[0])]
     back = poses_from_numbers(np.array([numbers]), "ur", "auto", "here")[0]
@@ -34,7 +34,7 @@ def test_a_ur_is_told_what_its_pendant_shows_and_a_line_to_run():
     assert f"x {1e3 * POSES[0, 0, 3]:.1f}" in shown and "mm" in shown and "rad" in shown
 
 
-def test_a_franka_is_told_columns_and_others_by_name():
+def test_a_franka_is_named_columns_and_others_by_name():
     (line,) = pose_lines(POSES[0], ArmWords("franka"))
     numbers = np.array([float(text) for text in re.findall(r"-?\d+\.\d+", line)])
     assert np.allclose(numbers.reshape(4, 4).T, POSES[0], atol=1e-5)

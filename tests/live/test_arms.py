@@ -35,7 +35,7 @@ def needs(*packages: str) -> None:
         pytest.skip(f"not installed: {', '.join(missing)}")
 
 
-def told_by(script: str, *words: object) -> Any:
+def named_by(script: str, *words: object) -> Any:
     """What a script of its own process prints as JSON, its last line; garbage is collected before it ends."""
     lines = [*script.strip("\n").splitlines(), "    import gc", "    gc.collect()"]
     command = [sys.executable, "-c", "\n".join(line.removeprefix("    ") for line in lines), *map(str, words)]
@@ -62,7 +62,7 @@ ASK = """
 def test_an_arm_gives_pose_and_joints_through_its_makers_package():
     needs("xarm")
     with fake_xarm("127.0.0.7", POSE, JOINTS):
-        pose, joints, refused = told_by(ASK, "xarm", "127.0.0.7", "127.0.0.8")
+        pose, joints, refused = named_by(ASK, "xarm", "127.0.0.7", "127.0.0.8")
     # An xArm tells float32, of which its package keeps six digits.
     assert np.allclose(pose, POSE, atol=1e-6) and np.allclose(joints, JOINTS, atol=1e-6)
     assert "xarm:127.0.0.8" in refused and "check the address" in refused
@@ -103,7 +103,7 @@ MOVED_FRANKA = """
 def test_a_simulated_franka_gives_pose_and_joints():
     needs("franky", "franky_sim")
     with simulated_franka("127.0.0.9"):
-        poses, joints, goal = map(np.array, told_by(MOVED_FRANKA, "127.0.0.9"))
+        poses, joints, goal = map(np.array, named_by(MOVED_FRANKA, "127.0.0.9"))
     assert np.allclose(joints[1], goal, atol=0.05)
     # The end effector is the hand, constant in the flange.
     tools = inverse(forward_kinematics(arm_named("fr3"), joints)) @ poses
@@ -139,12 +139,20 @@ def test_a_realsense_gives_images_depth_in_millimetres_and_the_intrinsics_of_its
             pytest.skip("pyrealsense2 needs libusb-1.0")
         assert made.returncode == 0, made.stderr
         pixels = [[10.0, 20.0], [600.0, 30.0], [320.0, 240.0], [630.0, 470.0]]
-        count, shape, depth_mm, lens, rays = told_by(FILMED, file, pixels)
+        count, shape, depth_mm, intrinsics, rays = named_by(FILMED, file, pixels)
     assert count >= 3 and shape == [480, 640, 3]
     # 1001 units of half a millimetre.
     assert set(depth_mm) <= {0, 500, 501}
-    assert (lens["fx"], lens["cy"]) == (600.0, 242.0)
-    found = Intrinsics(lens["fx"], lens["fy"], lens["cx"], lens["cy"], 640, 480, tuple(lens["distortion"]))
+    assert (intrinsics["fx"], intrinsics["cy"]) == (600.0, 242.0)
+    found = Intrinsics(
+        intrinsics["fx"],
+        intrinsics["fy"],
+        intrinsics["cx"],
+        intrinsics["cy"],
+        640,
+        480,
+        tuple(intrinsics["distortion"]),
+    )
     assert np.allclose(project(found, np.array(rays)), pixels, atol=0.05)
 
 
@@ -163,7 +171,7 @@ class Device:
         return self.values.get(prop, self.fixed.get(prop, 0.0))
 
 
-def test_a_device_keeps_to_size_exposure_and_focus_or_says_what_it_does_instead():
+def test_a_device_keeps_to_size_exposure_and_focus_or_shows_what_it_does_instead():
     device = Device({})
     keep_to(device, CameraOptions((1280, 720), 200.0, 30.0), "0")
     assert device.values == {

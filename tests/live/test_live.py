@@ -26,7 +26,7 @@ from jcr.live.collect import CollectOptions, collect
 from jcr.live.devices import opened
 from jcr.live.folder import LiveFolder
 from jcr.live.line_server import MAX_LINE, MOST_REFUSED, Listen, bound, served_poses
-from jcr.live.look import picture
+from jcr.live.look import still_image
 from jcr.live.rest import asks_at_rest
 from jcr.live.typed import typed_poses
 from places import ROOT
@@ -76,7 +76,7 @@ def close_to(image: ndarray, other: ndarray) -> bool:
     return bool(np.abs(image.astype(float) - other).mean() < 4)
 
 
-def test_each_pose_gets_the_picture_that_was_still_there_and_a_stopped_capture_goes_on(
+def test_each_pose_gets_the_image_that_was_still_there_and_a_stopped_capture_goes_on(
     tmp_path: Path, tabletop: Path
 ):
     pose = poses(tabletop)
@@ -109,7 +109,7 @@ def test_each_pose_gets_the_picture_that_was_still_there_and_a_stopped_capture_g
     assert (tmp_path / "c" / "live" / "now.jpg").is_file()
 
 
-def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_told(tmp_path: Path, tabletop: Path):
+def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_named(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     file = video(tmp_path / "a.avi", tabletop, range(1), rest_s=2)
     answers = taken(tmp_path / "c", file, map(Ask, [pose[0], pose[0], pose[1], pose[2]]), patience=0.8)
@@ -127,11 +127,11 @@ def test_a_frozen_stream_the_same_place_and_the_end_of_the_video_are_told(tmp_pa
         (lambda image, k: image // 64, "nearly black"),
     ],
 )
-def test_a_picture_that_moves_is_blurred_or_dark_is_refused(tabletop: Path, spoil, words: str):
-    sharp = picture(iter(Frame(still(tabletop, 0), k / RATE) for k in range(10)), [], 5.0)
+def test_a_image_that_moves_is_blurred_or_dark_is_refused(tabletop: Path, spoil, words: str):
+    sharp = still_image(iter(Frame(still(tabletop, 0), k / RATE) for k in range(10)), [], 5.0)
     assert not isinstance(sharp, str)
     spoiled = (Frame(spoil(still(tabletop, 1), k), k / RATE) for k in range(40))
-    assert words in str(picture(spoiled, [sharp], 2.0))
+    assert words in str(still_image(spoiled, [sharp], 2.0))
 
 
 def test_noise_of_a_cheap_sensor_is_no_motion(tabletop: Path):
@@ -141,7 +141,7 @@ def test_noise_of_a_cheap_sensor_is_no_motion(tabletop: Path):
         Frame(np.clip(image + rng.normal(0, 10, image.shape), 0, 255).astype(np.uint8), k / RATE)
         for k in range(10)
     )
-    assert not isinstance(picture(noisy, [], 1.0), str)
+    assert not isinstance(still_image(noisy, [], 1.0), str)
 
 
 class Client:
@@ -298,7 +298,7 @@ def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
         assert ask.current is not None and np.allclose(ask.current(), goals[2], atol=1e-9)
 
 
-def test_an_arm_that_moves_while_the_picture_is_taken_is_told_to_rest(tmp_path: Path, tabletop: Path):
+def test_an_arm_that_moves_while_the_image_is_taken_is_asked_to_rest(tmp_path: Path, tabletop: Path):
     pose = poses(tabletop)
     moved = pose[0].copy()
     moved[0, 3] += 1e-3
@@ -357,14 +357,14 @@ def test_an_interrupted_command_goes_on_and_the_example_client_talks_to_it(tmp_p
     client = Client(int(port))
     assert client.ask({"base_from_gripper": poses(tabletop)[0].tolist()})["image"] == "images/000.png"
     running.send_signal(signal.SIGINT)
-    told = running.communicate(timeout=20)[1]
+    printed = running.communicate(timeout=20)[1]
     client.close()
     assert running.returncode == 130
-    assert told.splitlines()[-1].startswith("error: interrupted") and "Traceback" not in told
+    assert printed.splitlines()[-1].startswith("error: interrupted") and "Traceback" not in printed
 
     running, port = start(out, video(tmp_path / "b.avi", tabletop, range(1, 4)))
     talked = subprocess.run([sys.executable, CLIENT, port], capture_output=True, text=True, timeout=60)
-    told = running.communicate(timeout=20)[1]
-    assert running.returncode == 0, told
+    printed = running.communicate(timeout=20)[1]
+    assert running.returncode == 0, printed
     assert talked.returncode == 0 and talked.stdout.count("images/00") == 3, talked.stdout + talked.stderr
     assert jcr.read_capture(out).images == tuple(f"images/00{k}.png" for k in range(4))

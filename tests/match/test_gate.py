@@ -49,7 +49,7 @@ def essential(i_from_j: np.ndarray) -> np.ndarray:
 MOTION = transform(rotation_exp(np.array([0.1, -0.3, 0.2])), np.array([0.15, 0.02, 0.03]))
 
 
-def test_a_reading_is_the_motion_as_surely_as_it_says():
+def test_a_reading_is_the_motion_as_surely_as_it_shows():
     errors, stds = [], []
     for seed in range(25):
         ray_i, ray_j = seen(MOTION, False, np.random.default_rng(seed))
@@ -127,11 +127,11 @@ def test_a_less_certain_pair_may_differ_more():
     assert angle_tolerance(0.5, 0.05) > 2 * angle_tolerance(0.5, 0.01)
 
 
-def test_turned_upright_no_image_is_turned_against_another():
+def test_rotated_upright_no_image_is_rotated_against_another():
     rng = np.random.default_rng(0)
     base_from_first = rotation_exp(np.array([np.pi, 0.0, 0.0]))  # looking down
-    turn = rng.uniform(-np.pi, np.pi, 12)
-    about_axis = rotation_exp(np.outer(turn, [0.0, 0.0, 1.0]))
+    rotation = rng.uniform(-np.pi, np.pi, 12)
+    about_axis = rotation_exp(np.outer(rotation, [0.0, 0.0, 1.0]))
     upright = rolls(base_from_first @ about_axis)
     back = rotation_exp(np.outer(upright, [0.0, 0.0, 1.0]))
     # What image 0, turned, sees at an angle, every other one, turned, sees at the same.
@@ -140,7 +140,7 @@ def test_turned_upright_no_image_is_turned_against_another():
 
 
 @pytest.mark.parametrize(("roll_deg", "used_deg"), [(-10, 0), (80, 90), (184, 180), (40, 40), (-40, 320)])
-def test_quarters_are_turned_without_resampling(roll_deg: float, used_deg: float):
+def test_quarters_are_rotated_without_resampling(roll_deg: float, used_deg: float):
     assert np.degrees(by_quarters(np.radians(roll_deg))) == pytest.approx(used_deg)
 
 
@@ -158,9 +158,9 @@ def test_what_keeps_its_pixel_while_the_gripper_moves_is_hidden():
 
 
 def test_the_smaller_group_of_images_moved():
-    lens = Intrinsics(FOCAL, FOCAL, 319.5, 239.5, 640, 480)
+    intrinsics = Intrinsics(FOCAL, FOCAL, 319.5, 239.5, 640, 480)
     at = np.random.default_rng(0).uniform([100, 200], [150, 260], (20, 2))
-    view = View.of([at] * 8, lens)
+    view = View.of([at] * 8, intrinsics)
     rows = np.column_stack([np.arange(20)] * 2)
     second = {(i, j): rows for i in (0, 3) for j in (1, 2, 4, 5)}
     second = {(min(key), max(key)): value for key, value in second.items()}

@@ -15,7 +15,7 @@ from jcr.match.verify import Geometries
 from jcr.reconstruct.sfm import camera_of
 from jcr.records import Intrinsics
 
-LENS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+INTRINSICS = Intrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
@@ -29,8 +29,8 @@ class Points:
         x = rng.uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.6], (120, 3))
         second = transform(rotation_exp(np.array([0.0, 0.2, 0.1])), np.array([-0.3, 0.0, 0.0]))
         self.x_px = [
-            project(LENS, x),
-            project(LENS, apply(inverse(second), x)),
+            project(INTRINSICS, x),
+            project(INTRINSICS, apply(inverse(second), x)),
             rng.uniform(0, 480, (120, 2)),
         ]
         self.matched: list[tuple[int, int]] = []
@@ -57,7 +57,7 @@ def in_numbers(found: Geometries) -> dict:
 def test_pairs_are_read_as_they_were_found_while_images_and_intrinsics_are_the_same(
     tmp_path: Path, known: bool
 ):
-    camera, rolls = camera_of(LENS, known), np.zeros((3, 2))
+    camera, rolls = camera_of(INTRINSICS, known), np.zeros((3, 2))
     wanted = Matcher(Points(), np.ones(2), camera, known, 0).geometries(PAIRS, rolls)
     assert list(wanted) == [(0, 1)]
 

@@ -53,19 +53,19 @@ def test_another_file_of_weights_is_refused(tmp_path: Path, monkeypatch: pytest.
     [pytest.param("xfeat", 60, marks=needs_xfeat), pytest.param("aliked", 60, marks=needs_aliked)],
 )
 @pytest.mark.parametrize("roll", [0.0, math.pi / 2, 2.4])
-def test_a_turned_image_is_matched_when_it_is_turned_back(kind, least: int, roll: float, tabletop: Path):
+def test_a_rotated_image_is_matched_when_it_is_rotated_back(kind, least: int, roll: float, tabletop: Path):
     import cv2
 
     from jcr.capture.images import read_image
     from jcr.match.learned import LearnedFeatures
 
     image = cv2.resize(read_image(sorted((tabletop / "images").iterdir())[0]), (320, 240))
-    turn = cv2.getRotationMatrix2D((159.5, 119.5), math.degrees(roll), 1.0)  # against y down, by -roll
-    turned = cv2.warpAffine(image, turn, (320, 240))
-    features = LearnedFeatures(kind, [image, turned])
+    rotation = cv2.getRotationMatrix2D((159.5, 119.5), math.degrees(roll), 1.0)  # against y down, by -roll
+    rotated = cv2.warpAffine(image, rotation, (320, 240))
+    features = LearnedFeatures(kind, [image, rotated])
     rows = features.match(0, 1, 0.0, roll)
     x, y = features.x_px[0][rows[:, 0]], features.x_px[1][rows[:, 1]]
-    error = np.linalg.norm(x @ turn[:, :2].T + turn[:, 2] - y, axis=1)
+    error = np.linalg.norm(x @ rotation[:, :2].T + rotation[:, 2] - y, axis=1)
     assert len(rows) > least
     assert np.median(error) < 1.0
     assert (error < 3).mean() > 0.9

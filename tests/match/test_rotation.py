@@ -65,7 +65,7 @@ def test_one_axis_fixes_nothing():
     assert rotation_of_x(gripper, x.T @ gripper @ x, np.full(10, 0.02)) is None
 
 
-def test_inverse_poses_are_told_from_right_ones():
+def test_inverse_poses_are_named_from_right_ones():
     """Their angles agree, their axes do not."""
     problem = hand_eye_problem(np.random.default_rng(3), 8)
     i, j = np.triu_indices(8, 1)

@@ -171,7 +171,7 @@ def test_what_a_back_end_does_not_use_is_refused_in_a_line(
 @pytest.mark.parametrize(
     ("name", "flag"), [("marker", "--board"), ("predictions", "--predictions"), ("given", "--cameras")]
 )
-def test_a_back_end_without_its_input_says_which_option_names_it(name: str, flag: str) -> None:
+def test_a_back_end_without_its_input_shows_which_option_names_it(name: str, flag: str) -> None:
     capture = Capture(Path(), ("a.png",), np.eye(4)[None], (64, 48))
     with pytest.raises(InputError, match=f"--backend {name}: name the .* with {flag}[ ,]"):
         backends.reconstruct(capture, ReconstructOptions(name))

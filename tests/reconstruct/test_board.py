@@ -51,16 +51,16 @@ def tag() -> tuple[ndarray, ndarray]:
 def test_a_detector_s_points_are_at_the_truth_on_average(spec, draw, flip, limit_px):
     sheet, origin = draw()
     sheet = cv2.copyMakeBorder(sheet, 100, 100, 100, 100, cv2.BORDER_CONSTANT, value=255)
-    missed = []
+    errors = []
     for degrees, shift in ((20, (0.1, 0.3)), (110, (0.4, -0.2)), (200, (-0.3, 0.1)), (290, (0.2, 0.4))):
         angle = np.radians(degrees)
-        turn = 0.25 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        rotation = 0.25 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         # Pixels of the image from those of the sheet, both counted from their images' corners.
-        middle = np.array([160.0, 160.0]) + shift - turn @ (np.array(sheet.shape[::-1]) / 2)
-        from_centres = np.column_stack([FINE * turn, FINE * (middle + turn @ [0.5, 0.5]) - 0.5])
+        middle = np.array([160.0, 160.0]) + shift - rotation @ (np.array(sheet.shape[::-1]) / 2)
+        from_centres = np.column_stack([FINE * rotation, FINE * (middle + rotation @ [0.5, 0.5]) - 0.5])
         fine = cv2.warpAffine(sheet, from_centres, (320 * FINE, 320 * FINE), borderValue=255)
         image = cv2.GaussianBlur(cv2.resize(fine, (320, 320), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
         (sighting,) = boards(spec)[0].detect(image)
         on_sheet = (sighting.x_in_body[:, :2] * [1, flip] + origin) * PX_PER_M + 100
-        missed.append(sighting.x_px - (on_sheet @ turn.T + middle - 0.5))
-    assert np.abs(np.concatenate(missed).mean(0)).max() < limit_px
+        errors.append(sighting.x_px - (on_sheet @ rotation.T + middle - 0.5))
+    assert np.abs(np.concatenate(errors).mean(0)).max() < limit_px

@@ -31,7 +31,7 @@ def seen_at(found: FaultyCapture, place_of_image: list[int]) -> list[list[Sighti
     """The corners in each image, of a board at one of the places; -1: it is not in view."""
     rng, sightings = np.random.default_rng(0), list[list[Sighting]]()
     for camera, place in zip(found.base_from_camera, place_of_image, strict=True):
-        x_px = project(found.lens, apply(inverse(camera) @ PLACES[place], GRID))
+        x_px = project(found.intrinsics, apply(inverse(camera) @ PLACES[place], GRID))
         x_px += 0.1 * rng.normal(size=x_px.shape)
         sightings.append([] if place < 0 else [Sighting(0, tuple(range(54)), GRID, x_px)])
     return sightings

@@ -16,7 +16,7 @@ from jcr.camera import project
 from jcr.capture.read import read_capture
 from jcr.depth.densify import densify, undistorted
 from jcr.depth.options import DepthOptions
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import apply_similarity, fit_similarity, inverse, rotation_between_deg
 from jcr.match.sift import SiftFeatures
 from jcr.progress import silent
@@ -113,9 +113,9 @@ def test_pointmaps_show_the_table_at_its_height(capture: Capture, found: Reconst
 
 def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_path: Path) -> None:
     """Bit for bit, also when the images lie on their side with an EXIF tag that says so."""
-    turned = _first(capture, 4)
+    rotated = _first(capture, 4)
     names = []
-    for name in turned.images:
+    for name in rotated.images:
         exif = Image.Exif()
         exif[0x0112] = 6  # to be turned a quarter clockwise for viewing
         names.append(f"{Path(name).stem}.png")
@@ -124,14 +124,14 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
             on_its_side.save(tmp_path / names[-1], exif=exif)
     shares = []
     again = reconstruct(
-        replace(turned, folder=tmp_path, images=tuple(names)),
+        replace(rotated, folder=tmp_path, images=tuple(names)),
         progress=lambda stage, share: shares.append(share) if stage == "mapping" else None,
     )
     assert shares == [0.0, 0.5, 0.75, 1.0, 1.0]  # a pair first, then image by image
     np.testing.assert_array_equal(again.recon_from_camera, four.recon_from_camera)
     np.testing.assert_array_equal(again.tracks.x_px, four.tracks.x_px)
     np.testing.assert_array_equal(again.tracks.points_in_recon, four.tracks.points_in_recon)
-    _, upright = undistorted(capture.folder, turned.images, four.intrinsics)
+    _, upright = undistorted(capture.folder, rotated.images, four.intrinsics)
     np.testing.assert_array_equal(undistorted(tmp_path, names, again.intrinsics)[1], upright)
 
 
@@ -145,7 +145,7 @@ def test_distortion_that_folds_over_is_not_used(capture: Capture, four: Reconstr
     np.testing.assert_array_equal(result.recon_from_camera, four.recon_from_camera)
 
 
-def test_unknown_lens_is_found(capture: Capture) -> None:
+def test_unknown_intrinsics_is_found(capture: Capture) -> None:
     assert capture.intrinsics is not None
     result = reconstruct(replace(_first(capture, 5), intrinsics=None))
     assert result.intrinsics.fx == pytest.approx(capture.intrinsics.fx, rel=0.01)
@@ -183,7 +183,7 @@ def test_images_without_texture_are_refused_in_one_line(capture: Capture, tmp_pa
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shade = np.linspace(90, 150 + k, 640)[None, :, None] * np.ones((480, 1, 3))
         Image.fromarray(shade.astype(np.uint8)).save(tmp_path / name)
-    with pytest.raises(NotTrustedError) as refusal:
+    with pytest.raises(RejectedError) as refusal:
         reconstruct(replace(bare, folder=tmp_path))
     message = str(refusal.value)
     assert "\n" not in message
@@ -205,5 +205,5 @@ def test_features_of_reduced_images_are_at_the_truth_on_average():
     (found,) = SiftFeatures([pixels], (400, 300), 1, silent).x_px
     x_px = (found + 0.5) * 1.5 - 0.5
     nearest = true[np.linalg.norm(x_px[:, None] - true, axis=2).argmin(1)]
-    missed = (x_px - nearest)[np.linalg.norm(x_px - nearest, axis=1) < 2]
-    assert len(missed) > 50 and np.abs(missed.mean(0)).max() < 0.03
+    errors = (x_px - nearest)[np.linalg.norm(x_px - nearest, axis=1) < 2]
+    assert len(errors) > 50 and np.abs(errors.mean(0)).max() < 0.03

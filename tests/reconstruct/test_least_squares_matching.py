@@ -12,7 +12,7 @@ from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.reconstruct.least_squares_matching import MOST_PX, align_tracks
 from jcr.records import Intrinsics, Tracks
 
-LENS = Intrinsics(300.0, 302.0, 158.0, 121.0, 320, 240, (-0.08, 0.05, 0.001, -0.001, 0.0))
+INTRINSICS = Intrinsics(300.0, 302.0, 158.0, 121.0, 320, 240, (-0.08, 0.05, 0.001, -0.001, 0.0))
 DISTANCE = (0.85, 1.0, 1.2)
 """The second is the median: the reference of every track."""
 ROTATION = rotation_exp(np.array([[0.25, 0.1, 0.3], [0.0, 0.0, 0.0], [-0.1, 0.3, -1.2]]))
@@ -33,7 +33,7 @@ def image(camera: int, seed: int = 0) -> UInt8[ndarray, "h w"]:
     """What a camera sees of the plane, with its gain, offset and noise."""
     pose = RECON_FROM_CAMERA[camera]
     pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), axis=-1)
-    ray = unproject(LENS, pixels) @ pose[:3, :3].T
+    ray = unproject(INTRINSICS, pixels) @ pose[:3, :3].T
     on_plane = pose[:3, 3] - (pose[2, 3] / ray[..., 2:]) * ray
     grey = GAIN[camera] * texture(on_plane[..., :2], seed) + OFFSET[camera]
     grey += NOISE * np.random.default_rng(camera).standard_normal(grey.shape)
@@ -49,7 +49,7 @@ def greys() -> UInt8[ndarray, "m h w"]:
 def exact() -> Tracks:
     """Points of the plane that all three cameras see, and where they see them."""
     points = np.random.default_rng(1).uniform(-0.35, 0.35, (300, 3)) * [1, 0.7, 0]
-    seen = np.stack([project(LENS, apply(inverse(pose), points)) for pose in RECON_FROM_CAMERA])
+    seen = np.stack([project(INTRINSICS, apply(inverse(pose), points)) for pose in RECON_FROM_CAMERA])
     whole = ((seen > 14) & (seen < [305, 225])).all((0, 2))
     n = int(whole.sum())
     assert n > 100
@@ -73,7 +73,7 @@ def disturbed(tracks: Tracks, px: float) -> Tracks:
 
 def test_observations_are_where_the_reference_is_seen(greys: UInt8[ndarray, "m h w"], exact: Tracks):
     start = disturbed(exact, 0.5)
-    found = align_tracks(greys, start, RECON_FROM_CAMERA, LENS)
+    found = align_tracks(greys, start, RECON_FROM_CAMERA, INTRINSICS)
     other, error = exact.image != 1, found.x_px - exact.x_px
     moved = (found.x_px != start.x_px).any(1)
     assert not moved[~other].any()
@@ -87,16 +87,16 @@ def test_order_of_observations_does_not_matter(greys: UInt8[ndarray, "m h w"], e
     start = disturbed(exact, 0.5)
     other = np.random.default_rng(3).permutation(len(start.point))
     shuffled = replace(start, image=start.image[other], x_px=start.x_px[other], point=start.point[other])
-    found = align_tracks(greys, start, RECON_FROM_CAMERA, LENS)
+    found = align_tracks(greys, start, RECON_FROM_CAMERA, INTRINSICS)
     assert np.allclose(
-        align_tracks(greys, shuffled, RECON_FROM_CAMERA, LENS).x_px, found.x_px[other], atol=1e-6
+        align_tracks(greys, shuffled, RECON_FROM_CAMERA, INTRINSICS).x_px, found.x_px[other], atol=1e-6
     )
 
 
 def test_what_shows_something_else_keeps_its_keypoint(greys: UInt8[ndarray, "m h w"], exact: Tracks):
     start = disturbed(exact, 0.5)
     occluded = np.stack([image(0, seed=5), greys[1], np.full_like(greys[2], 90)])
-    found = align_tracks(occluded, start, RECON_FROM_CAMERA, LENS)
+    found = align_tracks(occluded, start, RECON_FROM_CAMERA, INTRINSICS)
     kept = (found.x_px == start.x_px).all(1)
     assert kept[start.image == 0].mean() > 0.95
     assert kept[start.image == 2].all()
@@ -104,7 +104,7 @@ def test_what_shows_something_else_keeps_its_keypoint(greys: UInt8[ndarray, "m h
 
 def test_nothing_is_moved_far(greys: UInt8[ndarray, "m h w"], exact: Tracks):
     start = disturbed(exact, 4.0)
-    found = align_tracks(greys, start, RECON_FROM_CAMERA, LENS)
+    found = align_tracks(greys, start, RECON_FROM_CAMERA, INTRINSICS)
     moved = np.linalg.norm(found.x_px - start.x_px, axis=1)
     assert moved.max() <= MOST_PX
     # Within the limit most are found although they are far off.

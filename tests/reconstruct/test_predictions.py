@@ -61,9 +61,9 @@ def capture(tmp_path: Path, truth: dict[str, Any]) -> Capture:
         Rotation.from_rotvec([0.2, 0.1, 1.5]).as_matrix(), np.array([0.03, 0.05, 0.1])
     )
     focal = 5 * truth["gt_focal"]
-    lens = Intrinsics(focal, focal, 2.5 * WIDTH + 2, 2.5 * HEIGHT + 2, 5 * WIDTH, 5 * HEIGHT)
+    intrinsics = Intrinsics(focal, focal, 2.5 * WIDTH + 2, 2.5 * HEIGHT + 2, 5 * WIDTH, 5 * HEIGHT)
     base_from_gripper = truth["gt_poses"] @ inverse(gripper_from_camera)
-    return Capture(tmp_path, names, base_from_gripper, (5 * WIDTH, 5 * HEIGHT), lens)
+    return Capture(tmp_path, names, base_from_gripper, (5 * WIDTH, 5 * HEIGHT), intrinsics)
 
 
 def pair_arrays(truth: dict[str, Any]) -> dict[str, ndarray]:
@@ -98,7 +98,7 @@ def assert_poses(result: Reconstruction, truth: ndarray, millimetres: float, deg
 
 def assert_tracks(result: Reconstruction, median_px: float) -> None:
     """In original pixels, by the reconstruction's own geometry."""
-    tracks, lens = result.tracks, result.intrinsics
+    tracks, intrinsics = result.tracks, result.intrinsics
     camera_from_recon = inverse(result.recon_from_camera)
     x_in_camera = np.array(
         [
@@ -106,7 +106,7 @@ def assert_tracks(result: Reconstruction, median_px: float) -> None:
             for i, p in zip(tracks.image, tracks.point, strict=True)
         ]
     )
-    projected = x_in_camera @ lens.matrix.T
+    projected = x_in_camera @ intrinsics.matrix.T
     error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - tracks.x_px, axis=1)
     assert len(error) > 500 and np.median(error) < median_px
 
@@ -156,14 +156,14 @@ def test_pointmaps_in_one_frame_keep_their_poses(
     assert result.intrinsics.cx == pytest.approx(2.5 * WIDTH + 2, abs=0.05)
 
 
-def test_a_distorted_lens_is_used_with_intrinsics_and_given_up_without(
+def test_a_distorted_intrinsics_is_used_with_intrinsics_and_given_up_without(
     capture: Capture, truth: dict[str, Any]
 ) -> None:
-    lens = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480, (-0.1, 0.02, 0.0, 0.0, 0.0))
-    distorted = Capture(capture.folder, capture.images, capture.base_from_gripper, (640, 480), lens)
+    intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480, (-0.1, 0.02, 0.0, 0.0, 0.0))
+    distorted = Capture(capture.folder, capture.images, capture.base_from_gripper, (640, 480), intrinsics)
     seen = np.array([truth["gt_focal"], truth["gt_focal"], WIDTH / 2, HEIGHT / 2])
     arrays = pointmap_arrays(truth)
-    assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == lens
+    assert reconstructed(distorted, arrays | {"intrinsics": seen}).intrinsics == intrinsics
     result = reconstructed(distorted, arrays)
     assert result.intrinsics.distortion == (0.0,) * 5 and "distorted images" in result.warnings[0]
 
@@ -294,15 +294,15 @@ def test_an_any_view_model_is_given_our_intrinsics_and_the_robot_names_what_it_d
     assert (std[0] == 0).all() and np.degrees(std[1:, 3:]).min() > 1
     assert not any("check its pose" in text for text in result.warnings)
 
-    turned = capture.base_from_gripper.copy()
-    turned[1, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ turned[1, :3, :3]
-    off = Capture(capture.folder, capture.images, turned, capture.image_size, capture.intrinsics)
+    rotated = capture.base_from_gripper.copy()
+    rotated[1, :3, :3] = Rotation.from_euler("y", 20, degrees=True).as_matrix() @ rotated[1, :3, :3]
+    off = Capture(capture.folder, capture.images, rotated, capture.image_size, capture.intrinsics)
     found = reconstruct_views_at_once(off, options, predict=partial(mapanything.predict, model))
     named = [note for note in found.warnings if "check its pose" in note]
     assert len(named) == 1 and named[0].startswith("1.png: its angles to the other views differ")
 
 
-def test_mapanything_that_is_not_installed_says_how_to_get_it(capture: Capture) -> None:
+def test_mapanything_that_is_not_installed_shows_how_to_get_it(capture: Capture) -> None:
     if importlib.util.find_spec("mapanything"):
         pytest.skip("the mapanything package is installed here")
     with pytest.raises(InputError, match="pip install git"):

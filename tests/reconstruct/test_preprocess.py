@@ -29,20 +29,20 @@ def test_images_equal_the_published_preprocessing(name: str, long_edge: int) -> 
 
 
 def test_grid_intrinsics_project_a_point_to_where_the_pixel_goes() -> None:
-    lens = Intrinsics(905.3, 911.8, 655.2, 348.9, 1283, 727)
+    intrinsics = Intrinsics(905.3, 911.8, 655.2, 348.9, 1283, 727)
     grid = image_grid((1283, 727))
-    seen = grid.grid_intrinsics(lens)
+    seen = grid.grid_intrinsics(intrinsics)
     x_in_camera = np.array([0.12, -0.07, 0.9])
-    original = (lens.matrix @ x_in_camera)[:2] / x_in_camera[2]
+    original = (intrinsics.matrix @ x_in_camera)[:2] / x_in_camera[2]
     on_grid = (seen.matrix @ x_in_camera)[:2] / x_in_camera[2]
     np.testing.assert_allclose(grid.grid_from_original(original), on_grid, atol=1e-10)
     np.testing.assert_allclose(grid.original_from_grid(on_grid), original, atol=1e-10)
     back = grid.original_intrinsics(seen)
-    np.testing.assert_allclose(back.matrix, lens.matrix, atol=1e-10)
+    np.testing.assert_allclose(back.matrix, intrinsics.matrix, atol=1e-10)
 
 
 @pytest.mark.parametrize(("size", "long_edge"), [((1280, 720), 512), ((400, 300), 512), ((640, 480), 224)])
-def test_a_spot_in_the_image_lands_where_the_convention_says(size: tuple[int, int], long_edge: int) -> None:
+def test_a_spot_in_the_image_lands_where_the_convention_shows(size: tuple[int, int], long_edge: int) -> None:
     width, height = size
     v, u = np.mgrid[:height, :width]
     center = np.array([0.41 * width, 0.55 * height])
@@ -57,16 +57,16 @@ def test_a_spot_in_the_image_lands_where_the_convention_says(size: tuple[int, in
 
 
 def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_path: Path) -> None:
-    lens = Intrinsics(600.0, 605.0, 322.0, 236.0, 640, 480, (-0.21, 0.08, 0.001, -0.0007, 0.0))
+    intrinsics = Intrinsics(600.0, 605.0, 322.0, 236.0, 640, 480, (-0.21, 0.08, 0.001, -0.0007, 0.0))
     x_in_camera = np.array([[-0.31, -0.2, 1.0], [0.28, 0.21, 1.0], [0.02, -0.18, 1.0]])
     spots, _ = cv2.projectPoints(
-        x_in_camera, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion)
+        x_in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix, np.array(intrinsics.distortion)
     )
     spots = spots[:, 0]
     v, u = np.mgrid[:480, :640]
     image = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 5.0**2)) for x, y in spots)
     Image.fromarray(np.repeat((255 * image).astype(np.uint8)[..., None], 3, 2)).save(tmp_path / "0.png")
-    capture = Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), lens)
+    capture = Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), intrinsics)
 
     prepared = prepare_images(capture)
     assert prepared.intrinsics is not None
@@ -82,7 +82,7 @@ def test_a_distorted_capture_is_undistorted_and_pixels_find_their_way_back(tmp_p
 
 def test_a_folding_distortion_is_dropped_and_said(tmp_path: Path) -> None:
     Image.new("RGB", (640, 480)).save(tmp_path / "0.png")
-    lens = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480, (-0.9, 0.0, 0.0, 0.0, 0.0))
-    prepared = prepare_images(Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), lens))
+    intrinsics = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480, (-0.9, 0.0, 0.0, 0.0, 0.0))
+    prepared = prepare_images(Capture(tmp_path, ("0.png",), np.eye(4)[None], (640, 480), intrinsics))
     assert "folds over" in prepared.warnings[0]
     assert prepared.intrinsics_of_capture == Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)

@@ -30,7 +30,7 @@ from jcr.cell.cameras_json import cameras_file
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
 from jcr.cli.output import Output
 from jcr.cli.result import show
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, rotation_exp, transform
 from jcr.handeye.observability import excitation
 from jcr.records import (
@@ -81,8 +81,8 @@ def run(tabletop: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
         shutil.copy(tabletop / source, folder / name)
     reported = truth.base_from_gripper.copy()
     reported[WRONG, :3, 3] += [0.05, 0.0, 0.03]
-    lens = truth.intrinsics
-    capture = Capture(folder, tuple(names), reported, (lens.width, lens.height), lens)
+    intrinsics = truth.intrinsics
+    capture = Capture(folder, tuple(names), reported, (intrinsics.width, intrinsics.height), intrinsics)
     reconstruction, label = _cast(truth, tabletop)
     hand_eye = calibrate(capture, reconstruction)
     content = calibration_file(capture, reconstruction, hand_eye, {"reconstruct": 1.0}, "0.0")
@@ -108,14 +108,14 @@ def page(run: RunResult) -> str:
 def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
     """Pointmaps of table and boxes seen by all cameras but one, in a frame of its own; and their labels."""
     step, scale = 8, 0.1
-    lens = truth.intrinsics
+    intrinsics = truth.intrinsics
     grid = Intrinsics(
-        lens.fx / step,
-        lens.fy / step,
-        (lens.cx + 0.5) / step - 0.5,
-        (lens.cy + 0.5) / step - 0.5,
-        lens.width // step,
-        lens.height // step,
+        intrinsics.fx / step,
+        intrinsics.fy / step,
+        (intrinsics.cx + 0.5) / step - 0.5,
+        (intrinsics.cy + 0.5) / step - 0.5,
+        intrinsics.width // step,
+        intrinsics.height // step,
     )
     x, y = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
     rays = np.stack([(x - grid.cx) / grid.fx, (y - grid.cy) / grid.fy, np.ones(x.shape)], axis=-1)
@@ -144,16 +144,16 @@ def _cast(truth: Truth, tabletop: Path) -> tuple[Reconstruction, np.ndarray]:
             nearer = (enter < leave) & (enter < depth[k])
             depth[k][nearer], label[k][nearer] = enter[nearer], number
         in_camera = apply(inverse(base_from_camera), spots)
-        pixel = in_camera[:, :2] / in_camera[:, 2:] * lens.fx + [lens.cx, lens.cy]
+        pixel = in_camera[:, :2] / in_camera[:, 2:] * intrinsics.fx + [intrinsics.cx, intrinsics.cy]
         pixel += rng.normal(0, 0.3, pixel.shape)
-        inside = np.flatnonzero(((pixel > 0) & (pixel < [lens.width, lens.height])).all(1))
+        inside = np.flatnonzero(((pixel > 0) & (pixel < [intrinsics.width, intrinsics.height])).all(1))
         image.append(np.full(len(inside), k))
         seen.append(pixel[inside])
         point.append(inside)
     reconstruction = Reconstruction(
         image_index=rows,
         recon_from_camera=cameras,
-        intrinsics=lens,
+        intrinsics=intrinsics,
         pointmaps=Pointmaps(
             intrinsics=grid,
             points_in_recon=np.stack(
@@ -227,8 +227,10 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     np.testing.assert_allclose([float(values[axis]) for axis in "xyz"], x[:3, 3], atol=1e-9)
     is_rotation(Rotation.from_quat([float(values[f"q{axis}"]) for axis in "xyzw"]))
 
-    held_out = written["held_out"]
-    said = f"{significant(held_out['translation_mm'])} mm and {significant(held_out['rotation_deg'])}°"
+    leave_one_out = written["held_out"]
+    said = (
+        f"{significant(leave_one_out['translation_mm'])} mm and {significant(leave_one_out['rotation_deg'])}°"
+    )
     assert f"leave-one-out error: {said}" in elements.text
     required = run.calibration.requirement
     assert required is not None
@@ -244,7 +246,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
             assert f"{significant(image['reprojection_px'])} px" in elements.text
 
 
-def test_rejected_images_say_why(run: RunResult, page: str):
+def test_rejected_images_are_reported_with_why(run: RunResult, page: str):
     images = run.calibration.images
     assert [k for k, image in enumerate(images) if not image.used] == [WRONG, UNREGISTERED]
     text = Elements(page).text
@@ -276,9 +278,9 @@ def test_what_was_done_is_a_note_and_what_to_act_on_a_warning(
     written = log(content)
     assert "warning: a <pose> is off\n" in written and "note: a <note> & more\n" in written
     assert show(run, Output(json=True)) == 0
-    told = capsys.readouterr()
-    assert "warning: a <pose> is off\n" in told.err and "note: a <note> & more\n" in told.err
-    as_json = json.loads(told.out)
+    printed = capsys.readouterr()
+    assert "warning: a <pose> is off\n" in printed.err and "note: a <note> & more\n" in printed.err
+    as_json = json.loads(printed.out)
     assert as_json["notes"] == content.notes and as_json["warnings"] == content.warnings
     del as_json["notes"]  # as before there were any
     assert CalibrationFile.model_validate_json(json.dumps(as_json), strict=True).notes == []
@@ -435,7 +437,7 @@ def test_a_capture_that_was_copied_keeps_its_name_and_path(tmp_path: Path, table
     copied = kept(read, tmp_path / "out" / "capture")
     assert copied.folder.name == "capture" and copied.pose_convention == "ur"
     failed = failed_file(
-        copied, "colmap", no_reconstruction(NotTrustedError("nothing matched")), {"reconstruct": 1.0}, "0.0"
+        copied, "colmap", no_reconstruction(RejectedError("nothing matched")), {"reconstruct": 1.0}, "0.0"
     )
     elements = Elements(failed_report_html(copied, failed))
     assert "Hand-eye calibration of “bin_picking”" in elements.text
@@ -457,17 +459,17 @@ def test_the_covariance_is_offered_with_its_order(run: RunResult, page: str):
 
 def test_unseen_direction_has_a_red_bar(run: RunResult):
     capture, result = run.capture, run
-    turned = capture.base_from_gripper.copy()
-    yaw = np.linspace(0, 2, len(turned))[:, None] * [0.0, 0.0, 1.0]
-    turned[:, :3, :3] = rotation_exp(yaw) @ turned[0, :3, :3]
-    bars = list(excitation_bars(excitation(turned, result.hand_eye.gripper_from_camera)))
+    rotated = capture.base_from_gripper.copy()
+    yaw = np.linspace(0, 2, len(rotated))[:, None] * [0.0, 0.0, 1.0]
+    rotated[:, :3, :3] = rotation_exp(yaw) @ rotated[0, :3, :3]
+    bars = list(excitation_bars(excitation(rotated, result.hand_eye.gripper_from_camera)))
     assert [kind for kind, *_ in bars] == ["rejected"] + ["used"] * 6 and "translation" in bars[0][1]
 
 
-def test_a_run_without_camera_poses_says_why_with_its_images(run: RunResult):
+def test_a_run_without_camera_poses_reports_why_with_its_images(run: RunResult):
     capture = run.capture
     fault, remedy = "only 2 of 12 images share features", "lay <textured> things on the table"
-    error = NotTrustedError(fault, remedy)
+    error = RejectedError(fault, remedy)
     failed = failed_file(capture, "colmap", no_reconstruction(error), {"reconstruct": 2.0}, "0.0")
     elements = Elements(failed_report_html(capture, failed))
     assert f"No calibration: {fault}." in elements.text and f"{remedy.capitalize()}." in elements.text
@@ -482,8 +484,8 @@ def test_uncertainty_of_metres_is_said_in_metres(run: RunResult):
     optical = result.hand_eye.gripper_from_camera[:3, 2]
     for std, words in ((1.23, "±1.2 m"), (0.0123, "±12 mm")):
         covariance[:3, :3] = std**2 * np.outer(optical, optical)
-        told = worst_direction(result.hand_eye.estimate.gripper_from_camera, covariance)
-        assert told == f"along the optical axis: {words}"
+        printed = worst_direction(result.hand_eye.estimate.gripper_from_camera, covariance)
+        assert printed == f"along the optical axis: {words}"
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.7, 3.0, np.pi - 1e-6])
@@ -553,10 +555,10 @@ def test_figure_places_grippers_where_they_are(run: RunResult):
 
 
 def test_rendered_points_are_seen_from_the_front():
-    lens = Intrinsics(100.0, 100.0, 49.5, 29.5, 100, 60)
+    intrinsics = Intrinsics(100.0, 100.0, 49.5, 29.5, 100, 60)
     points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 1.0], [0.2, 0.1, 1.0], [0.0, 0.0, -1.0]])
     color = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]], np.uint8)
-    rgba = colored(points_in_pixels(points, 0.001, lens, 200), color)
+    rgba = colored(points_in_pixels(points, 0.001, intrinsics, 200), color)
     assert rgba.shape == (120, 200, 4)
     assert rgba[60, 100].tolist() == [0, 255, 0, 255]  # the near one hides the far one
     assert rgba[80, 140].tolist() == [0, 0, 255, 255]
@@ -609,20 +611,20 @@ def file(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_in_a_browser(chromium: Chromium, file: Path):
     chromium.events.clear()
     chromium.open(file.as_uri(), 1280)
-    picture = chromium.picture("#scene")
-    drawn = picture[(picture != picture[20, 20]).any(-1)]
-    assert len(drawn) > 0.05 * picture.shape[0] * picture.shape[1]
+    image = chromium.image("#scene")
+    drawn = image[(image != image[20, 20]).any(-1)]
+    assert len(drawn) > 0.05 * image.shape[0] * image.shape[1]
     assert len(np.unique(drawn, axis=0)) > 200
 
     # Turned by the mouse, it shows something else; every layer and switch changes it too.
-    before = chromium.picture("#scene")
+    before = chromium.image("#scene")
     x, y = chromium.center("#scene")
     mouse = {"button": "left", "buttons": 1, "clickCount": 1}
     chromium.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
     for k in range(1, 5):
         chromium.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 20 * k, y=y + 5 * k, **mouse)
     chromium.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 80, y=y + 20, **mouse)
-    pictures = [before, chromium.picture("#scene")]
+    images = [before, chromium.image("#scene")]
     for control in (
         'input[name="scene-layer"][value="1"]',
         'input[name="scene-layer"][value="2"]',
@@ -635,8 +637,8 @@ def test_in_a_browser(chromium: Chromium, file: Path):
         '[data-through="1"]',
     ):
         chromium.js(f"document.querySelector('{control}').click()")
-        pictures.append(chromium.picture("#scene"))
-    for one, two in itertools.pairwise(pictures):
+        images.append(chromium.image("#scene"))
+    for one, two in itertools.pairwise(images):
         assert (one != two).any()
     # Out of a camera, the photograph can be laid over the map.
     assert chromium.js("document.getElementById('scene-photo').naturalWidth") > 100
@@ -678,7 +680,7 @@ def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.open(file.as_uri(), 400, phone=True)
     assert chromium.js("document.documentElement.scrollWidth") <= 400
     light = chromium.js("getComputedStyle(document.body).backgroundColor")
-    before = chromium.picture("#scene")
+    before = chromium.image("#scene")
     x, y = chromium.center("#scene")
     finger = [{"x": x, "y": y, "id": 0}]
     chromium.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=finger)
@@ -686,7 +688,7 @@ def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
         moved = [{"x": x + 12 * k, "y": y, "id": 0}]
         chromium.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=moved)
     chromium.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-    assert (chromium.picture("#scene") != before).any()
+    assert (chromium.image("#scene") != before).any()
 
     chromium.open(file.as_uri(), 1280, scheme="dark")
     dark = chromium.js("getComputedStyle(document.body).backgroundColor")

@@ -363,7 +363,7 @@ def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: 
 
 
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("points", "message"),
     [
         (np.zeros(3), r"\(n, 3\)"),
         (np.zeros((4, 2)), r"\(n, 3\)"),
@@ -371,9 +371,9 @@ def test_moving_scene_and_workspace_moves_the_answers(cloud: PointCloud, scene: 
         (np.array([[np.inf, 0, 0]]), "row 0 is not finite"),
     ],
 )
-def test_points_that_are_none_are_refused(scene: "SceneMap", points: np.ndarray, says: str):
+def test_points_that_are_none_are_refused(scene: "SceneMap", points: np.ndarray, message: str):
     # Past the shape checks of the test run, as a user's call comes.
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         scene._points(points, "points")
 
 

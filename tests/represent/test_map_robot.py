@@ -96,8 +96,8 @@ def test_spheres_hold_the_shape_and_little_else(name: str):
     low, high = shape.bounds + [[-0.05], [0.05]]
     around = np.random.default_rng(0).uniform(low, high, (5000, 3))
     depth = trimesh.proximity.signed_distance(shape, around)
-    held = apply(link_from_shape, np.concatenate([surface, around[depth > 0]]))
-    gap = np.linalg.norm(held[:, None] - centers, axis=-1) - radii
+    fixed = apply(link_from_shape, np.concatenate([surface, around[depth > 0]]))
+    gap = np.linalg.norm(fixed[:, None] - centers, axis=-1) - radii
     assert gap.min(1).max() <= 1e-6
     beyond = apply(link_from_shape, around[depth < -1.5 * EXCESS])
     gap = np.linalg.norm(beyond[:, None] - centers, axis=-1) - radii
@@ -105,7 +105,7 @@ def test_spheres_hold_the_shape_and_little_else(name: str):
     assert len(radii) < 450
 
 
-def test_joints_move_the_spheres_as_the_urdf_says(urdf: Path):
+def test_joints_move_the_spheres_as_the_urdf_shows(urdf: Path):
     from jcr.represent.robot import load_robot
 
     robot = load_robot(urdf)

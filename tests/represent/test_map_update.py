@@ -269,14 +269,14 @@ def test_poses_are_read_from_json_npy_and_text(tmp_path: Path):
     for file in files.values():
         assert np.allclose(read_pose(file), pose), file
     wrong = tmp_path / "e.json"
-    for value, says in (
+    for value, message in (
         ((np.diag([1000.0, 1000, 1000, 1]) @ pose).tolist(), "no rotation"),
         (transform(np.eye(3), np.array([400.0, -100, 500])).tolist(), "millimetres"),
         ([[1, 2], [3, 4]], "4x4"),
         ({"pose": 1}, "base_from_gripper"),
     ):
         wrong.write_text(json.dumps(value))
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             read_pose(wrong)
     with pytest.raises(InputError, match="no such pose file"):
         read_pose(tmp_path / "none.json")

@@ -50,8 +50,8 @@ def test_a_cloud_keeps_reasons_and_sigmas_on_disk(tmp_path: Path) -> None:
     plain = analytic_scene.cloud(300)
     draw = np.random.default_rng(0)
     reason = draw.choice([MATCHED, PRIOR, BOTH], 300).astype(np.uint8)
-    told = replace(plain, reason=reason, depth_std=draw.uniform(1e-4, 1e-2, 300))
-    for cloud in (plain, told):
+    printed = replace(plain, reason=reason, depth_std=draw.uniform(1e-4, 1e-2, 300))
+    for cloud in (plain, printed):
         write_cloud(tmp_path / "cloud.ply", cloud)
         back = read_cloud(tmp_path / "cloud.ply")
         for name in ("reason", "depth_std"):

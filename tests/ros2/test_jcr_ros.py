@@ -111,7 +111,7 @@ def test_samples_are_taken_by_service_and_at_rest_and_the_next_pose_is_proposed(
     assert np.allclose(capture.base_from_gripper, played.poses[:4])
 
 
-def test_a_lens_that_is_not_known_and_a_gripper_that_is_not_in_tf_are_said(tmp_path: Path):
+def test_a_intrinsics_that_is_not_known_and_a_gripper_that_is_not_in_tf_are_said(tmp_path: Path):
     session = Session(Settings(tmp_path / "c"), lambda: None, lambda text: None, lambda *_: None)
     with pytest.raises(jcr.InputError, match="camera_info"):
         info = camera_info()

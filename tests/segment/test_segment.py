@@ -56,7 +56,9 @@ def table(rng, x: float = 0.3, y: float = 0.3) -> Float[ndarray, "n 3"]:
     return rectangle(rng, (-x, -y, 0), (x, y, 0), density=1e5)
 
 
-def box(rng, size: Sequence[float], at: Sequence[float] = (0, 0), turn: float = 0.0) -> Float[ndarray, "n 3"]:
+def box(
+    rng, size: Sequence[float], at: Sequence[float] = (0, 0), rotation: float = 0.0
+) -> Float[ndarray, "n 3"]:
     """Top and sides of a box on z = 0."""
     a, b, h = size[0] / 2, size[1] / 2, size[2]
     faces = [((-a, -b, h), (a, b, h))]
@@ -64,7 +66,7 @@ def box(rng, size: Sequence[float], at: Sequence[float] = (0, 0), turn: float = 
         ((-a, s * b, 0), (a, s * b, h)) for s in (-1, 1)
     ]
     points = np.concatenate([rectangle(rng, low, high) for low, high in faces])
-    return apply(transform(rotation_exp(np.array([0.0, 0.0, turn])), np.array([*at, 0.0])), points)
+    return apply(transform(rotation_exp(np.array([0.0, 0.0, rotation])), np.array([*at, 0.0])), points)
 
 
 def ring(
@@ -74,8 +76,8 @@ def ring(
     top, side = (int(4e5 * np.pi * area) for area in (outer**2 - inner**2, 2 * outer * (height - foot)))
     radius = np.append(np.sqrt(rng.uniform(inner**2, outer**2, top)), np.full(side, outer))
     z = np.append(np.full(top, height), rng.uniform(foot, height, side))
-    turn = rng.uniform(0, 2 * np.pi, top + side)
-    return np.stack([radius * np.cos(turn) + at[0], radius * np.sin(turn) + at[1], z], -1)
+    rotation = rng.uniform(0, 2 * np.pi, top + side)
+    return np.stack([radius * np.cos(rotation) + at[0], radius * np.sin(rotation) + at[1], z], -1)
 
 
 def cloud_of(
@@ -122,8 +124,8 @@ def test_sizes_are_recovered_on_a_tilted_table(rng: np.random.Generator):
     assert abs(lying.height - 0.05) < 2e-4 and abs(standing.height - 0.11) < 2e-4
     table_from_box = inverse(base_from_table) @ lying.base_from_box
     np.testing.assert_allclose(table_from_box[:3, 3], [0.1, 0.05, 0.025], atol=0.002)
-    turn = np.arctan2(table_from_box[1, 0], table_from_box[0, 0]) % np.pi
-    assert turn == pytest.approx(0.6, abs=0.02)
+    rotation = np.arctan2(table_from_box[1, 0], table_from_box[0, 0]) % np.pi
+    assert rotation == pytest.approx(0.6, abs=0.02)
     # The outline lies on the table and holds the box's corners.
     outline = apply(inverse(base_from_table), lying.footprint_in_base)
     np.testing.assert_allclose(outline[:, 2], 0, atol=3e-4)
@@ -147,7 +149,7 @@ def test_a_wall_behind_with_more_points_is_no_table_and_no_object(rng: np.random
     assert len(measured.objects) == 1 and abs(measured.objects[0].height - 0.05) < 2e-4
 
 
-def test_objects_that_touch_are_one_and_those_with_room_between_are_two(rng: np.random.Generator):
+def test_objects_that_touch_are_one_and_those_with_space_between_are_two(rng: np.random.Generator):
     left = box(rng, (0.06, 0.06, 0.05), (-0.03, 0.0))
     (touching,) = sizes_of(cloud_of(rng, table(rng), left, box(rng, (0.06, 0.06, 0.08), (0.03, 0.0))))
     np.testing.assert_allclose(touching, [0.12, 0.06, 0.08], atol=0.003)
@@ -184,13 +186,13 @@ def test_a_board_on_the_table_does_not_lift_the_plane(rng: np.random.Generator):
     assert abs(size.height - 0.05) < 4e-4
 
 
-def test_an_empty_table_has_no_object_and_says_so(rng: np.random.Generator):
+def test_an_empty_table_has_no_object_and_reports_it(rng: np.random.Generator):
     cloud, notes = label_cloud(cloud_of(rng, table(rng)), SegmentOptions())
     assert cloud.label_names == ("none", "table") and "no object" in notes[0]
     assert measure(cloud).objects == ()
 
 
-def test_without_a_plane_there_are_no_segments_and_it_says_so(rng: np.random.Generator):
+def test_without_a_plane_there_are_no_segments_and_it_reports_it(rng: np.random.Generator):
     ball = rng.normal(size=(3000, 3))
     scatter = cloud_of(rng, 0.3 * ball / np.linalg.norm(ball, axis=1, keepdims=True))
     cloud, notes = label_cloud(scatter, SegmentOptions())
@@ -232,7 +234,7 @@ def test_the_height_of_a_can_is_its_rims_and_not_its_sunk_lids(rng: np.random.Ge
     assert heights[1].height < 0.102
 
 
-def test_what_planes_filled_says_nothing_of_the_supports_noise(rng: np.random.Generator):
+def test_what_planes_filled_shows_nothing_of_the_supports_noise(rng: np.random.Generator):
     cloud = cloud_of(rng, table(rng), noise=3e-4)
     filled = rng.uniform(size=len(cloud.image)) < 0.6
     x = cloud.points_in_base.copy()
@@ -279,7 +281,7 @@ def test_a_top_that_one_image_alone_shows_is_no_more_than_a_lower_bound(rng: np.
     assert sizes_table(measured).count("≥") == 1
 
 
-def test_options_say_what_counts_as_an_object(rng: np.random.Generator):
+def test_options_show_what_counts_as_an_object(rng: np.random.Generator):
     things = table(rng), box(rng, (0.05, 0.05, 0.03), (-0.1, 0)), box(rng, (0.05, 0.05, 0.2), (0.1, 0))
     cloud = cloud_of(rng, *things)
 
@@ -291,19 +293,21 @@ def test_options_say_what_counts_as_an_object(rng: np.random.Generator):
     assert found(TabletopOptions(object_smallest=0.1)) == 1
 
 
-LENS = Intrinsics(90.0, 90.0, 39.5, 29.5, 80, 60, (-0.1, 0.0, 0.0, 0.0, 0.0))
+INTRINSICS = Intrinsics(90.0, 90.0, 39.5, 29.5, 80, 60, (-0.1, 0.0, 0.0, 0.0, 0.0))
 PINHOLE = Intrinsics(60.0, 60.0, 19.5, 14.5, 40, 30)
 
 
 def labelled_capture(folder: Path, rows: tuple[int, ...] = (0, 1)) -> tuple[Capture, Reconstruction]:
-    capture = Capture(folder, ("images/a.png", "images/b.png"), np.stack([np.eye(4)] * 2), (80, 60), LENS)
+    capture = Capture(
+        folder, ("images/a.png", "images/b.png"), np.stack([np.eye(4)] * 2), (80, 60), INTRINSICS
+    )
     m = len(rows)
     grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.15, 0.15, 30)), -1)
     points = np.concatenate([grid, np.full((30, 40, 1), 0.5)], -1)
     reconstruction = Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=np.stack([np.eye(4)] * m),
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         tracks=Tracks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 3))),
         backend="colmap",
         pointmaps=Pointmaps(
@@ -340,9 +344,9 @@ def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_pa
         spot = np.zeros((60, 80), np.uint8)
         # Where the lens puts the ray of the grid's pixel (35, 15).
         ray = np.array([[(35 - PINHOLE.cx) / PINHOLE.fx, (15 - PINHOLE.cy) / PINHOLE.fy, 1.0]])
-        x, y = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), LENS.matrix, np.array(LENS.distortion))[0][
-            0, 0
-        ]
+        x, y = cv2.projectPoints(
+            ray, np.zeros(3), np.zeros(3), INTRINSICS.matrix, np.array(INTRINSICS.distortion)
+        )[0][0, 0]
         spot[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2] = 9
         write_label(tmp_path, name, spot)
     labels = read_labels(capture, reconstruction)
@@ -509,7 +513,7 @@ def test_segment_anything_gives_distinct_masks_of_the_image(
 
 
 @pytest.mark.slow
-def test_segment_anything_that_is_not_there_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_segment_anything_that_is_not_there_shows_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from jcr.segment.sam import load_sam
 
     pytest.importorskip("transformers", reason="the extra `sam` is not installed")

@@ -26,7 +26,7 @@ from jcr.simulate.robots import (
     table_center,
     views,
 )
-from jcr.simulate.taken import with_lens_error
+from jcr.simulate.taken import with_intrinsics_error
 
 
 def only(arm, name: str, value: float) -> BentArm:
@@ -51,8 +51,8 @@ def test_every_arm_sees_its_table_from_varied_sides(name):
         assert np.degrees(angle).max() < 25
     assert (cameras[:, 2, 3] > target[2] + 0.08).all() and (cameras[:, 2, 2] < -0.4).all()
     # Relative rotations about all axes: what a hand-eye calibration lives on.
-    turns = rotation_log(cameras[:1, :3, :3].swapaxes(1, 2) @ cameras[1:, :3, :3])
-    assert np.linalg.svd(turns, compute_uv=False)[2] / np.sqrt(len(turns)) > np.radians(5)
+    rotations = rotation_log(cameras[:1, :3, :3].swapaxes(1, 2) @ cameras[1:, :3, :3])
+    assert np.linalg.svd(rotations, compute_uv=False)[2] / np.sqrt(len(rotations)) > np.radians(5)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
@@ -89,8 +89,8 @@ def test_effective_hand_eye_predicts_the_camera_better_than_the_physical_one():
             # The base that suits each; then what is left.
             base = fit_known_scale(cameras, reported @ x, (np.eye(4), np.eye(4)), noise).base_from_recon
             gap = inverse(base @ reported @ x) @ cameras
-            turned = rotation_angle(gap[:, :3, :3])
-            costs.append(((gap[:, :3, 3] / 1e-3) ** 2).sum() + ((turned / 2e-3) ** 2).sum())
+            rotated = rotation_angle(gap[:, :3, :3])
+            costs.append(((gap[:, :3, 3] / 1e-3) ** 2).sum() + ((rotated / 2e-3) ** 2).sum())
         better.append(costs[0] <= costs[1] * 1.001)
     assert all(better)
 
@@ -148,11 +148,11 @@ def test_a_pattern_out_of_reach_is_refused():
 
 def test_given_intrinsics_are_drawn_around_the_true_ones():
     camera, rng = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480), np.random.default_rng(0)
-    drawn = [with_lens_error(camera, 0.5, rng) for _ in range(2000)]
+    drawn = [with_intrinsics_error(camera, 0.5, rng) for _ in range(2000)]
     numbers = np.array([[one.fx, one.fy, one.cx, one.cy] for one in drawn])
     np.testing.assert_array_equal(numbers[:, 0], numbers[:, 1])
     np.testing.assert_allclose(numbers[:, [0, 2, 3]].std(0), [3.0, 3.2, 3.2], rtol=0.07)
-    assert with_lens_error(camera, 0.0, rng) == camera
+    assert with_intrinsics_error(camera, 0.0, rng) == camera
 
 
 @pytest.mark.gl
@@ -166,7 +166,7 @@ def test_a_capture_of_a_bent_arm(tmp_path):
         link_errors=1.0,
         sag=0.2,
         gear_errors=0.1,
-        lens_error=0.5,
+        intrinsics_error=0.5,
     )
     folder = simulate(tmp_path / "bent", options)
     capture, truth = jcr.read_capture(folder), read_truth(folder)
@@ -199,8 +199,8 @@ def test_options_of_a_robot_that_mean_nothing_are_refused(tmp_path):
     for options, message in (
         (SimulateOptions(joint_offsets=0.1), "--joint-offsets 0.1: errors of an arm; name it with --robot"),
         (SimulateOptions(robot="ur5e", link_errors=-1.0), "sigmas; give 0 or more"),
-        (SimulateOptions(lens_error=-1.0), "sigmas; give 0 or more"),
-        (SimulateOptions(lens_error=0.5, unknown_intrinsics=True), "no intrinsics are given"),
+        (SimulateOptions(intrinsics_error=-1.0), "sigmas; give 0 or more"),
+        (SimulateOptions(intrinsics_error=0.5, unknown_intrinsics=True), "no intrinsics are given"),
     ):
         with pytest.raises(InputError, match=message):
             simulate(tmp_path / "out", options)

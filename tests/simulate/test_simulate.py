@@ -56,10 +56,10 @@ def test_surfaces_close_and_face_outwards(make):
     thing = make(np.random.default_rng(0))
     corners = np.concatenate([part.mesh.vertices for part in thing.parts])
     x = np.random.default_rng(1).uniform(corners.min(0) - 0.01, corners.max(0) + 0.01, (1000, 3))
-    turns = sum(winding_number(part.mesh, x) for part in thing.parts)
+    rotations = sum(winding_number(part.mesh, x) for part in thing.parts)
     # The open ends of a mug's handle and an apple's stalk leak a little, and little else than beside them.
-    assert (np.abs(turns - turns.round()) > 0.05).mean() < 0.02
-    assert turns.round().min() == 0 and turns.round().max() >= 1
+    assert (np.abs(rotations - rotations.round()) > 0.05).mean() < 0.02
+    assert rotations.round().min() == 0 and rotations.round().max() >= 1
 
 
 def test_solids_are_where_the_boxes_are():
@@ -133,7 +133,7 @@ def test_depth_and_labels_are_those_of_the_pixel_centers():
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("opengl")
-def test_pictures_show_points_where_they_project():
+def test_images_show_points_where_they_project():
     scene = make_scene("tabletop", 0)
     square, columns, rows = 0.05, 19, 24
     checks = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 200 + 30).astype(np.uint8)
@@ -221,7 +221,7 @@ def test_same_seed_same_bytes_and_fewer_images_are_the_first_ones(simulated, tmp
 
 
 @pytest.mark.gl
-def test_robot_noise_is_in_the_report_and_not_in_the_pictures(simulated, tmp_path):
+def test_robot_noise_is_in_the_report_and_not_in_the_images(simulated, tmp_path):
     options = SimulateOptions(
         seed=1, images=2, robot_noise=(2.0, 0.5), unknown_intrinsics=True, truth="scene"
     )
@@ -239,10 +239,10 @@ def test_robot_noise_has_the_sigma_asked_for_in_every_axis():
     true = transform(rotation_exp(np.random.default_rng(0).normal(size=(4000, 3))), np.array([0.4, 0.1, 0.3]))
     reported = with_robot_noise(true, 2.0, 0.5, np.random.default_rng(1))
     shift = reported[:, :3, 3] - true[:, :3, 3]
-    turn = rotation_log(reported[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1))
+    rotation = rotation_log(reported[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1))
     # The sigma of 4000 draws is known to 1.1 %; their mean to 1.6 % of it.
     np.testing.assert_allclose(shift.std(0), 2e-3, rtol=0.05)
-    np.testing.assert_allclose(np.degrees(turn).std(0), 0.5, rtol=0.05)
+    np.testing.assert_allclose(np.degrees(rotation).std(0), 0.5, rtol=0.05)
     assert np.abs(shift.mean(0)).max() < 1.5e-4
 
 

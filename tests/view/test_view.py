@@ -87,7 +87,7 @@ def test_a_higher_threshold_leaves_fewer_points_all_of_them_over_it(viewer: "Vie
     viewer.show_points()
 
 
-def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
+def test_sphere_rotates_red_in_an_object_and_where_nobody_looked(viewer: "Viewer", truth: Truth):
     from jcr.view.viewer import COLLIDES, FREE
 
     book = next(thing for thing in truth.objects if thing.name == "book")
@@ -115,7 +115,7 @@ def test_sphere_turns_red_in_an_object_and_where_nobody_looked(viewer: "Viewer",
     color(*over)
 
 
-def test_click_finds_the_first_point_and_says_what_is_there(viewer: "Viewer", truth: Truth):
+def test_click_finds_the_first_point_and_shows_what_is_there(viewer: "Viewer", truth: Truth):
     from jcr.view.viewer import CLOUD
 
     book = next(thing for thing in truth.objects if thing.name == "book")
@@ -135,15 +135,17 @@ def test_click_finds_the_first_point_and_says_what_is_there(viewer: "Viewer", tr
 def test_the_photograph_lies_where_its_camera_sees_it(viewer: "Viewer"):
     viewer.image.value, viewer.photo.value = 3, 40
     viewer.choose_image()
-    camera, photo, lens = viewer._camera_of_image(), viewer._photo, viewer.run.intrinsics
+    camera, photo, intrinsics = viewer._camera_of_image(), viewer._photo, viewer.run.intrinsics
     assert camera is not None and photo.visible and photo.image.shape[2] == 4
     assert (photo.image[..., 3] == 102).all() and (photo.image[..., :3] == viewer.run.pixels[camera]).all()
     half = np.array([photo.render_width, photo.render_height]) / 2
     axes = Rotation.from_quat(np.asarray(photo.wxyz)[[1, 2, 3, 0]]).as_matrix()
     for sign in ((-1, -1), (1, 1)):
         corner = np.asarray(photo.position) + axes @ np.array([*(sign * half), 0])
-        seen = project(lens, apply(inverse(viewer.run.base_from_camera[camera]), corner))
-        assert seen == pytest.approx((np.array(sign) + 1) / 2 * [lens.width, lens.height] - 0.5, abs=1e-3)
+        seen = project(intrinsics, apply(inverse(viewer.run.base_from_camera[camera]), corner))
+        assert seen == pytest.approx(
+            (np.array(sign) + 1) / 2 * [intrinsics.width, intrinsics.height] - 0.5, abs=1e-3
+        )
     viewer.photo.value = 0
     viewer.choose_image()
     assert not photo.visible and all(frustum.visible for frustum in viewer.frusta)
@@ -272,11 +274,11 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
     try:
         chromium.open(f"http://127.0.0.1:{viewer.server.get_port()}", 800, 400)
         deadline = time.monotonic() + 120
-        picture, rows, columns = chromium.picture("canvas"), np.zeros(0, int), np.zeros(0, int)
+        image, rows, columns = chromium.image("canvas"), np.zeros(0, int), np.zeros(0, int)
         while len(rows) < 100:
-            picture = chromium.picture("canvas").astype(int)
+            image = chromium.image("canvas").astype(int)
             assert time.monotonic() < deadline, "the scene does not appear"
-            drawn = np.ptp(picture, axis=-1) > 15  # the background is grey or white
+            drawn = np.ptp(image, axis=-1) > 15  # the background is grey or white
             rows, columns = np.nonzero(
                 minimum_filter(drawn, 3)[200:, 320:450]
             )  # of the table, left of the panel
@@ -291,16 +293,16 @@ def test_in_a_browser(viewer: "Viewer", tmp_path: Path):
         until(lambda: viewer.clicked.content != "not yet")
         assert "occupancy" in viewer.clicked.content
 
-        def red(picture: np.ndarray) -> int:
-            r, g, b = np.moveaxis(picture.astype(int), -1, 0)
+        def red(image: np.ndarray) -> int:
+            r, g, b = np.moveaxis(image.astype(int), -1, 0)
             return int(((r > 150) & (r - g > 80) & (r - b > 80)).sum())  # the ball is translucent
 
         viewer.shown.value = "none"
         viewer.show_points()
         viewer.radius.value = 150.0
         viewer.move_sphere()
-        before = red(picture)
-        while red(chromium.picture("canvas")) < before + 500:
+        before = red(image)
+        while red(chromium.image("canvas")) < before + 500:
             assert time.monotonic() < deadline, "the sphere does not rotate red"
         bad = [
             event["params"]

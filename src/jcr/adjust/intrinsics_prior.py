@@ -35,7 +35,7 @@ ESTIMATED = {
     "p2": 3e-3,
 }
 """Of a cheap camera that nobody calibrated, about what the reconstruction found."""
-HELD: dict[str, float] = {}
+FIXED: dict[str, float] = {}
 """Of intrinsics that are exact."""
 LEAST = 1e-12
 """A standard deviation below it leaves a parameter as it is."""

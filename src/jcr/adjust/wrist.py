@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.adjust.boards import shapes_of
-from jcr.adjust.intrinsics_prior import HELD, IntrinsicsPrior, prior_of
+from jcr.adjust.intrinsics_prior import FIXED, IntrinsicsPrior, prior_of
 from jcr.adjust.robots import Adjusted, ArmPoses
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.adjust.score_test import freed
@@ -53,7 +53,7 @@ def adjust_wrist(
     """
     x, scale, z = start
     each, systematic = np.arange(len(base_from_gripper)), options.systematic
-    prior = prior_of(intrinsics, HELD) if prior is None else prior
+    prior = prior_of(intrinsics, FIXED) if prior is None else prior
     points_in_world = scale * tracks.points_in_recon.astype(float)
     twice = np.bincount(tracks.point, minlength=len(points_in_world)) >= 2
     boards, world_from_board = shapes_of(tracks.boards, points_in_world, twice, len(each))

@@ -25,8 +25,8 @@ from jcr.handeye.solve import judged
 from jcr.records import (
     Estimate,
     HandEye,
-    HeldOut,
     ImageResiduals,
+    LeaveOneOut,
     PaperResiduals,
     RobotExamined,
     RobotNoise,
@@ -51,7 +51,7 @@ def adjusted(case: Case) -> Case:
     if not case.hand_eye.converged:
         return case
     refined = judged(refined_by(case, found))
-    if case.tracks.from_pointmaps and not _is_nearer(refined.held_out, case.hand_eye.held_out):
+    if case.tracks.from_pointmaps and not _is_nearer(refined.leave_one_out, case.hand_eye.leave_one_out):
         return case
     return replace(case, hand_eye=refined)
 
@@ -143,7 +143,7 @@ def _considered(case: Case) -> Case:
     return replace(case, hand_eye=judged(considered))
 
 
-def _is_nearer(one: HeldOut | None, other: HeldOut | None) -> bool:
+def _is_nearer(one: LeaveOneOut | None, other: LeaveOneOut | None) -> bool:
     """Whether the leave-one-out error is smaller; not, where there are too few images."""
     return one is not None and other is not None and one.length_m < other.length_m
 
@@ -173,7 +173,7 @@ def refined_by(case: Case, found: Adjusted) -> HandEye:
         ),
         residuals=PaperResiduals(*paper_residuals(gripper, camera, x, estimate.scale, before.inliers)),
         robot=RobotExamined(robot_noise_of(found)),
-        held_out=_leave_one_out(found),
+        leave_one_out=_leave_one_out(found),
         before=before,
     )
 
@@ -184,7 +184,7 @@ def _adjusted_poses(found: Adjusted) -> Float[ndarray, "u 4 4"]:
     return predict(placed.x[0], placed.scale, placed.z[0], placed.scene.world_from_rig[rigs])
 
 
-def _leave_one_out(found: Adjusted) -> HeldOut | None:
+def _leave_one_out(found: Adjusted) -> LeaveOneOut | None:
     """Each image's gripper pose predicted by an adjustment that does not use it."""
     left_out = found.leave_one_out()
     m = len(left_out)
@@ -199,7 +199,7 @@ def _leave_one_out(found: Adjusted) -> HeldOut | None:
     in_metres = inverse(z) @ retract(gripper, -left_out) @ x
     rigs[own] = scale_translation(in_metres, 1 / placed.scale)
     moved = view_of(replace(evidence.scene, world_from_rig=rigs), evidence.problem)
-    return HeldOut(
+    return LeaveOneOut(
         1e3 * float(metres),
         float(np.degrees(radians)),
         float(np.median(median_reprojection_px(moved, evidence.problem))),

@@ -23,9 +23,9 @@ from jcr.records import (
     DepthCheck,
     Finding,
     HandEye,
-    HeldOut,
     ImageVerdict,
     Kind,
+    LeaveOneOut,
     Mount,
     NextPose,
     PaperResiduals,
@@ -138,7 +138,7 @@ class CalibrationFile(Part):
     images: list[ImageVerdict]
     residuals: PaperResiduals | None
     uncertainty: Uncertainty | None
-    held_out: HeldOut | None
+    held_out: LeaveOneOut | None
     observability: Observed
     robot_noise: Noise | None
     intrinsics: IntrinsicsAndStd | None
@@ -251,7 +251,7 @@ def calibration_file(
         "images": image_verdicts(capture, reconstruction, hand_eye),
         "residuals": hand_eye.residuals,
         "uncertainty": Uncertainty.of(hand_eye.estimate, hand_eye.in_use),
-        "held_out": hand_eye.held_out,
+        "held_out": hand_eye.leave_one_out,
         "observability": hand_eye.observability,
         "robot_noise": Noise.of(hand_eye.robot_noise),
         "intrinsics": IntrinsicsAndStd.of(hand_eye.intrinsics, hand_eye.estimate.intrinsics_std),

@@ -143,7 +143,7 @@ class Ahead:
             rotation_95_deg=then.seen.rotation_95_deg,
             like=like,
             moved_m=float(np.linalg.norm(motion[:3, 3])),
-            turned_rad=float(rotation_angle(motion[:3, :3])),
+            rotation_rad=float(rotation_angle(motion[:3, :3])),
         )
 
 

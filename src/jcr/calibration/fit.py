@@ -10,7 +10,7 @@ from jcr.calibration.case import Case
 from jcr.calibration.cues import height_cue, length_cue, scale_contradiction
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.robot_errors import RobotErrors
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.handeye.fit import Cues
 from jcr.handeye.solve import solve_hand_eye
 from jcr.records import Capture, Finding, HandEye, Reconstruction
@@ -25,7 +25,7 @@ def fitted(
     """
     registered = len(reconstruction.image_index)
     if registered < 2:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{registered} of {len(capture)} images registered",
             "overlap the views more",
             also=(*reconstruction.warnings, *reconstruction.notes),

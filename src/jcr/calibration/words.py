@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.calibration_json import CalibrationFile, GivenIntrinsicsKept
 from jcr.calibration.uncertainty_json import SeenAndCorners, UncertaintyBudget
-from jcr.records import Attempt, DepthCheck, HeldOut, is_explained, verdict_of
+from jcr.records import Attempt, DepthCheck, LeaveOneOut, is_explained, verdict_of
 from jcr.records.words import network_scale, reached_in_words, sentence
 from jcr.rounding import significant
 
@@ -72,7 +72,9 @@ def found(content: CalibrationFile) -> list[str]:
     if content.depth_check is not None:
         lines.append(depth_in_words(content.depth_check))
     if (held_out := content.held_out) is not None:
-        lines.append(f"leave-one-out error: {missed(held_out)}{pixels(held_out)} ({held_out.how})")
+        lines.append(
+            f"leave-one-out error: {leave_one_out_text(held_out)}{pixels(held_out)} ({held_out.how})"
+        )
     return lines
 
 
@@ -155,12 +157,12 @@ def attempt_in_words(attempt: Attempt, images: int) -> str:
     return f"{attempt.backend}{features} registered {registered}, {verdict}; {times}"
 
 
-def missed(held_out: HeldOut) -> str:
+def leave_one_out_text(held_out: LeaveOneOut) -> str:
     """By how much images left out are missed."""
     return f"{significant(held_out.translation_mm)} mm and {significant(held_out.rotation_deg)}°"
 
 
-def pixels(held_out: HeldOut) -> str:
+def pixels(held_out: LeaveOneOut) -> str:
     """The same in their images, to follow it; empty where no image tells."""
     return "" if held_out.reprojection_px is None else f", {significant(held_out.reprojection_px)} px"
 

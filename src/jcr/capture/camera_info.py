@@ -7,10 +7,10 @@ from typing import Any
 from jcr.capture.checks import checked_intrinsics
 from jcr.capture.plain_files import read_yaml, shown
 from jcr.errors import InputError
-from jcr.records import COEFFICIENTS, Intrinsics, LensModel
+from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
 
 FILE = "camera_info.yaml"
-_MODELS: dict[Any, LensModel] = {
+_MODELS: dict[Any, DistortionModel] = {
     "": "pinhole",
     "plumb_bob": "pinhole",
     "rational_polynomial": "rational",

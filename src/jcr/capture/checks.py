@@ -17,7 +17,7 @@ from jcr.capture.plain_files import LONGEST, contained
 from jcr.capture.robot_poses import likely_unit
 from jcr.errors import InputError
 from jcr.geometry import require_rigid, step_between
-from jcr.records import COEFFICIENTS, Capture, Finding, Intrinsics, Kind, LensModel, coefficients_of
+from jcr.records import COEFFICIENTS, Capture, DistortionModel, Finding, Intrinsics, Kind, coefficients_of
 
 NAMED = 10
 """Images that a message names; of more it gives the number."""
@@ -97,7 +97,7 @@ def checked_intrinsics(
     distortion: Sequence[Any],
     size: tuple[int, int],
     where: str,
-    model: LensModel = "pinhole",
+    model: DistortionModel = "pinhole",
 ) -> Intrinsics:
     """Intrinsics of images of `size` from fx, fy, cx, cy and the model's coefficients; InputError if they cannot be."""
     names = COEFFICIENTS[model]

@@ -19,7 +19,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained
 from jcr.errors import InputError
 from jcr.geometry import inverse, transform
-from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
+from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
 
 if TYPE_CHECKING:
     import pycolmap
@@ -191,6 +191,6 @@ def _intrinsics(camera: "pycolmap.Camera", folder: Path, size: tuple[int, int]) 
     centre, rest = [value - HALF_PIXEL for value in rest[:2]], rest[2:]
     wanted = _COEFFICIENTS[name]
     value = dict(zip(wanted, rest, strict=True))
-    model: LensModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
+    model: DistortionModel = "fisheye" if "FISHEYE" in name else "rational" if any(rest[5:]) else "pinhole"
     distortion = [value.get(key, 0.0) for key in COEFFICIENTS[model]]
     return checked_intrinsics([*focals, *centre], distortion, size, str(folder), model)

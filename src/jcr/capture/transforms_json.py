@@ -20,7 +20,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.plain_files import contained, read_json
 from jcr.capture.table import IMAGE_SUFFIXES
 from jcr.errors import InputError
-from jcr.records import COEFFICIENTS, Capture, Intrinsics, LensModel
+from jcr.records import COEFFICIENTS, Capture, DistortionModel, Intrinsics
 
 FILE = "transforms.json"
 MODELS = (
@@ -108,7 +108,7 @@ def _intrinsics(content: dict[str, Any], file: Path, size: tuple[int, int]) -> I
     model = content.get("camera_model", "OPENCV")
     if model not in MODELS:
         raise InputError(f"{file}: camera_model {model}; undistort the images to a pinhole or OPENCV camera")
-    distortion_model: LensModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
+    distortion_model: DistortionModel = "fisheye" if model == "OPENCV_FISHEYE" else "pinhole"
     if first.get("k4") and distortion_model == "pinhole":
         raise InputError(f"{file}: a distortion with k4, which jcr does not know; undistort the images")
     width, height = size

@@ -12,7 +12,7 @@ from jcr.calibration.calibration_json import image_verdicts
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.stage import calibrate
 from jcr.cell.found import CameraFound, ImageFound
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse
 from jcr.progress import Progress
 from jcr.reconstruct.backends import ReconstructOptions, reconstruct
@@ -74,7 +74,7 @@ def calibrated_elsewhere(
     try:
         reconstruction = reconstruct(own, replace(reconstruct_options, backend="auto"), progress)
         found = calibrate(own, reconstruction, options)
-    except NotTrustedError as error:
+    except RejectedError as error:
         return replace(shared, findings=strongest_first((*no_reconstruction(error), other_scene)))
     depth = [
         float(np.median(apply(inverse(pose), reconstruction.tracks.points_in_recon)[:, 2]))
@@ -116,7 +116,7 @@ def found_alone(
     )
 
 
-def not_registered(camera: CellCamera, error: NotTrustedError) -> CameraFound:
+def not_registered(camera: CellCamera, error: RejectedError) -> CameraFound:
     """Of a camera whose images could not be reconstructed."""
     count = len(camera.images)
     return CameraFound.not_placed(camera, no_reconstruction(error), [0] * count, ["not registered"] * count)

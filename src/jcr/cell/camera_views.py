@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from jcr.camera import usable_lens
+from jcr.camera import usable_intrinsics
 from jcr.cell.found import CameraFound
 from jcr.cell.localise import Shared, distance
 from jcr.records import CellCamera, Finding, Intrinsics, Kind, Mend
@@ -61,14 +61,14 @@ class CameraViews:
     @property
     def intrinsics(self) -> Intrinsics:
         """Given, or as the image with most points has it."""
-        intrinsics, _ = usable_lens(self.camera.intrinsics)
+        intrinsics, _ = usable_intrinsics(self.camera.intrinsics)
         best = max((one for one in self.shared if one is not None), key=lambda one: len(one.x_px))
         return intrinsics or best.intrinsics
 
     @property
     def agrees_with_given(self) -> bool:
         """Whether all places were found with intrinsics that were given, and none with a focal length of its own."""
-        intrinsics, _ = usable_lens(self.camera.intrinsics)
+        intrinsics, _ = usable_intrinsics(self.camera.intrinsics)
         return all(one is None or one.intrinsics == intrinsics for one in self.shared)
 
     def without(self, reasons: Mapping[int, str]) -> "CameraViews":

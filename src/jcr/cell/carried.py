@@ -19,7 +19,7 @@ from jcr.calibration.stage import calibrate
 from jcr.cell.alone import found_alone, not_registered, of_camera
 from jcr.cell.background import write_moving_parts
 from jcr.cell.found import CameraFound
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import inverse
 from jcr.handeye.solve import judged, solve_hand_eye
 from jcr.progress import Progress
@@ -58,7 +58,7 @@ def calibrated_alone(
     try:
         reconstruction = reconstruct(seen, replace(reconstruct_options, backend="auto"), progress)
         found = refined(own, reconstruction, calibrate(seen, reconstruction, options), options)
-    except NotTrustedError as error:
+    except RejectedError as error:
         return not_registered(camera, error)
     middle = found.base_from_recon[:3, 3] + found.base_from_recon[:3, :3] @ (
         found.scale * np.median(reconstruction.tracks.points_in_recon, axis=0)

@@ -18,7 +18,7 @@ from jcr.calibration.checks.camera import camera_faults, with_contradiction
 from jcr.calibration.checks.given_intrinsics import contradicted_by
 from jcr.calibration.checks.imaged import Imaged
 from jcr.calibration.options import CalibrateOptions
-from jcr.camera import usable_lens
+from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.camera_views import CameraViews
 from jcr.cell.found import ArmFound, CameraFound, CellFound, ImageFound
@@ -83,7 +83,7 @@ def place_cameras(
     found: dict[str, list[Shared | int]] = {camera.name: [] for camera in others}
     todo = [(camera, image) for camera in others for image in camera.images]
     for camera, image in steps(progress, "other cameras", todo):
-        intrinsics, _ = usable_lens(camera.intrinsics)
+        intrinsics, _ = usable_intrinsics(camera.intrinsics)
         pixels = read_image((camera.folder or capture.folder) / image)
         start = intrinsics or guessed_intrinsics(camera.image_size)
         found[camera.name].append(localised(known, pixels, start, intrinsics is not None))

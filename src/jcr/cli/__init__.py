@@ -16,7 +16,7 @@ from importlib import import_module
 from types import ModuleType
 
 from jcr.cli.output import Quiet
-from jcr.errors import InputError, NotTrustedError, did_you_mean, printable
+from jcr.errors import InputError, RejectedError, did_you_mean, printable
 from jcr.memory import MORE_MEMORY, require_address_space
 
 GROUPS = {
@@ -157,7 +157,7 @@ def _guarded(action: Callable[[], int]) -> int:
         return status
     except InputError as error:
         return _fail(2, str(error))
-    except NotTrustedError as error:
+    except RejectedError as error:
         return _fail(3, str(error))
     except BrokenPipeError:
         _write_no_more()  # whoever read our output has seen enough

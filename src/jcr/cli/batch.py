@@ -47,7 +47,7 @@ class Arguments:
 def main(arguments: Arguments) -> int:
     """Run all and print the table."""
     from jcr.batch import batch, is_accepted
-    from jcr.errors import InputError, NotTrustedError
+    from jcr.errors import InputError, RejectedError
     from jcr.progress import progress_bars
 
     if len(arguments.paths) < 2:
@@ -60,7 +60,7 @@ def main(arguments: Arguments) -> int:
     )
     doubtful = sum(not is_accepted(row) for row in rows)
     if doubtful:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{doubtful} of {len(rows)} captures failed or are rejected; see {out / 'summary.html'}"
         )
     return 0

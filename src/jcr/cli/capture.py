@@ -12,7 +12,7 @@ import tyro
 
 from jcr.capture.options import ConventionName, UnitsName
 from jcr.cli.output import Output, warn
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.handeye.arms import CHOICES, ROBOT_NAMES, RobotName
 from jcr.live.camera import CameraOptions
 from jcr.live.collect import CollectOptions
@@ -92,12 +92,14 @@ def main(arguments: Arguments) -> int:
 
     def tell(answer: "Answer", lines: list[str]) -> None:
         answers.append(answer)
-        _say("\n".join(lines))
+        _print("\n".join(lines))
 
     given = _intrinsics(arguments.intrinsics_from)
     with locked(arguments.out), opened(arguments.camera, arguments.optics) as camera:
         live = LiveFolder(arguments.out, given or camera.intrinsics, arguments.robot)
-        _say(f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser")
+        _print(
+            f"{len(live.names)} images in {arguments.out}; watch {arguments.out / 'live.html'} in a browser"
+        )
         calibration = _calibration(live, options)
         asks = _asks(arguments, _lines(arguments, typed))
         try:
@@ -121,7 +123,7 @@ def _finished(calibration: "LiveCalibration") -> "RunResult | None":
     """The calibration of all images; None, and a line that says why, where there is none."""
     try:
         return calibration.finish()
-    except NotTrustedError as error:
+    except RejectedError as error:
         warn(f"no calibration: {error}")
         return None
 
@@ -158,13 +160,13 @@ def _lines(arguments: Arguments, typed: "queue.SimpleQueue[Typed]") -> "Iterator
 
     lines = without_commands(sys.stdin, typed.put)
     if sys.stdin.isatty():
-        _say(HELP)
+        _print(HELP)
     if arguments.poses != "typed":
         threading.Thread(target=lambda: all(True for _ in lines), daemon=True).start()
     return lines
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
 
@@ -177,16 +179,16 @@ def _asks(arguments: Arguments, lines: "Iterator[str]") -> "Iterator[Ask]":
 
     kind, _, address = arguments.poses.partition(":")
     if kind == "typed" and not address:
-        yield from typed_poses(lines, _say, arguments.pose_convention, arguments.pose_units)
+        yield from typed_poses(lines, _print, arguments.pose_convention, arguments.pose_units)
     elif kind == "tcp" and not address:
         host, port = _address(arguments.listen, 7464, "--listen ")
         token = arguments.token or os.environ.get("JCR_TOKEN")
         listen = Listen(host, port, token, arguments.timeout)
         with bound(listen) as server:
-            _say("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
+            _print("waiting for poses on {}:{}".format(*server.getsockname()[:2]))
             yield from served_poses(server, listen)
     elif kind in _SPOKEN and address:
-        _say(f"move the arm; an image is taken whenever it rests ({address})")
+        _print(f"move the arm; an image is taken whenever it rests ({address})")
         if kind == "ur":
             host, port = _address(address, 30003, "--poses ur:")
             yield from asks_at_rest(lambda: ur.states(host, port))

@@ -56,7 +56,7 @@ def main(arguments: Arguments) -> int:
     """Examine the capture and print what was found."""
     from jcr.calibration.options import CalibrateOptions, check_options
     from jcr.check import check
-    from jcr.errors import InputError, NotTrustedError
+    from jcr.errors import InputError, RejectedError
     from jcr.progress import progress_bars
 
     if arguments.suggest < 0:
@@ -79,7 +79,7 @@ def main(arguments: Arguments) -> int:
         )
     arguments.output.result(_as_text(capture, found), _as_json(capture, found))
     if found.faults:
-        raise NotTrustedError(f"rejected: {found.faults[0]}")
+        raise RejectedError(f"rejected: {found.faults[0]}")
     return 0
 
 
@@ -87,7 +87,7 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
     from jcr.check import QUICK
     from jcr.rounding import significant
 
-    rotation = np.degrees(found.largest_turn_rad)
+    rotation = np.degrees(found.largest_rotation_rad)
     lines = [
         _as_read(capture),
         f"the gripper moves by up to {1e3 * found.largest_move_m:.0f} mm and rotates by up to {rotation:.0f}°",
@@ -109,7 +109,7 @@ def _as_text(capture: "Capture | PosePairs", found: "Examination") -> str:
         matrix = np.array2string(pose.base_from_gripper, precision=4, suppress_small=True)
         then = f"{significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}°"
         lines += [
-            f"add pose {k}: {1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.turned_rad):.0f}° from that of "
+            f"add pose {k}: {1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.rotation_rad):.0f}° from that of "
             f"{capture.images[pose.like]}; then within {then}; base_from_gripper:",
             *(f"  {row}" for row in matrix.splitlines()),
         ]
@@ -153,7 +153,7 @@ def _as_json(capture: "Capture | PosePairs", found: "Examination") -> dict[str, 
             for k, name in enumerate(capture.images)
         ],
         "largest_move_mm": 1e3 * found.largest_move_m,
-        "largest_turn_deg": float(np.degrees(found.largest_turn_rad)),
+        "largest_turn_deg": float(np.degrees(found.largest_rotation_rad)),
         "observability": {
             "observable": found.observability.observable,
             "unobservable": list(found.observability.unobservable),

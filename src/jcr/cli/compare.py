@@ -38,7 +38,7 @@ def main(arguments: Arguments) -> int:
     """Print the difference, χ² and p where standard deviations are known, and what explains it."""
     from jcr.calibration.difference import difference
     from jcr.calibration.known_transform import read_hand_eye
-    from jcr.errors import NotTrustedError
+    from jcr.errors import RejectedError
 
     known = {path: read_hand_eye(path) for path in (arguments.out, arguments.reference)}
     found = difference(known[arguments.out], known[arguments.reference])
@@ -66,5 +66,5 @@ def main(arguments: Arguments) -> int:
     arguments.output.result(text + "\n", result)
     for path, one in known.items():
         if one.doubt is not None:
-            raise NotTrustedError(f"{path}: its calibration is rejected: {one.doubt}")
+            raise RejectedError(f"{path}: its calibration is rejected: {one.doubt}")
     return 0

@@ -30,14 +30,14 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print the sizes; 3 when the calibration they rest on is rejected."""
-    from jcr.errors import NotTrustedError
+    from jcr.errors import RejectedError
     from jcr.pipeline import measure
     from jcr.run_folder import RunFolder
 
     measured = measure(arguments.out)
     arguments.output.result(table(measured), content(measured))
     if (doubt := RunFolder(arguments.out).calibration().doubt) is not None:
-        raise NotTrustedError(f"sizes rejected: {doubt}")
+        raise RejectedError(f"sizes rejected: {doubt}")
     return 0
 
 

@@ -5,7 +5,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from jcr.cli.output import Output, warn
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 
 if TYPE_CHECKING:
     from jcr.results import PosesResult, RunResult, SavedRun
@@ -43,10 +43,10 @@ def show(result: "RunResult | SavedRun | PosesResult", output: Output, after: st
     for note in () if isinstance(result, PosesResult) else content.notes:
         sys.stderr.write(f"note: {note}\n")
     if content.doubt is not None:
-        raise NotTrustedError(f"rejected: {content.doubt}")
+        raise RejectedError(f"rejected: {content.doubt}")
     for camera in () if cameras is None else cameras.cameras:
         if camera.doubt is not None:
-            raise NotTrustedError(f"camera {camera.name} is rejected: {camera.doubt}")
+            raise RejectedError(f"camera {camera.name} is rejected: {camera.doubt}")
     if content.short is not None:
         warn(sentence(content.short))
     return 0

@@ -23,7 +23,7 @@ class Arguments:
       jcr simulate captures/noisy --seed 3 --robot-noise 0.5 0.1
       jcr simulate captures/measuring --scene measuring --images 10
       jcr simulate captures/orbit --pattern orbit --unknown-intrinsics
-      jcr simulate captures/bent --robot ur5e --joint-offsets 0.1 --link-errors 0.3 --lens-error 0.5
+      jcr simulate captures/bent --robot ur5e --joint-offsets 0.1 --link-errors 0.3 --intrinsics-error 0.5
     """
 
     out: Annotated[Path, tyro.conf.Positional]

@@ -32,7 +32,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> int:
     """Print each error beside what was expected."""
-    from jcr.errors import NotTrustedError
+    from jcr.errors import RejectedError
     from jcr.touch_test import UNLIKELY, touch
 
     found = touch(arguments.out, arguments.points)
@@ -58,7 +58,7 @@ def main(arguments: Arguments) -> int:
     }
     arguments.output.result("\n".join(lines) + "\n", content)
     if found.p_value < UNLIKELY:
-        raise NotTrustedError(
+        raise RejectedError(
             "the tip and the map are farther apart than the reported uncertainty: check the tip's calibration "
             "(a constant error), then calibrate the camera again (jcr run)"
         )

@@ -66,13 +66,13 @@ def main(arguments: Arguments) -> int:
 
 def _print_found(found: "Verification", output: Output) -> int:
     """Print it; NotTrustedError where something has moved."""
-    from jcr.errors import NotTrustedError
+    from jcr.errors import RejectedError
 
     output.result(_as_text(found), _as_json(found))
     for note in found.notes:
         warn(note)
     if found.moved:
-        raise NotTrustedError(found.advice)
+        raise RejectedError(found.advice)
     return 0
 
 

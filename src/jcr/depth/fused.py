@@ -74,12 +74,12 @@ def fused_depth(
     with ThreadPoolExecutor(threads) as pool:
         check = partial(_check, pool, views, grid(pinhole))
         count = through = information = np.zeros(0)
-        trusted = known
+        consistent = known
         for tolerance in AGREEMENT:
-            inverse_depth, count, through, information = check(inverse_depth, known, trusted, tolerance)
-            trusted = known & (count >= needed)
+            inverse_depth, count, through, information = check(inverse_depth, known, consistent, tolerance)
+            consistent = known & (count >= needed)
         report(0.2)
-        matched = trusted if changing else trusted & (count > 2 * through)
+        matched = consistent if changing else consistent & (count > 2 * through)
         std = MATCHING_STD_PX / np.sqrt(np.maximum(information, 1e-12)) / inverse_depth
         confidence = (np.minimum(score, 1) * count).astype(np.float32)
         if not priors or matched.sum() < FEWEST_MATCHED:
@@ -118,11 +118,11 @@ def _check(
     k: Float[ndarray, "4"],
     inverse_depth: Float[ndarray, "m h w"],
     known: Bool[ndarray, "m h w"],
-    trusted: Bool[ndarray, "m h w"],
+    consistent: Bool[ndarray, "m h w"],
     tolerance: float,
 ) -> list[ndarray]:
     """`agreement` of all images, (m,h,w) each; inverse depths that are not known stay as they are."""
-    compared, width = evidence(inverse_depth, known, trusted), inverse_depth.shape[2]
+    compared, width = evidence(inverse_depth, known, consistent), inverse_depth.shape[2]
 
     def one(i: int) -> Float[ndarray, "4 h w"]:
         v = views[i]

@@ -154,19 +154,19 @@ def planar_prior(
     in_camera = recon_from_camera[:3, :3].T @ support[:3]
     offset = float(support[:3] @ recon_from_camera[:3, 3] + support[3])
     plane = -in_camera / offset if offset else np.zeros(3)
-    planes, on_support, inliers, held, rest, middle, shape = region_planes(
+    planes, on_support, inliers, fixed, rest, middle, shape = region_planes(
         label, count, inverse_depth, matched, plane, grid(pinhole).astype(float), ON_PLANE, i
     )
     pixel = np.stack(np.meshgrid(np.arange(label.shape[1]), np.arange(label.shape[0])), -1)
     du, dv = np.moveaxis(pixel - middle[label], -1, 0)
     xx, xy, yy = np.moveaxis(shape[label], -1, 0)
     # Patches of shade and print on the support plane that carry no plane of their own.
-    lonely = _beside_support(label, on_support & (inliers > 0)) & (inliers == 0) & (held < FEWEST)
+    lonely = _beside_support(label, on_support & (inliers > 0)) & (inliers == 0) & (fixed < FEWEST)
     lonely &= np.bincount(label.ravel(), minlength=count) < PATCH * label.size
     planes[lonely] = plane
     predicted = np.einsum("hwi,hwi->hw", planes[label], rays(pinhole)).astype(np.float32)
     away = np.sqrt(np.maximum(xx * du**2 + 2 * xy * du * dv + yy * dv**2, 0))
-    carried = (inliers > 0) & (inliers >= CARRIED * held)
+    carried = (inliers > 0) & (inliers >= CARRIED * fixed)
     near = on_support[label] | lonely[label] | (away < FARTHEST)
     asked = (carried | lonely)[label] & (predicted > 0) & near
     same, unlike, through = colours_agree(
@@ -185,10 +185,10 @@ def planar_prior(
     alone = asked & (same == 1) & (unlike == 0) & (through == 0)
     holds |= alone & on_support[label]
     # On top of a thing the plane would lie below its colours, which then differ along its outline in the other views.
-    held_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
-    holds &= ~(lonely & (held_share < WHOLE))[label]
+    fixed_share = np.bincount(label.ravel(), holds.ravel()) / np.bincount(label.ravel())
+    holds &= ~(lonely & (fixed_share < WHOLE))[label]
     off = np.abs(predicted / inverse_depth - 1) > OFF_PLANE
-    strong = asked & (inliers >= STRONG * held)[label]
+    strong = asked & (inliers >= STRONG * fixed)[label]
     return Prior(
         inverse_depth=predicted,
         holds=holds,

@@ -95,13 +95,13 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
     is relative, of inverse depth.
     """
     state = random_state(seed)
-    whole, held, start, pixel = _by_region(label, count, matched)
+    whole, fixed, start, pixel = _by_region(label, count, matched)
     planes, on_support = np.zeros((count, 3)), np.zeros(count, np.bool_)
     inliers, rest = np.zeros(count, np.int64), np.zeros(count)
     middle, shape = np.zeros((count, 2)), np.zeros((count, 3))
     samples = np.empty((SAMPLED, 3))
     for r in range(count):
-        if held[r] < FEWEST:
+        if fixed[r] < FEWEST:
             continue
         of_region = pixel[start[r] : start[r + 1]]
         taken = _sample(samples, of_region, inverse_depth, k, state)
@@ -128,7 +128,7 @@ def region_planes(label, count, inverse_depth, matched, support, k, tolerance, s
             -xy / determinant,
             (xx + 1) / determinant,
         )
-    return planes, on_support, inliers, held, rest, middle, shape
+    return planes, on_support, inliers, fixed, rest, middle, shape
 
 
 @compiled
@@ -137,22 +137,22 @@ def _by_region(label, count, matched):
     """Of each region the moments (count,6), how many pixels are matched, and where these begin in the list of all."""
     h, w = label.shape
     whole = np.zeros((count, 6))
-    held = np.zeros(count, np.int64)
+    fixed = np.zeros(count, np.int64)
     for v in range(h):
         for u in range(w):
             _add(whole[label[v, u]], u, v)
-            held[label[v, u]] += matched[v, u]
+            fixed[label[v, u]] += matched[v, u]
     start, at = np.zeros(count + 1, np.int64), np.zeros(count, np.int64)
     for r in range(count):
         at[r] = start[r]
-        start[r + 1] = start[r] + held[r]
+        start[r + 1] = start[r] + fixed[r]
     pixel = np.empty(start[count], np.int64)
     for v in range(h):
         for u in range(w):
             if matched[v, u]:
                 pixel[at[label[v, u]]] = v * w + u
                 at[label[v, u]] += 1
-    return whole, held, start, pixel
+    return whole, fixed, start, pixel
 
 
 @inlined

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jcr.errors import InputError, NotTrustedError, did_you_mean
+from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportOptions, FormatName
 from jcr.export.provenance import Provenance
@@ -77,7 +77,7 @@ def written(
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
     run = Run(out, options)
     if run.doubt is not None and not options.force:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
             "with this reason in the file, add --force"
         )

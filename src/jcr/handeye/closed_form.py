@@ -16,7 +16,7 @@ Poses = Float[ndarray, "*#batch n 4 4"]
 Weights = Float[ndarray, "*#batch n"]
 ROUNDS = 5
 """Of polishing the rotations; a likelihood fit finishes the work."""
-NEAR_HALF_TURN = -0.73
+NEAR_HALF_ROTATION = -0.73
 """Trace of a rotation by 150°, beyond which the sine of the angle shows little of the axis."""
 RELATIVE_CUT = 1e-10
 """Of the largest singular value: what is smaller is rounding, and of a direction unseen."""
@@ -93,7 +93,7 @@ def rotations(
     rotation = nearest_rotation(np.swapaxes(of_a, 1, 2) * pairs @ of_b)
     rotation, base, gap = _polished(rotation, gripper, camera, weights, rounds)
 
-    near = (np.trace(a, axis1=-2, axis2=-1) < NEAR_HALF_TURN).any((1, 2))
+    near = (np.trace(a, axis1=-2, axis2=-1) < NEAR_HALF_ROTATION).any((1, 2))
     if near.any():
         some = gripper[near], camera[near], weights[near]
         kron = np.einsum("hn,hnij,hnkl->hikjl", some[2], some[0], some[1]).reshape(-1, 9, 9)

@@ -34,7 +34,7 @@ BETTER = 3.0
 """A reading is named when it fits this many times better than the poses as given."""
 ROUGHLY = 2.0
 """A closed form shows how well a reading fits to this factor."""
-TURN, ON_MULTIPLE = 2 * np.pi, 1.5
+ROTATION, ON_MULTIPLE = 2 * np.pi, 1.5
 """Degrees: numbers that were taken as radians are known up to multiples of the one, and lie as near one as the other."""
 MIN_SHARE = 0.8
 """of the images must agree under it."""
@@ -237,7 +237,7 @@ def _degrees_taken_as_radians(base_from_gripper: Poses, recon_from_camera: Poses
     for order in (None, *EULER_ORDERS[:4]):
         numbers, along = _written(read, order)
         multiples = np.meshgrid(*[np.arange(-29, 30)] * along.shape[1], indexing="ij")
-        first = TURN * np.stack(multiples, -1).reshape(-1, 1, along.shape[1]) @ along[0] + numbers[0]
+        first = ROTATION * np.stack(multiples, -1).reshape(-1, 1, along.shape[1]) @ along[0] + numbers[0]
         first = first[(np.abs(first) <= [180, 90 if order else 180, 180]).all(2)]
         gripper_from_camera = np.swapaxes(_rotations(first, order), 1, 2) @ camera[0]
         for k in range(1, len(position)):
@@ -281,7 +281,7 @@ def _nearest(
     """What an image's numbers may have been (degrees), nearest to those of expected rotations, and how far off."""
     read = Rotation.from_matrix(expected)
     degrees = np.degrees(read.as_rotvec() if order is None else _euler(read, order))[:, None]
-    possible = numbers + TURN * np.round((degrees - numbers) @ along.T / TURN) @ along
+    possible = numbers + ROTATION * np.round((degrees - numbers) @ along.T / ROTATION) @ along
     off = np.abs(possible - degrees).max(2)
     return possible[np.arange(len(off)), off.argmin(1)], off.min(1)
 

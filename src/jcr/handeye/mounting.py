@@ -39,11 +39,11 @@ def mounted_arm(arm: Arm, joints: Joints, base_from_gripper: Poses) -> Arm:
     """
     nominal = forward_kinematics(arm, joints)
     weights = np.ones(len(joints))
-    half_turn = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    half_rotation = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
     tool, _, base = closed_form(base_from_gripper, nominal, weights)
     fits = [
         fit_known_scale(base_from_gripper, nominal, start, NOISE)
-        for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_turn), (tool, base))
+        for start in ((np.eye(4), np.eye(4)), (np.eye(4), half_rotation), (tool, base))
     ]
     _require_length(arm, base_from_gripper, nominal)
     best = min(fits, key=lambda fit: float((fit.residual / np.repeat(NOISE, 3)) ** 2 @ np.ones(6) @ weights))

@@ -23,9 +23,9 @@ from jcr.records import (
     Estimate,
     Finding,
     HandEye,
-    HeldOut,
     ImageResiduals,
     Kind,
+    LeaveOneOut,
     PaperResiduals,
     RobotExamined,
     RobotNoise,
@@ -146,7 +146,7 @@ def _with_residuals(
         ),
         residuals=PaperResiduals(delta_t, delta_r),
         robot=RobotExamined(fit.noise),
-        held_out=_held_out(fit, used_distinct),
+        leave_one_out=_leave_one_out(fit, used_distinct),
         findings=seen.findings,
     )
 
@@ -225,14 +225,14 @@ def _of_residuals(hand_eye: HandEye) -> Iterator[Finding]:
             value=metres,
             details={"rotation": radians, "given": noise.given[0], "given_rotation": noise.given[1]},
         )
-    if (held_out := hand_eye.held_out) is not None:
-        leave_one_out, typical = 1e-3 * held_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
-        if leave_one_out > max(3 * typical, WELL_ABOVE):
+    if (leave_one_out := hand_eye.leave_one_out) is not None:
+        leave_one_out_m, typical = 1e-3 * leave_one_out.translation_mm, float(np.sqrt(3)) * noise.together[0]
+        if leave_one_out_m > max(3 * typical, WELL_ABOVE):
             yield Finding(
                 kind=Kind.LEAVE_ONE_OUT,
                 severity="warns",
                 mend="images",
-                value=leave_one_out,
+                value=leave_one_out_m,
                 details={"residual": typical},
             )
     if len(hand_eye.inliers) < FEW:
@@ -268,12 +268,12 @@ def _reasons(
     )
 
 
-def _held_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> HeldOut | None:
+def _leave_one_out(fit: PoseFit, used: Bool[ndarray, " n"]) -> LeaveOneOut | None:
     """Each used image predicted by a fit to the others; None when too few are left to fit."""
     if used.sum() < 4:
         return None
     metres, radians = np.linalg.norm(fit.leave_one_out[used].reshape(-1, 2, 3), axis=2).mean(0)
-    return HeldOut(
+    return LeaveOneOut(
         1e3 * float(metres), float(np.degrees(radians)), None, "each image predicted by the others"
     )
 

@@ -20,7 +20,7 @@ from jcr.calibration.robot_errors import RobotErrors, errors_of, robot_errors
 from jcr.calibration.stage import checked
 from jcr.capture.camera_json import intrinsics_as_json
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.files import read_bytes, write_text
 from jcr.geometry import apply, largest_motion
 from jcr.handeye.arms import arm_named
@@ -256,7 +256,7 @@ class LiveCalibration:
         robot = robot_errors(capture, self._options).of(made.image_index)
         try:
             case = checked(capture, made, self._options, robot)
-        except NotTrustedError:
+        except RejectedError:
             state = replace(state, findings=strongest_first([*of_images, *_too_few(len(names))]))
             return replace(state, **self._before_calibration(capture))
         assumptions = assumed_of(case)

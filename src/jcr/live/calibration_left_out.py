@@ -93,23 +93,23 @@ def _of_rows(made: Reconstruction, rows: Int[ndarray, " k"]) -> Reconstruction:
 
 def _seen_from(case: Case, found: Adjusted, seen: Tracks) -> Float[ndarray, "4 4"] | None:
     """base_from_camera of an image by the points that the calibration placed; None of too few of them."""
-    lens, placed = found.placed.scene.cameras[0], found.placed
+    intrinsics, placed = found.placed.scene.cameras[0], found.placed
     points = apply(placed.z[0], placed.scale * placed.scene.points_in_world)
     known = found.given.evidence.problem.points
     seen = seen.only(np.isin(seen.point, known))
     if len(seen.point) < LEAST_POINTS:
         return None
-    at, focal = points[np.searchsorted(known, seen.point)], lens.fx
-    rays = focal * unproject(lens, seen.x_px)[:, :2]
+    at, focal = points[np.searchsorted(known, seen.point)], intrinsics.fx
+    rays = focal * unproject(intrinsics, seen.x_px)[:, :2]
     pinhole = np.diag([focal, focal, 1.0])
-    is_found, turn, shift, inliers = cv2.solvePnPRansac(
+    is_found, rotation, shift, inliers = cv2.solvePnPRansac(
         at, rays, pinhole, None, reprojectionError=GATE_PX, flags=cv2.SOLVEPNP_SQPNP
     )
     if not is_found or inliers is None or len(inliers) < LEAST_POINTS:
         return None
     some = np.asarray(inliers[:, 0], dtype=int)
-    turn, shift = cv2.solvePnPRefineLM(at[some], rays[some], pinhole, None, turn, shift)
-    return inverse(transform(rotation_exp(turn[:, 0]), shift[:, 0]))
+    rotation, shift = cv2.solvePnPRefineLM(at[some], rays[some], pinhole, None, rotation, shift)
+    return inverse(transform(rotation_exp(rotation[:, 0]), shift[:, 0]))
 
 
 def _squares(
@@ -117,15 +117,15 @@ def _squares(
 ) -> tuple[float, float, float, float]:
     """Squares of the distance (m) and the angle (rad) between two places of a camera, and what is expected of both."""
     found = case.hand_eye
-    lens, distance = found.intrinsics or case.reconstruction.intrinsics, case.scene_distance_m
+    intrinsics, distance = found.intrinsics or case.reconstruction.intrinsics, case.scene_distance_m
     assert distance is not None
-    centre = np.array([lens.cx, lens.cy])
-    ray = unproject(lens, centre)
+    centre = np.array([intrinsics.cx, intrinsics.cy])
+    ray = unproject(intrinsics, centre)
     point = distance * ray / np.linalg.norm(ray)
     away = apply(by_robot, point) - apply(by_images, point)
     angle = float(rotation_angle(by_robot[:3, :3].T @ by_images[:3, :3]))
     base_from_gripper = by_robot @ inverse(found.gripper_from_camera)
-    expected = seen_in_base(found, lens, centre, distance, base_from_gripper)
+    expected = seen_in_base(found, intrinsics, centre, distance, base_from_gripper)
     # The points are placed in the base about as exactly as the camera on the gripper: it counts twice.
     square_m = float(np.trace(expected.together + expected.calibration))
     rotation = found.robot_noise.together[1]

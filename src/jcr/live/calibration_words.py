@@ -33,7 +33,7 @@ def progress_lines(state: Progress, require: tuple[float, float] | None, words: 
         if one.severity != "informs" and one.kind is not Kind.NOT_EXACT_ENOUGH
     ]
     if (pose := state.next_pose) is not None:
-        moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+        moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
         then = (
             f"then {significant(pose.within_95_mm)} mm and {significant(pose.rotation_95_deg)}° are expected"
         )

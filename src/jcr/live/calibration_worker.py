@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.live.calibration_progress import Progress
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class CalibrationWorker:
             self._remove_all()
             try:
                 self._calibrate()
-            except (InputError, NotTrustedError) as error:
+            except (InputError, RejectedError) as error:
                 self._heard(Failed(str(error)))
             except Exception as error:
                 self._heard(error)

@@ -25,7 +25,7 @@ from jcr.live.calibration_worker import CalibrationWorker, Failed
 from jcr.live.camera import Camera
 from jcr.live.coverage import as_answer, coverage, in_words
 from jcr.live.folder import LiveFolder
-from jcr.live.look import Picture, grid, picture
+from jcr.live.look import Still, grid, still_image
 from jcr.live.page import ENOUGH, Window, write_page
 from jcr.live.rest import REST, farther
 
@@ -204,19 +204,19 @@ class _Taking:
         ask.answer(answer)
         self.tell(answer, lines)
 
-    def _image(self, ask: Ask) -> Picture | str:
+    def _image(self, ask: Ask) -> Still | str:
         """An image at rest, or why none is kept."""
         for name, pose in self.live.places():
             is_there = name in self.kept and name != self.replaces
             if is_there and not farther(pose, ask.base_from_gripper, SAME_PLACE):
                 return f"the gripper is where {name} was taken; move to another pose"
         others = [one for name, one in self.kept.items() if name != self.replaces]
-        taken = picture(self.frames, others, self.options.patience)
+        taken = still_image(self.frames, others, self.options.patience)
         if ask.current is not None and farther(ask.base_from_gripper, ask.current(), REST):
             return "the arm moved while the image was taken; let it rest"
         return taken
 
-    def _keep(self, ask: Ask, taken: Picture) -> str | InputError:
+    def _keep(self, ask: Ask, taken: Still) -> str | InputError:
         """Keep an image, in place of another where one is retaken; an InputError of one that does not fit the others."""
         try:
             name = self.live.add(taken.image, ask.base_from_gripper, ask.joints, taken.depth_mm, taken.time_s)
@@ -269,6 +269,6 @@ class _Taking:
         write_page(self.live, self.found, headline, self.options.require or ENOUGH)
 
 
-def _as_kept(live: LiveFolder, name: str) -> Picture:
+def _as_kept(live: LiveFolder, name: str) -> Still:
     image = read_image(live.folder / name)
-    return Picture(image, grid(image), brightness_and_sharpness(image)[1])
+    return Still(image, grid(image), brightness_and_sharpness(image)[1])

@@ -115,7 +115,7 @@ def in_words(found: Coverage) -> list[str]:
         lines[0] += (
             f"; a point seen at {far} m is expected within {mm} mm and {deg}° (95 % of errors, usual robot)"
         )
-    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.turned_rad)
+    moved, rotated = 1e3 * pose.moved_m, np.degrees(pose.rotation_rad)
     then = f", then {significant(pose.within_95_mm)} mm" if now is not None else ""
     lines.append(f"best next: {moved:.0f} mm and {rotated:.0f}° from {found.like}{then}")
     return lines + [f"  {line}" for line in next_lines(found)]

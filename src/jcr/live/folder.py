@@ -27,7 +27,7 @@ THUMBNAIL_PX = 240
 class LiveFolder:
     """A capture folder that images are added to; what it holds already is kept."""
 
-    def __init__(self, folder: Path, lens: dict[str, Any] | None = None, robot: str | None = None):
+    def __init__(self, folder: Path, intrinsics: dict[str, Any] | None = None, robot: str | None = None):
         """Raises InputError when `folder` holds a capture.json that cannot be resumed."""
         self.folder = folder
         self._lock = threading.Lock()
@@ -36,7 +36,7 @@ class LiveFolder:
         self.joints: list[Float[ndarray, " dof"] | None] = []
         self.depths: list[str | None] = []
         self.times_s: list[float | None] = []
-        self.lens = lens
+        self.intrinsics = intrinsics
         self.size: tuple[int, int] | None = None
         self.rest: dict[str, Any] = {"source": {"program": "jcr capture"}}
         if folder.exists() and not folder.is_dir():
@@ -64,7 +64,7 @@ class LiveFolder:
             self.depths.append(depth if isinstance(depth, str) else None)
             time_s = frame.get("time_s")
             self.times_s.append(float(time_s) if isinstance(time_s, int | float) else None)
-        self.lens = self.lens or content.get("intrinsics")
+        self.intrinsics = self.intrinsics or content.get("intrinsics")
         self.rest = {key: content[key] for key in content if key not in ("frames", "intrinsics")}
 
     def add(
@@ -86,8 +86,8 @@ class LiveFolder:
                 f"{self.folder}: holds images of {self.size[0]}x{self.size[1]} pixels, the camera gives "
                 f"{size[0]}x{size[1]}; set its old resolution or name a new folder"
             )
-        if self.lens is not None:
-            read_intrinsics(self.lens, size, self.folder / FILE)
+        if self.intrinsics is not None:
+            read_intrinsics(self.intrinsics, size, self.folder / FILE)
         name = f"images/{self._next_number():03d}.png"
         write_bytes(self.folder / name, encode_png(image))
         depth = None
@@ -144,14 +144,14 @@ class LiveFolder:
 
     def _capture(self) -> Capture:
         assert self.size is not None
-        lens = read_intrinsics(self.lens, self.size, self.folder / FILE)
+        intrinsics = read_intrinsics(self.intrinsics, self.size, self.folder / FILE)
         return Capture(
             folder=self.folder,
             images=tuple(self.names),
             base_from_gripper=np.stack(self.poses),
             image_size=self.size,
-            intrinsics=lens,
-            intrinsics_std=read_std(self.rest.get("intrinsics_std"), lens, self.folder / FILE),
+            intrinsics=intrinsics,
+            intrinsics_std=read_std(self.rest.get("intrinsics_std"), intrinsics, self.folder / FILE),
             joints=self.all_joints(),
             robot=name if (name := self.rest.get("robot")) in ROBOT_NAMES else None,
             depths=tuple(self.depths) if any(self.depths) else None,
@@ -173,7 +173,7 @@ class LiveFolder:
             if self.times_s[row] is not None:
                 frame["time_s"] = self.times_s[row]
             frames.append(frame)
-        content = {"frames": frames, "intrinsics": self.lens, **self.rest}
+        content = {"frames": frames, "intrinsics": self.intrinsics, **self.rest}
         write_text(self.folder / FILE, json.dumps(content, indent=1) + "\n")
 
     @staticmethod

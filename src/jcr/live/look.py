@@ -20,7 +20,7 @@ GRID_PX = 160
 
 
 @dataclass(frozen=True)
-class Picture:
+class Still:
     """An image that was kept, and what later ones are held against."""
 
     image: UInt8[ndarray, "h w 3"]
@@ -31,7 +31,7 @@ class Picture:
     """On the camera's clock."""
 
 
-def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> Picture | str:
+def still_image(frames: Iterator[Frame], kept: list[Still], patience_s: float) -> Still | str:
     """The first image at rest that can be kept, or after `patience_s` the reason why none could.
 
     Those `kept` were taken from elsewhere, so this one must differ. Raises StopIteration at the end of a video
@@ -57,7 +57,7 @@ def picture(frames: Iterator[Frame], kept: list[Picture], patience_s: float) -> 
         elif any(np.abs(now - one.grid).mean() < STILL for one in kept):
             reason = "the gripper moved but the image did not change; is the stream frozen, or is it another camera?"
         else:
-            return Picture(frame.image, now, sharpness, frame.depth_mm, frame.time_s)
+            return Still(frame.image, now, sharpness, frame.depth_mm, frame.time_s)
         if frame.time_s > end:
             return reason
 

@@ -82,7 +82,7 @@ def page_state(live: LiveFolder, found: Coverage, headline: str, wanted: tuple[f
         tiles=_tiles(found, wanted),
         next_pose=""
         if pose is None
-        else f"{1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.turned_rad):.0f}° from {found.like}.",
+        else f"{1e3 * pose.moved_m:.0f} mm and {np.degrees(pose.rotation_rad):.0f}° from {found.like}.",
         next_pose_lines=[] if pose is None else next_lines(found),
         scene=pose_figure(live.poses, next_gripper, like) if live.poses else None,
         chart=chart_figure(LABEL, shares, FEWEST) if found.expected else None,

@@ -104,4 +104,4 @@ def distance_px(
     camera = predicted(motion[pair.key], gripper_from_camera)
     length = max(float(np.linalg.norm(camera[:3, 3])), 1e-9)
     ray_i, ray_j = view.rays[pair.i][pair.rows[:, 0]], view.rays[pair.j][pair.rows[:, 1]]
-    return np.abs(sampson_px(camera[:3, :3], camera[:3, 3] / length, ray_i, ray_j, view.lens.fx))
+    return np.abs(sampson_px(camera[:3, :3], camera[:3, 3] / length, ray_i, ray_j, view.intrinsics.fx))

@@ -36,26 +36,26 @@ def focal_by_robot(
     best, support = None, LEAST_SUPPORT
     for factor in LADDER:
         focal = float(factor * max(size))
-        lens = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+        intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
         agreeing = 0.0
         for key, geometry in known:
-            gap = min((abs(a - angle[key]) for a in _angles(x_px, lens, key, geometry)), default=np.inf)
+            gap = min((abs(a - angle[key]) for a in _angles(x_px, intrinsics, key, geometry)), default=np.inf)
             agreeing += math.exp(-0.5 * (gap / TOLERANCE) ** 2)
         if agreeing > support:
-            best, support = lens, agreeing
+            best, support = intrinsics, agreeing
     return best
 
 
 def _angles(
     x_px: list[Float[ndarray, "_ 2"]],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     key: Key,
     geometry: pycolmap.TwoViewGeometry,
 ) -> list[float]:
     """Angles of rotation that a geometry may mean."""
     rows = np.asarray(geometry.inlier_matches, dtype=int)[:MATCHES]
-    essential, homography = matrices(geometry, lens)
-    view = View.of([x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]], lens)
+    essential, homography = matrices(geometry, intrinsics)
+    view = View.of([x_px[key[0]][rows[:, 0]], x_px[key[1]][rows[:, 1]]], intrinsics)
     found = []
     if homography is not None:
         count, rotations, _, normals = cv2.decomposeHomographyMat(homography, np.eye(3))

@@ -43,8 +43,11 @@ def guided(
     i, j = key
     (start_i, of_i), (start_j, of_j) = (matcher.descriptors(k, float(upright[k])) for k in key)
     at = [slice(start, start + len(of)) for start, of in ((start_i, of_i), (start_j, of_j))]
-    some = View.of([view.x_px[k][rows] for k, rows in zip(key, at, strict=True)], view.lens)
-    rows = guided_rows(some, 0, 1, of_i, of_j, i_from_j, band_px(view.lens.fx, std_rad)) + [start_i, start_j]
+    some = View.of([view.x_px[k][rows] for k, rows in zip(key, at, strict=True)], view.intrinsics)
+    rows = guided_rows(some, 0, 1, of_i, of_j, i_from_j, band_px(view.intrinsics.fx, std_rad)) + [
+        start_i,
+        start_j,
+    ]
     found = matched(view.x_px, camera, i, j, rows, matcher.seed, matcher.known)
     if found is None or len(found.inlier_matches) < LEAST_RIGHT * len(rows):
         return None
@@ -77,7 +80,7 @@ def guided_rows(
     off = np.abs(h_i @ line_i.T)
     off_i = off / np.maximum(np.linalg.norm(line_i[:, :2], axis=1), 1e-12)
     off_j = off / np.maximum(np.linalg.norm(line_j[:, :2], axis=1), 1e-12)[:, None]
-    near = np.maximum(off_i, off_j) < band / view.lens.fx
+    near = np.maximum(off_i, off_j) < band / view.intrinsics.fx
     alike = np.where(near, descriptor_i @ descriptor_j.T, -1.0)
     if min(alike.shape) < 2:
         return np.zeros((0, 2), dtype=int)

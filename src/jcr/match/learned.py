@@ -103,13 +103,13 @@ class LearnedFeatures:
         roll = by_quarters(roll)
         key = row, round(math.degrees(roll))
         if key not in self._sets:
-            pixels, given_from_turned = _prepared(self._images[row], roll)
+            pixels, given_from_rotated = _prepared(self._images[row], roll)
             count = KEYPOINTS[self._kind]
             if isinstance(self._network, xfeat.XFeat):
                 x_px, descriptor = xfeat.detect(self._network, pixels, count)
             else:
                 x_px, descriptor = aliked.detect(self._network, pixels, count)
-            given = _mapped(x_px.double().numpy(), given_from_turned)
+            given = _mapped(x_px.double().numpy(), given_from_rotated)
             height, width = self._images[row].shape[:2]
             inside = ((given > 2) & (given < [width - 3, height - 3])).all(1)  # not in what fills the corners
             kept = torch.from_numpy(inside)
@@ -152,22 +152,22 @@ def _prepared(
     sx, sy = width / small_size[0], height / small_size[1]
     given_from_small = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
     cosine, sine = math.cos(roll), math.sin(roll)
-    turn = np.array([[cosine, -sine], [sine, cosine]])
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
     w, h = small_size
-    corners = turn @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
+    corners = rotation @ np.array([[0, w - 1, 0, w - 1], [0, 0, h - 1, h - 1]])
     low, extent = corners.min(1), corners.max(1) - corners.min(1)
-    turned_from_small = np.eye(3)
-    turned_from_small[:2, :2], turned_from_small[:2, 2] = turn, -low
+    rotated_from_small = np.eye(3)
+    rotated_from_small[:2, :2], rotated_from_small[:2, 2] = rotation, -low
     out = [MULTIPLE * math.ceil((round(float(side)) + 1) / MULTIPLE) for side in extent]
-    turned = cv2.warpAffine(
+    rotated = cv2.warpAffine(
         small,
-        turned_from_small[:2],
+        rotated_from_small[:2],
         (out[0], out[1]),
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    pixels = torch.from_numpy(np.ascontiguousarray(turned)).permute(2, 0, 1).float() / 255
-    return pixels, given_from_small @ np.linalg.inv(turned_from_small)
+    pixels = torch.from_numpy(np.ascontiguousarray(rotated)).permute(2, 0, 1).float() / 255
+    return pixels, given_from_small @ np.linalg.inv(rotated_from_small)
 
 
 def _mapped(x_px: Float[ndarray, "k 2"], to_from: Float[ndarray, "3 3"]) -> Float[ndarray, "k 2"]:

@@ -26,7 +26,7 @@ class _SelfAttention(nn.Module):
 
     def forward(self, x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
         q, k, v = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(0, 1).unbind(-1)
-        q, k = (of * cosine + _quarter_turn(of) * sine for of in (q, k))
+        q, k = (of * cosine + _quarter_rotation(of) * sine for of in (q, k))
         message = F.scaled_dot_product_attention(q[None], k[None], v[None])[0]
         return x + self.ffn(torch.cat([x, self.out_proj(message.transpose(0, 1).flatten(1))], -1))
 
@@ -55,9 +55,9 @@ class _Layer(nn.Module):
         self.self_attn, self.cross_attn = _SelfAttention(width, heads), _CrossAttention(width, heads)
 
     def forward(
-        self, x0: Tensor, x1: Tensor, turn0: tuple[Tensor, Tensor], turn1: tuple[Tensor, Tensor]
+        self, x0: Tensor, x1: Tensor, rotation0: tuple[Tensor, Tensor], rotation1: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        return self.cross_attn(self.self_attn(x0, *turn0), self.self_attn(x1, *turn1))
+        return self.cross_attn(self.self_attn(x0, *rotation0), self.self_attn(x1, *rotation1))
 
 
 class _Assignment(nn.Module):
@@ -113,10 +113,10 @@ class LightGlue(nn.Module):
         if not len(x0_px) or not len(x1_px):
             return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0)
         x0, x1 = self.input_proj(descriptor0), self.input_proj(descriptor1)
-        turn0, turn1 = self._encoding(x0_px, size0), self._encoding(x1_px, size1)
+        rotation0, rotation1 = self._encoding(x0_px, size0), self._encoding(x1_px, size1)
         last, layers = 0, len(self.transformers)
         for last, layer in enumerate(self.transformers):
-            x0, x1 = layer(x0, x1, turn0, turn1)
+            x0, x1 = layer(x0, x1, rotation0, rotation1)
             if early and last < layers - 1:
                 sure = self.token_confidence[last](torch.cat([x0, x1])) >= 0.8 + 0.1 * math.exp(
                     -4 * last / layers
@@ -141,7 +141,7 @@ def _feed_forward(width: int) -> nn.Sequential:
     )
 
 
-def _quarter_turn(x: Tensor) -> Tensor:
+def _quarter_rotation(x: Tensor) -> Tensor:
     """Neighbouring channels as coordinates of a plane, rotated by 90°."""
     a, b = x.unflatten(-1, (-1, 2)).unbind(-1)
     return torch.stack([-b, a], -1).flatten(-2)

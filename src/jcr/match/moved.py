@@ -79,7 +79,7 @@ def _has_place_of_its_own(view: View, rows: Int[ndarray, "m 2"], of_scene: Pair)
     for side, row in enumerate(of_scene.key):
         mine, its = (view.x_px[row][of[:, side]] for of in (rows, of_scene.rows))
         low, high = np.quantile(mine, [0.05, 0.95], axis=0)
-        if (high - low).prod() > LARGEST_AREA * view.lens.width * view.lens.height:
+        if (high - low).prod() > LARGEST_AREA * view.intrinsics.width * view.intrinsics.height:
             return False
         inside = ((its > low) & (its < high)).all(1).sum()
         if inside > SCENE_INSIDE * len(mine):

@@ -46,7 +46,7 @@ def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -
         return []
     first_from_camera = motion[0] @ x.gripper_from_camera
     camera_from_first = inverse(first_from_camera)
-    inside = np.stack([_in_image(view.lens, apply(pose, points)) for pose in camera_from_first])
+    inside = np.stack([_in_image(view.intrinsics, apply(pose, points)) for pose in camera_from_first])
     counted = inside.astype(np.float32)  # of 200 images 10⁷ numbers
     common = counted @ counted.T
     share = common / np.maximum(inside.sum(1), 1)[:, None]
@@ -56,11 +56,11 @@ def seen_in_common(view: View, found: Gate, motion: Float[ndarray, "n n 4 4"]) -
     return _best(score, PARTNERS)
 
 
-def _in_image(lens: Intrinsics, x_in_camera: Float[ndarray, "p 3"]) -> Bool[ndarray, " p"]:
+def _in_image(intrinsics: Intrinsics, x_in_camera: Float[ndarray, "p 3"]) -> Bool[ndarray, " p"]:
     """Which points an image shows."""
     inside = x_in_camera[:, 2] > 0
-    x_px = project(lens, x_in_camera[inside])
-    inside[inside] = ((x_px > -0.5) & (x_px < [lens.width - 0.5, lens.height - 0.5])).all(1)
+    x_px = project(intrinsics, x_in_camera[inside])
+    inside[inside] = ((x_px > -0.5) & (x_px < [intrinsics.width - 0.5, intrinsics.height - 0.5])).all(1)
     return inside
 
 

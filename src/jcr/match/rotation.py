@@ -85,13 +85,13 @@ def _refined(
     information = np.zeros((3, 3))
     agreeing = np.zeros(len(gripper), dtype=bool)
     for _ in range(ROUNDS):
-        turned = x @ camera @ x.T
-        residual = rotation_log(np.swapaxes(turned, 1, 2) @ gripper)
+        rotated = x @ camera @ x.T
+        residual = rotation_log(np.swapaxes(rotated, 1, 2) @ gripper)
         agreeing = np.linalg.norm(residual, axis=1) < tolerance
         if agreeing.sum() < 3:
             return None
         # turned → exp(w) turned exp(-w): the residual, in the axes after turned, changes by (turnedᵀ − I) w.
-        jacobian = np.swapaxes(turned, 1, 2) - np.eye(3)
+        jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
         w = np.where(agreeing, weight / (1 + (2 * np.linalg.norm(residual, axis=1) / tolerance) ** 2), 0.0)
         information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)
         gradient = np.einsum("p,pki,pk->i", w, jacobian, residual)

@@ -48,7 +48,7 @@ class Matched:
     """Those that a mapper may believe."""
     gate: Gate | None
     """None where the robot poses were not used."""
-    lens: Intrinsics
+    intrinsics: Intrinsics
     """At the working size: given, or as the robot and the images have it."""
     upright: Float[ndarray, " n"] | None = None
     """Angles (rad) by which the images were rotated, once X's rotation was known."""
@@ -83,23 +83,23 @@ class _Search:
         self, pairs: Iterable[Key], rolls: Float[ndarray, " n"] | None = None, guess: float = 0.0
     ) -> None:
         """Match pairs with images rotated by `rolls`, or the second of each by a guess; the better of two is kept."""
-        todo, turns = [], []
+        todo, rotations = [], []
         for i, j in pairs:
-            turn = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
+            rotation = (0.0, guess) if rolls is None else (float(rolls[i]), float(rolls[j]))
             if not self.matcher.minds_roll:
-                turn = (0.0, 0.0)
-            turn = robot.by_quarters(turn[0]), robot.by_quarters(turn[1])
-            how = (i, j, round(math.degrees(turn[0])), round(math.degrees(turn[1])))
+                rotation = (0.0, 0.0)
+            rotation = robot.by_quarters(rotation[0]), robot.by_quarters(rotation[1])
+            how = (i, j, round(math.degrees(rotation[0])), round(math.degrees(rotation[1])))
             if how in self.tried:
                 continue
             self.tried.add(how)
             todo.append((i, j))
-            turns.append(turn)
+            rotations.append(rotation)
         if not todo:
             return
-        found = self.matcher.geometries(todo, np.array(turns))
+        found = self.matcher.geometries(todo, np.array(rotations))
         if self.matcher.minds_roll:  # an image that is rotated brings keypoints of its own
-            self.view = View.of(self.matcher.x_px, self.view.lens)
+            self.view = View.of(self.matcher.x_px, self.view.intrinsics)
         for key, geometry in found.items():
             clean = self._seen(key, geometry)
             if clean is None:
@@ -113,7 +113,7 @@ class _Search:
         angle = np.asarray(rotation_angle(self.motion[..., :3, :3]))
         way = np.linalg.norm(self.motion[..., :3, 3], axis=-1)
         moving = [key for key in self.matcher.raw if angle[key] > STILL[1] or way[key] > STILL[0]]
-        size = self.view.lens.width, self.view.lens.height
+        size = self.view.intrinsics.width, self.view.intrinsics.height
         still = still_cells(self.matcher.x_px, self.matcher.raw, size, moving)
         if not still.any():
             return
@@ -186,7 +186,7 @@ class _Search:
 def match_with_robot(
     matcher: Matcher,
     base_from_gripper: Float[ndarray, "n 4 4"],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     known: bool,
     names: Sequence[str],
     original: tuple[int, int],
@@ -201,23 +201,23 @@ def match_with_robot(
     n = len(base_from_gripper)
     motion = motions(base_from_gripper)
     angle = np.asarray(rotation_angle(motion[..., :3, :3]))
-    search = _Search(matcher, motion, View.of(matcher.x_px, lens), known)
+    search = _Search(matcher, motion, View.of(matcher.x_px, intrinsics), known)
     everything = all_pairs(n) if n <= matcher.every_pair else near_pairs(motion, NEIGHBOURS)
     at_once = n <= FEW and not matcher.minds_roll
     first = everything if at_once else near_pairs(motion, FIRST_NEIGHBOURS)
     search.match([key for key in first if not matcher.minds_roll or angle[key] < AS_TAKEN])
     search.hide_still_parts()
     report(0.3)
-    found = _with_lens(search, lens)
+    found = _with_intrinsics(search, intrinsics)
     if found.of_x is None and matcher.minds_roll:
         found = _guessed(search, everything, angle, found)
     report(0.5)
     if found.of_x is None:
         search.match(everything)
-        found = _with_lens(search, lens)
+        found = _with_intrinsics(search, intrinsics)
     if found.of_x is None:
         notes = _beside(search, found, names, original)
-        return Matched(search.geometries, None, search.view.lens, None, search.still, notes)
+        return Matched(search.geometries, None, search.view.intrinsics, None, search.still, notes)
     upright = robot.rolls(robot.base_from_camera_rotations(base_from_gripper, found.of_x))
     search.match(seen_in_common(search.view, found, motion) or everything, upright)
     found = search.gate(found)
@@ -236,7 +236,7 @@ def match_with_robot(
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
     notes = (*_left_out(found), *_beside(search, found, names, original))
     warnings = _wrong_poses(stale, names)
-    return Matched(kept, found, search.view.lens, upright, search.still, notes, warnings)
+    return Matched(kept, found, search.view.intrinsics, upright, search.still, notes, warnings)
 
 
 def _without_partners(found: Gate, count: int) -> set[int]:
@@ -245,14 +245,14 @@ def _without_partners(found: Gate, count: int) -> set[int]:
     return set(np.flatnonzero(np.bincount(rows, minlength=count) < 2).tolist())
 
 
-def _with_lens(search: _Search, guess: Intrinsics) -> Gate:
+def _with_intrinsics(search: _Search, guess: Intrinsics) -> Gate:
     """The gate through the intrinsics that are known, or else through those by which most pairs agree with the robot."""
     if search.known:
         return search.gate()
     size = guess.width, guess.height
-    lens = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
-    if lens is not None:
-        search.view = View.of(search.matcher.x_px, lens)
+    intrinsics = focal_by_robot(list(search.matcher.x_px), size, search.geometries.items(), search.motion)
+    if intrinsics is not None:
+        search.view = View.of(search.matcher.x_px, intrinsics)
         search.pairs = {key: pair_of(search.view, *key, found) for key, found in search.geometries.items()}
     return search.gate()
 
@@ -319,7 +319,7 @@ def _wrong_poses(stale: set[int], names: Sequence[str]) -> tuple[str, ...]:
 
 def _beside(search: _Search, found: Gate, names: Sequence[str], original: tuple[int, int]) -> tuple[str, ...]:
     """What is left out of the matches because it does not move with the scene."""
-    notes, size = [], (search.view.lens.width, search.view.lens.height)
+    notes, size = [], (search.view.intrinsics.width, search.view.intrinsics.height)
     if search.still is not None:
         place = still_in_words(search.still, size, original)
         notes.append(

@@ -46,15 +46,15 @@ class View:
 
     x_px: Sequence[Float[ndarray, "_ 2"]]
     """Keypoints of every image; pixel centres are whole numbers."""
-    lens: Intrinsics
+    intrinsics: Intrinsics
     """Given, or a guess."""
     rays: Sequence[Float[ndarray, "_ 2"]]
     """x/z, y/z of the keypoints through those intrinsics."""
 
     @staticmethod
-    def of(x_px: Sequence[Float[ndarray, "_ 2"]], lens: Intrinsics) -> "View":
+    def of(x_px: Sequence[Float[ndarray, "_ 2"]], intrinsics: Intrinsics) -> "View":
         """The keypoints with their rays."""
-        return View(x_px, lens, [unproject(lens, x)[:, :2] for x in x_px])
+        return View(x_px, intrinsics, [unproject(intrinsics, x)[:, :2] for x in x_px])
 
     def pair(
         self,
@@ -66,7 +66,7 @@ class View:
     ) -> Pair:
         """Matched keypoints with all readings of their geometry; matrices of normalised coordinates, j from i."""
         ray_i, ray_j = self.rays[i][rows[:, 0]], self.rays[j][rows[:, 1]]
-        return Pair(i, j, rows, tuple(readings(ray_i, ray_j, self.lens.fx, essential, homography)))
+        return Pair(i, j, rows, tuple(readings(ray_i, ray_j, self.intrinsics.fx, essential, homography)))
 
 
 def matched(
@@ -97,14 +97,14 @@ def matched(
 def pair_of(view: View, i: int, j: int, found: pycolmap.TwoViewGeometry) -> Pair:
     """COLMAP's two-view geometry with its readings through the view's intrinsics."""
     rows = np.asarray(found.inlier_matches, dtype=int).reshape(-1, 2)
-    return view.pair(i, j, rows, *matrices(found, view.lens))
+    return view.pair(i, j, rows, *matrices(found, view.intrinsics))
 
 
 def matrices(
-    found: pycolmap.TwoViewGeometry, lens: Intrinsics
+    found: pycolmap.TwoViewGeometry, intrinsics: Intrinsics
 ) -> tuple[Float[ndarray, "3 3"] | None, Float[ndarray, "3 3"] | None]:
     """Essential matrix and homography of normalised coordinates, j from i, where COLMAP found one."""
-    k = lens.matrix
+    k = intrinsics.matrix
     essential, homography = found.E, found.H
     if essential is None and found.F is not None:
         essential = k.T @ _between_centres(found.F) @ k

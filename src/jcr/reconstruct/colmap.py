@@ -5,9 +5,9 @@ from dataclasses import replace
 
 from PIL import ExifTags, Image
 
-from jcr.camera import usable_lens
+from jcr.camera import usable_intrinsics
 from jcr.capture.images import read_image
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.memory import plan
 from jcr.progress import Progress, silent
 from jcr.reconstruct.colmap_options import ColmapOptions
@@ -38,11 +38,11 @@ def reconstruct(
     working_px = int(width * height * min(1.0, options.working_size_px / max(width, height)) ** 2)
     plan(len(capture), (width, height), options.memory_gb, features=working_px * BYTES_OF_FEATURES)
     images = [read_image(capture.folder / name) for name in capture.images]
-    lenses, is_known, warnings = starting_intrinsics(capture)
+    cameras, is_known, warnings = starting_intrinsics(capture)
     try:
         sparse = structure_from_motion(
             images,
-            lenses,
+            cameras,
             is_known,
             options,
             report,
@@ -50,7 +50,7 @@ def reconstruct(
             capture.images,
             KeptFeatures.of(capture) if options.features == "sift" else None,
         )
-    except NotTrustedError as error:
+    except RejectedError as error:
         raise error.with_more(*warnings) from None
     notes, registered = sparse.notes, sparse.image_index
     if missing := [name for row, name in enumerate(capture.images) if row not in registered]:
@@ -60,11 +60,11 @@ def reconstruct(
 
 def starting_intrinsics(capture: Capture) -> tuple[list[Intrinsics], bool, tuple[str, ...]]:
     """The intrinsics from which the mapping starts, tried in turn; whether they are known; and warnings about them."""
-    given, warnings = usable_lens(capture.intrinsics)
-    return [given] if given else _guessed_lenses(capture), given is not None, warnings
+    given, warnings = usable_intrinsics(capture.intrinsics)
+    return [given] if given else _guessed_intrinsics(capture), given is not None, warnings
 
 
-def _guessed_lenses(capture: Capture) -> list[Intrinsics]:
+def _guessed_intrinsics(capture: Capture) -> list[Intrinsics]:
     """Starting points for unknown intrinsics: EXIF's 35 mm focal length if there is one, then a ladder."""
     width, height = capture.image_size
     with Image.open(capture.folder / capture.images[0]) as opened:

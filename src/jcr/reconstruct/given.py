@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from jcr.capture import colmap_model, transforms_json
 from jcr.capture.images import read_image
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import inverse
 from jcr.match.matchers import Matcher
 from jcr.match.pairs import all_pairs
@@ -55,7 +55,7 @@ def reconstruct_given(
         images = [read_image(capture.folder / capture.images[k]) for k in known]
         tracks = _triangulated(images, intrinsics, recon_from_camera, options, report)
     if len(tracks.points_in_recon) < MIN_POINTS:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{cameras}: with its camera poses only {len(tracks.points_in_recon)} points can be triangulated",
             "check that it belongs to these images, or leave it out (--backend colmap)",
         )

@@ -33,7 +33,7 @@ from jcr.reconstruct.placed import poses_of
 from jcr.reconstruct.sfm import (
     adjust_robustly,
     enter,
-    lens_of,
+    intrinsics_of,
     log_level,
     map_incrementally,
     matched_pairs,
@@ -66,7 +66,7 @@ class Growing:
         self._database = Path(self._temporary.name) / "database.db"
         self._capture = capture
         self._rows = list(range(len(capture)))
-        self._lenses, self._known, _ = starting_intrinsics(capture)
+        self._all_intrinsics, self._known, _ = starting_intrinsics(capture)
         self._kept = KeptFeatures.growing(capture.folder)
         with log_level(False):
             self._map_all()
@@ -75,15 +75,22 @@ class Growing:
         capture, known = self._capture, self._known
         images = [read_image(capture.folder / name) for name in capture.images]
         self._kept.digests.extend(file_digest(capture.folder / name) for name in capture.images)
-        cameras = enter(self._database, len(capture), self._lenses, known, OPTIONS.working_size_px)
+        cameras = enter(self._database, len(capture), self._all_intrinsics, known, OPTIONS.working_size_px)
         self._features = sift_features(images, cameras[0], OPTIONS.memory_gb, silent, self._kept)
         self._matcher = KeepingMatcher(self._features, cameras[0], known, OPTIONS.seed, self._kept)
         poses = capture.base_from_gripper
         matched = matched_pairs(
-            self._database, self._matcher, poses, self._lenses[0], cameras, known, capture.images, silent
+            self._database,
+            self._matcher,
+            poses,
+            self._all_intrinsics[0],
+            cameras,
+            known,
+            capture.images,
+            silent,
         )
         self._gate, self._still = matched.gate or Gate((), (), (), None), matched.still
-        self._view = View.of(self._matcher.x_px, matched.lens)
+        self._view = View.of(self._matcher.x_px, matched.intrinsics)
         self._geometries: Geometries = dict(matched.geometries)
         self._matched_with = {row: 0 for row in self._rows}
         for key in self._geometries:
@@ -91,7 +98,7 @@ class Growing:
         self._model = map_incrementally(self._database, len(capture), cameras, known, OPTIONS.seed, silent)
         self._mapped_of = self._adjusted_of = len(capture)
         if self._model is not None:
-            adjust_robustly(self._model, hold_lens=known)
+            adjust_robustly(self._model, fix_intrinsics=known)
 
     @property
     def is_to_be_mapped_again(self) -> bool:
@@ -124,8 +131,8 @@ class Growing:
         self._features.add(image)
         self._matcher.images_added()
         x_px = self._matcher.x_px[row]
-        rays = unproject(self._view.lens, x_px)[:, :2]
-        self._view = View([*self._view.x_px, x_px], self._view.lens, [*self._view.rays, rays])
+        rays = unproject(self._view.intrinsics, x_px)[:, :2]
+        self._view = View([*self._view.x_px, x_px], self._view.intrinsics, [*self._view.rays, rays])
         with log_level(False):
             self._match(row)
             if self._model is not None:
@@ -145,12 +152,16 @@ class Growing:
         if self._model is None or len(places) < 2:
             return None
         rows = [self._rows[place] for place in places]
-        lens = self._lenses[0] if self._known else lens_of(self._model.camera(1), self._lenses[0])
+        intrinsics = (
+            self._all_intrinsics[0]
+            if self._known
+            else intrinsics_of(self._model.camera(1), self._all_intrinsics[0])
+        )
         return Reconstruction(
             image_index=np.array(places),
             recon_from_camera=poses_of(self._model, rows),
-            intrinsics=lens,
-            tracks=tracks_of(self._model, [row + 1 for row in rows], (lens.width, lens.height)),
+            intrinsics=intrinsics,
+            tracks=tracks_of(self._model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height)),
             backend="colmap",
         )
 
@@ -227,7 +238,9 @@ class Growing:
         mapping, triangulation = options.get_mapper(), options.get_triangulation()
         mapping.abs_pose_min_num_inliers = LEAST_INLIERS
         self._database.unlink()
-        enter(self._database, len(self._view.x_px), self._lenses, self._known, OPTIONS.working_size_px)
+        enter(
+            self._database, len(self._view.x_px), self._all_intrinsics, self._known, OPTIONS.working_size_px
+        )
         write_keypoints(self._database, self._view.x_px)
         write_geometries(self._database, self._geometries)
         with closing(pycolmap.Database.open(self._database)) as db:
@@ -248,5 +261,5 @@ class Growing:
             )
         mapper.end_reconstruction(False)
         if len(self._rows) >= ADJUSTED_AGAIN * self._adjusted_of:
-            adjust_robustly(self._model, hold_lens=self._known)
+            adjust_robustly(self._model, fix_intrinsics=self._known)
             self._adjusted_of = len(self._rows)

@@ -46,7 +46,7 @@ def align_tracks(
     greys: UInt8[ndarray, "m h w"],
     tracks: Tracks,
     recon_from_camera: Float[ndarray, "m 4 4"],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
 ) -> Tracks:
     """The tracks with the observations moved that could be aligned to their track's reference, and how surely.
 
@@ -58,18 +58,18 @@ def align_tracks(
     begins = np.flatnonzero(np.diff(point, prepend=-1))
     ends = np.append(begins, len(point))
     facing = _facing(tracks, recon_from_camera)[point]
-    scale = _scales(image, tracks.points_in_recon[point], facing, recon_from_camera, lens)
+    scale = _scales(image, tracks.points_in_recon[point], facing, recon_from_camera, intrinsics)
     rank = np.lexsort((scale, point))
     reference = rank[(ends[:-1] + ends[1:]) // 2]
     of_reference = np.repeat(reference, np.diff(ends))
     warp, bend = _warps(
-        x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, lens
+        x_px, image, tracks.points_in_recon[point], facing, of_reference, recon_from_camera, intrinsics
     )
     start_px, start_affine = x_px.copy(), warp
     found, variance = x_px.copy(), np.full(len(point), KEYPOINT_STD_PX**2)
     for reduced in _REDUCED:
         level = _reduced(greys, reduced)
-        level_from_image = np.array([level.shape[2] / lens.width, level.shape[1] / lens.height])
+        level_from_image = np.array([level.shape[2] / intrinsics.width, level.shape[1] / intrinsics.height])
         seen_px = _resized(start_px, level_from_image)
         aligned_px, affine, variance_px = seen_px.copy(), start_affine.copy(), np.full(len(point), np.inf)
         _align_all(
@@ -134,12 +134,12 @@ def _scales(
     x_in_recon: Float[ndarray, "k 3"],
     facing: Float[ndarray, "k 3"],
     recon_from_camera: Float[ndarray, "m 4 4"],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
 ) -> Float[ndarray, " k"]:
     """Pixels² of each observation that a unit of area of its plane covers, times the square of the normal's length."""
     camera_from_recon = inverse(recon_from_camera)[image]
     x_in_camera = _moved(camera_from_recon, x_in_recon)
-    by_recon = by_point(lens, x_in_camera) @ camera_from_recon[:, :3, :3]
+    by_recon = by_point(intrinsics, x_in_camera) @ camera_from_recon[:, :3, :3]
     # The area's factor along a normal n is det [J; nᵀ], and n is as long for all observations of a point.
     return np.abs(np.linalg.det(np.concatenate([by_recon, facing[:, None]], axis=1)))
 
@@ -151,7 +151,7 @@ def _warps(
     facing: Float[ndarray, "k 3"],
     of_reference: Int[ndarray, " k"],
     recon_from_camera: Float[ndarray, "m 4 4"],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
 ) -> tuple[Float[ndarray, "k 2 2"], Float[ndarray, "k 2 3"]]:
     """Affine part and bend: (u, v) from the reference's keypoint is affine·(u, v) + bend·(u², uv, v²) from the other.
 
@@ -165,10 +165,10 @@ def _warps(
 
     def at(u: int, v: int) -> Float[ndarray, "k 2"]:
         offset = _BEND_AT_PX * np.array([u, v])
-        rays = unproject(lens, x_px[of_reference] + offset)
+        rays = unproject(intrinsics, x_px[of_reference] + offset)
         ray = np.einsum("kij,kj->ki", recon_from_reference[:, :3, :3], rays)
         on_plane = centre + (height / (ray * facing).sum(1))[:, None] * ray
-        return project(lens, _moved(camera_from_recon, on_plane))
+        return project(intrinsics, _moved(camera_from_recon, on_plane))
 
     with np.errstate(all="ignore"):
         middle, right, left, below, above = at(0, 0), at(1, 0), at(-1, 0), at(0, 1), at(0, -1)

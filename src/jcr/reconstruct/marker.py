@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from jcr.camera import WITHIN_FOLD, by_point, fold_distance_px, project, unproject, without_distortion
 from jcr.capture.images import read_image
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import apply, inverse, retract, rotation_between_deg, rotation_exp, skew, transform
 from jcr.least_squares import minimise
 from jcr.memory import plan
@@ -64,7 +64,7 @@ def reconstruct_marker(
     recon_from_camera, recon_from_body = locate_cameras_and_bodies(poses)
     rows = np.array(sorted(recon_from_camera), dtype=int)
     if len(rows) < 3:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{len(rows)} of {len(capture)} images show {look_for} well enough",
             "check its size and kind, that it lies flat and wholly in view, or use a back end that needs no marker",
         )
@@ -96,7 +96,7 @@ def _intrinsics(
     shown = [s for sightings in seen for s in sightings]
     images = sum(map(bool, seen))
     if images < FEWEST_FOR_INTRINSICS:
-        raise NotTrustedError(
+        raise RejectedError(
             f"{images} of {len(capture)} images show {board.name}, {FEWEST_FOR_INTRINSICS} are needed to find the "
             "unknown intrinsics from it",
             "check the board's kind and size, or give the intrinsics",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
-from jcr.camera import is_distorted, usable_lens
+from jcr.camera import is_distorted, usable_intrinsics
 from jcr.errors import InputError
 from jcr.geometry import require_rigid
 from jcr.memory import ALLOWANCE, GB, MAP, announce, require, resident
@@ -119,7 +119,7 @@ def _images(
     them the pixels are taken to be the capture's own, and a known distortion cannot be accounted for.
     """
     seen, grid = camera_of_arrays(arrays, size, source)
-    intrinsics, warnings = usable_lens(capture.intrinsics)
+    intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     grid = grid or _plain_grid(capture.image_size, size, source)
     if seen is not None:
         pinhole = grid.original_intrinsics(seen)

@@ -21,7 +21,7 @@ from jcr.camera import (
     resized,
     undistort_image,
     unproject,
-    usable_lens,
+    usable_intrinsics,
     without_distortion,
 )
 from jcr.capture.images import read_image
@@ -128,7 +128,7 @@ def prepare_images(
 
     `grid_of` gives the resize and crop for the size of an image. Raises InputError for an image that cannot be read.
     """
-    intrinsics, warnings = usable_lens(capture.intrinsics)
+    intrinsics, warnings = usable_intrinsics(capture.intrinsics)
     pinhole = intrinsics
     if intrinsics is not None and is_distorted(intrinsics):
         pinhole = pinhole_inside(intrinsics, max(intrinsics.width, intrinsics.height))

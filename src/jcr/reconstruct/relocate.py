@@ -63,21 +63,22 @@ def relocate(
 
     `older` are the images of the reconstruction's rows, in their order; all are of one camera.
     """
-    lens = reconstruction.intrinsics
-    known = [features(image, lens) for image in older]
+    intrinsics = reconstruction.intrinsics
+    known = [features(image, intrinsics) for image in older]
     return [
-        _located(features(image, lens), known, reconstruction.recon_from_camera, lens.fx) for image in new
+        _located(features(image, intrinsics), known, reconstruction.recon_from_camera, intrinsics.fx)
+        for image in new
     ]
 
 
-def features(image: UInt8[ndarray, "h w 3"], lens: Intrinsics) -> Features:
+def features(image: UInt8[ndarray, "h w 3"], intrinsics: Intrinsics) -> Features:
     """SIFT of an image of these intrinsics, reduced to WORKING_SIZE_PX."""
-    scale = min(1.0, WORKING_SIZE_PX / max(lens.width, lens.height))
-    size = round(lens.width * scale), round(lens.height * scale)
+    scale = min(1.0, WORKING_SIZE_PX / max(intrinsics.width, intrinsics.height))
+    size = round(intrinsics.width * scale), round(intrinsics.height * scale)
     found, descriptors = detect(grey_of(image, size))
-    to_original = np.array([lens.width / size[0], lens.height / size[1]])
+    to_original = np.array([intrinsics.width / size[0], intrinsics.height / size[1]])
     return Features(
-        (found + 0.5) * to_original - 0.5, unproject(resized(lens, *size), found)[:, :2], descriptors
+        (found + 0.5) * to_original - 0.5, unproject(resized(intrinsics, *size), found)[:, :2], descriptors
     )
 
 
@@ -94,13 +95,13 @@ def _located(
     if good.sum() < MIN_POINTS:
         return int(good.sum())
     points, spread, rays = x_in_recon[good], spread[good], rays[good]
-    found, turn, shift, inliers = cv2.solvePnPRansac(
+    found, rotation, shift, inliers = cv2.solvePnPRansac(
         points, focal_px * rays, np.diag([focal_px, focal_px, 1.0]), None,
         iterationsCount=2000, reprojectionError=GATE_PX, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < MIN_POINTS:
         return 0 if inliers is None else len(inliers)
-    start = inverse(transform(rotation_exp(turn[:, 0]), shift[:, 0]))
+    start = inverse(transform(rotation_exp(rotation[:, 0]), shift[:, 0]))
     agree = np.asarray(inliers, int)[:, 0]
     return _refined(points[agree], spread[agree], rays[agree], start, focal_px)
 
@@ -122,9 +123,9 @@ def triangulated(
     normal = np.zeros((n, 3, 3))
     for _ in range(3):  # later without those that missed, and by how far each camera was
         normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        told = weight[kept, None, None] * across[kept]
-        np.add.at(normal, feature[kept], told)
-        np.add.at(right, feature[kept], np.einsum("cij,cj->ci", told, center[kept]))
+        weighted = weight[kept, None, None] * across[kept]
+        np.add.at(normal, feature[kept], weighted)
+        np.add.at(right, feature[kept], np.einsum("cij,cj->ci", weighted, center[kept]))
         # With one ray, or parallel ones, the depth is open; the small term keeps it finite.
         normal += 1e-9 * np.eye(3)
         point = np.linalg.solve(normal, right[..., None])[..., 0]
@@ -157,8 +158,10 @@ def _refined(
     sigma, normal = 1.0 / focal_px, np.eye(6)
     for _ in range(MEASUREMENTS):
         residual, jacobian = _reprojection(points, rays, recon_from_camera)
-        turned = -jacobian[:, :, :3]
-        whitening = np.linalg.inv(np.linalg.cholesky(np.eye(2) + turned @ spread @ np.swapaxes(turned, 1, 2)))
+        rotated = -jacobian[:, :, :3]
+        whitening = np.linalg.inv(
+            np.linalg.cholesky(np.eye(2) + rotated @ spread @ np.swapaxes(rotated, 1, 2))
+        )
         squared = ((whitening @ residual[..., None]) ** 2).sum((1, 2))
         before, sigma = sigma, max(float(np.sqrt(np.median(squared))) / 1.1774, 0.05 / focal_px)
         whitening /= LOSS_SCALE * sigma
@@ -180,5 +183,5 @@ def _reprojection(
     """By how much the camera misses the rays, and the derivative by its step."""
     rotation, arm = recon_from_camera[:3, :3], points - recon_from_camera[:3, 3]
     x = arm @ rotation
-    turned = by_point(NORMALIZED, x) @ rotation.T
-    return project(NORMALIZED, x) - rays, np.concatenate([-turned, turned @ skew(arm)], axis=2)
+    rotated = by_point(NORMALIZED, x) @ rotation.T
+    return project(NORMALIZED, x) - rays, np.concatenate([-rotated, rotated @ skew(arm)], axis=2)

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.camera import HALF_PIXEL, fold_distance_px, resized
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import inverse
 from jcr.match.guided import guided
 from jcr.match.kept import KeepingMatcher, KeptFeatures
@@ -62,7 +62,7 @@ _FEW_FEATURES = 1000
 
 def structure_from_motion(
     images: Sequence[UInt8[ndarray, "h w 3"]],
-    lenses: Sequence[Intrinsics],
+    all_intrinsics: Sequence[Intrinsics],
     known: bool,
     options: ColmapOptions,
     report: Progress,
@@ -82,34 +82,37 @@ def structure_from_motion(
     seed = options.seed
     with log_level(options.verbose), tempfile.TemporaryDirectory(prefix="jcr-colmap-") as folder:
         database = Path(folder) / "database.db"
-        cameras = enter(database, len(images), lenses, known, options.working_size_px)
+        cameras = enter(database, len(images), all_intrinsics, known, options.working_size_px)
         matcher = matcher_of(options, images, cameras[0], known, report, kept)
         matched = matched_pairs(
-            database, matcher, base_from_gripper, lenses[0], cameras, known, names, report
+            database, matcher, base_from_gripper, all_intrinsics[0], cameras, known, names, report
         )
         model = map_incrementally(database, len(images), cameras, known, seed, report)
         if model is not None and base_from_gripper is not None and model.num_reg_images() < len(images):
             model, matched = _placed(database, model, matcher, matched, base_from_gripper, names)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(database, len(images), model)
-        adjust_robustly(model, hold_lens=known)
+        adjust_robustly(model, fix_intrinsics=known)
         std_px = _align_observations(
-            model, images, lenses[0] if known else lens_of(model.camera(1), lenses[0])
+            model, images, all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])
         )
-        adjust_robustly(model, hold_lens=known)
-        lens, notes = (lenses[0] if known else lens_of(model.camera(1), lenses[0])), list(matched.notes)
-        if not known and fold_distance_px(lens) is not None:
+        adjust_robustly(model, fix_intrinsics=known)
+        intrinsics, notes = (
+            (all_intrinsics[0] if known else intrinsics_of(model.camera(1), all_intrinsics[0])),
+            list(matched.notes),
+        )
+        if not known and fold_distance_px(intrinsics) is not None:
             notes.append("the views do not determine the distortion: it is taken as zero")
             model.camera(1).params = [*model.camera(1).params[:3], 0.0, 0.0]
-            adjust_robustly(model, hold_lens=True)
-            lens = lens_of(model.camera(1), lens)
+            adjust_robustly(model, fix_intrinsics=True)
+            intrinsics = intrinsics_of(model.camera(1), intrinsics)
     report("mapping", 1.0)
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
-    tracks = tracks_of(model, [row + 1 for row in rows], (lens.width, lens.height))
+    tracks = tracks_of(model, [row + 1 for row in rows], (intrinsics.width, intrinsics.height))
     return Reconstruction(
         image_index=np.array(rows),
         recon_from_camera=poses_of(model, rows),
-        intrinsics=lens,
+        intrinsics=intrinsics,
         tracks=replace(tracks, std_px=std_px),
         backend="colmap",
         notes=tuple(notes),
@@ -118,13 +121,13 @@ def structure_from_motion(
 
 
 def enter(
-    database: Path, count: int, lenses: Sequence[Intrinsics], known: bool, working_size_px: int
+    database: Path, count: int, all_intrinsics: Sequence[Intrinsics], known: bool, working_size_px: int
 ) -> list[pycolmap.Camera]:
     """A new database of `count` images without features; the intrinsics, at the working size, as COLMAP's cameras."""
-    width, height = lenses[0].width, lenses[0].height
+    width, height = all_intrinsics[0].width, all_intrinsics[0].height
     scale = min(1.0, working_size_px / max(width, height))
     size = round(width * scale), round(height * scale)
-    cameras = [camera_of(resized(lens, *size), known) for lens in lenses]
+    cameras = [camera_of(resized(intrinsics, *size), known) for intrinsics in all_intrinsics]
     with closing(pycolmap.Database.open(database)) as db:
         db.write_camera(cameras[0], use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
@@ -180,7 +183,7 @@ def matched_pairs(
     database: Path,
     matcher: Matcher,
     base_from_gripper: Float[ndarray, "n 4 4"] | None,
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     cameras: list[pycolmap.Camera],
     known: bool,
     names: Sequence[str],
@@ -188,7 +191,7 @@ def matched_pairs(
 ) -> Matched:
     """The pairs that a mapper may believe, written into the database; intrinsics that the robot found come first."""
     report("matching", 0.0)
-    working = resized(lens, cameras[0].width, cameras[0].height)
+    working = resized(intrinsics, cameras[0].width, cameras[0].height)
     if base_from_gripper is None:
         n = len(matcher.x_px)
         pairs = all_pairs(n)
@@ -200,13 +203,13 @@ def matched_pairs(
             working,
             known,
             names,
-            (lens.width, lens.height),
+            (intrinsics.width, intrinsics.height),
             lambda fraction: report("matching", fraction),
         )
     write_keypoints(database, matcher.x_px)
     write_geometries(database, matched.geometries)
-    if not known and matched.lens != working:
-        cameras.insert(0, camera_of(matched.lens, known))
+    if not known and matched.intrinsics != working:
+        cameras.insert(0, camera_of(matched.intrinsics, known))
     report("matching", 1.0)
     return matched
 
@@ -260,8 +263,8 @@ def _placed(
     rows = sorted(image_id - 1 for image_id in model.reg_image_ids())
     left = [row for row in range(len(base_from_gripper)) if row not in rows]
     camera = model.camera(1)
-    lens = matched.lens if matcher.known else lens_of(camera, matched.lens)
-    _match_guided(database, matcher, View.of(matcher.x_px, lens), camera, matched, predicted, left)
+    intrinsics = matched.intrinsics if matcher.known else intrinsics_of(camera, matched.intrinsics)
+    _match_guided(database, matcher, View.of(matcher.x_px, intrinsics), camera, matched, predicted, left)
     poses = dict(zip(rows, poses_of(model, rows), strict=True))
     apart = _second_model(database, left, camera, matcher.known, matcher.seed)
     together = joined(apart, predicted) if apart is not None else {}
@@ -375,14 +378,14 @@ def _models(
     )
 
 
-def adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
+def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool) -> None:
     """One more bundle adjustment under a Cauchy loss, for COLMAP's least squares lets mismatches pull.
 
     It halves the error of the camera centres (0.20 to 0.11 mm rms over 12 simulated views).
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = not hold_lens
+    options.refine_focal_length = options.refine_extra_params = not fix_intrinsics
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = 0.5
     options.ceres.solver_options.num_threads = 1
@@ -396,7 +399,7 @@ def adjust_robustly(model: pycolmap.Reconstruction, hold_lens: bool) -> None:
 
 
 def _align_observations(
-    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], lens: Intrinsics
+    model: pycolmap.Reconstruction, images: Sequence[UInt8[ndarray, "h w 3"]], intrinsics: Intrinsics
 ) -> Float[ndarray, " k"] | None:
     """Least-squares matching of the model's observations, in the images that features were found in.
 
@@ -406,13 +409,13 @@ def _align_observations(
     size = camera.width, camera.height
     poses = poses_of(model, [image_id - 1 for image_id in image_ids])
     greys = np.stack([grey_of(images[image_id - 1], size) for image_id in image_ids])
-    aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(lens, *size))
+    aligned = align_tracks(greys, tracks_of(model, image_ids, size), poses, resized(intrinsics, *size))
     for (row, index, _), x_px in zip(_observations(model, image_ids), aligned.x_px, strict=True):
         model.image(image_ids[row]).point2D(index).xy = x_px + HALF_PIXEL
-    return None if aligned.std_px is None else lens.width / camera.width * aligned.std_px
+    return None if aligned.std_px is None else intrinsics.width / camera.width * aligned.std_px
 
 
-def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> NotTrustedError:
+def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstruction | None) -> RejectedError:
     """How many registered, the likely reason, what to do instead."""
     with closing(pycolmap.Database.open(database)) as db:
         features = int(np.median([db.num_keypoints_for_image(row + 1) for row in range(n_images)]))
@@ -425,7 +428,7 @@ def _not_registered(database: Path, n_images: int, model: pycolmap.Reconstructio
         reason = (
             "the matches agree on no common scene: a repeated pattern, things that moved, or wrong intrinsics"
         )
-    return NotTrustedError(
+    return RejectedError(
         f"structure from motion registered {model.num_reg_images() if model else 0} of {n_images} images ({reason})",
         "put textured objects or a newspaper on the table, let the views overlap more, or use a foundation-model back "
         "end or a marker",
@@ -461,30 +464,32 @@ def _observations(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> l
     ]
 
 
-def camera_of(lens: Intrinsics, known: bool) -> pycolmap.Camera:
+def camera_of(intrinsics: Intrinsics, known: bool) -> pycolmap.Camera:
     """COLMAP's one camera: the given intrinsics, or a focal length and two radial coefficients to refine."""
-    centre = [lens.cx + HALF_PIXEL, lens.cy + HALF_PIXEL]
+    centre = [intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL]
     if not known:
-        name, params = "RADIAL", [lens.fx, *centre, 0.0, 0.0]
-    elif lens.model == "fisheye":
-        name, params = "OPENCV_FISHEYE", [lens.fx, lens.fy, *centre, *lens.distortion]
-    elif any(lens.distortion):
-        eight = [*lens.distortion, 0.0, 0.0, 0.0][:8]
-        name, params = "FULL_OPENCV", [lens.fx, lens.fy, *centre, *eight]
+        name, params = "RADIAL", [intrinsics.fx, *centre, 0.0, 0.0]
+    elif intrinsics.model == "fisheye":
+        name, params = "OPENCV_FISHEYE", [intrinsics.fx, intrinsics.fy, *centre, *intrinsics.distortion]
+    elif any(intrinsics.distortion):
+        eight = [*intrinsics.distortion, 0.0, 0.0, 0.0][:8]
+        name, params = "FULL_OPENCV", [intrinsics.fx, intrinsics.fy, *centre, *eight]
     else:
-        name, params = "PINHOLE", [lens.fx, lens.fy, *centre]
-    camera = pycolmap.Camera(model=name, width=lens.width, height=lens.height, params=params, camera_id=1)
+        name, params = "PINHOLE", [intrinsics.fx, intrinsics.fy, *centre]
+    camera = pycolmap.Camera(
+        model=name, width=intrinsics.width, height=intrinsics.height, params=params, camera_id=1
+    )
     camera.has_prior_focal_length = known
     return camera
 
 
-def lens_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
+def intrinsics_of(camera: pycolmap.Camera, like: Intrinsics) -> Intrinsics:
     """Of a camera that `camera_of` made for unknown intrinsics; in images of the size of `like`."""
     focal, cx, cy, k1, k2 = (float(p) for p in camera.params)
     distortion = (k1, k2, 0.0, 0.0, 0.0)
     centre = cx - HALF_PIXEL, cy - HALF_PIXEL
-    lens = Intrinsics(focal, focal, *centre, camera.width, camera.height, distortion)
-    return resized(lens, like.width, like.height)
+    intrinsics = Intrinsics(focal, focal, *centre, camera.width, camera.height, distortion)
+    return resized(intrinsics, like.width, like.height)
 
 
 @contextmanager

@@ -78,7 +78,7 @@ class NextPose:
     """Row of the existing pose that it is nearest to."""
     moved_m: float
     """From there."""
-    turned_rad: float
+    rotation_rad: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class LeaveOneOut:
     """Error on images left out of the calibration: the number to believe."""
 
     translation_mm: float
@@ -434,7 +434,7 @@ class HandEye(Assessed):
     images: ImageResiduals
     residuals: PaperResiduals
     robot: RobotExamined
-    held_out: HeldOut | None = None
+    leave_one_out: LeaveOneOut | None = None
     scale_evidence: ScaleEvidence = ScaleEvidence()
     plan: Plan = Plan()
     in_use: InUse | None = None

@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from jcr.records.notebook import table
 
-LensModel = Literal["pinhole", "rational", "fisheye"]
-COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
+DistortionModel = Literal["pinhole", "rational", "fisheye"]
+COEFFICIENTS: dict[DistortionModel, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
@@ -42,7 +42,7 @@ class Intrinsics:
     height: int
     distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
     """As many coefficients as COEFFICIENTS has names for the model."""
-    model: LensModel = "pinhole"
+    model: DistortionModel = "pinhole"
 
     @property
     def matrix(self) -> Float[ndarray, "3 3"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 
 Severity = Literal["rejects", "warns", "informs"]
 Mend = Literal["reconstruction", "motion", "images", "intrinsics", "poses", "mount", "robot", "none"]
@@ -145,7 +145,7 @@ class Finding:
         return np.outer(shift, shift)
 
 
-def no_reconstruction(error: NotTrustedError) -> tuple[Finding, ...]:
+def no_reconstruction(error: RejectedError) -> tuple[Finding, ...]:
     """The failure of every back end as findings."""
     details = {"text": error.what, "remedy": "; ".join(error.remedies)}
     failed = Finding(kind=Kind.NO_RECONSTRUCTION, severity="rejects", mend="reconstruction", details=details)

@@ -96,7 +96,7 @@ def _next_pose(pose: NextPose, near: str, convention: str) -> dict[str, Any]:
         "matrix": json.dumps(pose.base_from_gripper.round(6).tolist()),
         "cells": (
             near,
-            f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.turned_rad):.0f}°",
+            f"{1e3 * pose.moved_m:.0f}\u00a0mm, {np.degrees(pose.rotation_rad):.0f}°",
             f"{significant(pose.within_95_mm)}\u00a0mm, {significant(pose.rotation_95_deg)}°",
             f"±{mm}\u00a0mm, ±{significant(float(deg))}°, ±{percent}\u00a0%",
         ),

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.calibration.words import missed
+from jcr.calibration.words import leave_one_out_text
 from jcr.geometry import step_between
 from jcr.records import HandEye
 from jcr.report.images import shown_names
@@ -75,7 +75,7 @@ def _bar(values: Sequence[float], longest: float, unit: str) -> tuple[float, flo
 
 def _whole(fits: Sequence[HandEye]) -> dict[str, list[str]]:
     return {
-        "error": [missed(fit.held_out) if fit.held_out else "–" for fit in fits],
+        "error": [leave_one_out_text(fit.leave_one_out) if fit.leave_one_out else "–" for fit in fits],
         "translation": [f"{significant(1e3 * fit.residuals.translation)} mm" for fit in fits],
         "rotation": [significant(fit.residuals.rotation) for fit in fits],
     }

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jcr.calibration.calibration_json import CalibrationFile
-from jcr.calibration.words import missed, pixels
+from jcr.calibration.words import leave_one_out_text, pixels
 from jcr.records import Kind, verdict_of
 from jcr.records.words import SHORT, reached_in_words, remedy, sentence, text
 from jcr.report.render import Section
@@ -65,7 +65,7 @@ def _leave_one_out(calibration: CalibrationFile) -> str:
     """How far the leave-one-out error supports the verdict."""
     if (held_out := calibration.held_out) is None:
         return "There were too few images to leave one out and see how well the others predict it."
-    error = missed(held_out)
+    error = leave_one_out_text(held_out)
     if not calibration.observability.observable:
         # An error along a direction that no motion shows changes no prediction.
         return f"Its leave-one-out error of {error} is no comfort: what is unobservable, no image can contradict."

@@ -230,10 +230,10 @@ def spheres_of_shape(
     while missing.any():
         of = np.flatnonzero(missing)
         candidates = draw.choice(of, min(CANDIDATES, len(of)), replace=False)
-        held = tree.query_ball_point(points[candidates], radius[candidates] - slack)
-        rows = np.repeat(np.arange(len(candidates)), [len(row) for row in held])
+        fixed = tree.query_ball_point(points[candidates], radius[candidates] - slack)
+        rows = np.repeat(np.arange(len(candidates)), [len(row) for row in fixed])
         holds = csr_array(
-            (np.ones(len(rows), np.float32), (rows, np.concatenate(held))), (len(held), len(points))
+            (np.ones(len(rows), np.float32), (rows, np.concatenate(fixed))), (len(fixed), len(points))
         )
         while True:
             gain = holds @ missing.astype(np.float32)
@@ -241,5 +241,5 @@ def spheres_of_shape(
             if gain[best] == 0:
                 break
             chosen.append(candidates[best])
-            missing[held[best]] = False
+            missing[fixed[best]] = False
     return apply(link_from_shape, points[chosen]), radius[chosen]

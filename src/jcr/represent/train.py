@@ -73,8 +73,8 @@ def train(
 
     # Shuffled once, so that batches are slices and nothing is gathered again.
     rays = rays[torch.randperm(len(rays.x), generator=generator, device=device)]
-    held_out, rays = rays[: len(rays.x) // 50], rays[len(rays.x) // 50 :]
-    test = draw(held_out)
+    leave_one_out, rays = rays[: len(rays.x) // 50], rays[len(rays.x) // 50 :]
+    test = draw(leave_one_out)
     best, falls, step = float("inf"), 0, 0
     while falls < FALLS and time.perf_counter() - start < max_seconds:
         first = step * BATCH % max(len(rays.x) - BATCH, 1)

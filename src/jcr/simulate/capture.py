@@ -133,7 +133,7 @@ def _check(out: Path, options: SimulateOptions) -> None:
         "--gear-errors": options.gear_errors,
         "--sag": options.sag,
     }
-    sigmas = (*options.robot_noise, options.noise, options.blur, options.lens_error, *bends.values())
+    sigmas = (*options.robot_noise, options.noise, options.blur, options.intrinsics_error, *bends.values())
     bent = next(
         (f"{option} {size:g}" for option, size in bends.items() if size and options.robot is None), ""
     )
@@ -150,8 +150,8 @@ def _check(out: Path, options: SimulateOptions) -> None:
             f"--depth {percent:g} {depth_mm:g}: give percent over -100, and a sigma of 0 mm or more",
         ),
         (
-            bool(options.lens_error) and options.unknown_intrinsics,
-            f"--lens-error {options.lens_error:g}: no intrinsics are given; leave one of both out",
+            bool(options.intrinsics_error) and options.unknown_intrinsics,
+            f"--intrinsics-error {options.intrinsics_error:g}: no intrinsics are given; leave one of both out",
         ),
         (
             not lossless and not 1 <= int(quality) <= 100,
@@ -159,7 +159,7 @@ def _check(out: Path, options: SimulateOptions) -> None:
         ),
         (
             min(sigmas) < 0,
-            f"--robot-noise, --noise, --blur, --lens-error, {', '.join(bends)}: sigmas; give 0 or more",
+            f"--robot-noise, --noise, --blur, --intrinsics-error, {', '.join(bends)}: sigmas; give 0 or more",
         ),
         (not in_cell, "--fixed-cameras 0 to 20, --wrist-cameras 1 or 2, --arms 1 or 2: give one of these"),
         (

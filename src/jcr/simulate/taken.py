@@ -28,7 +28,7 @@ def pinhole(rng: np.random.Generator) -> Intrinsics:
     return Intrinsics(focal_px, focal_px, (_WIDTH - 1) / 2, (_HEIGHT - 1) / 2, _WIDTH, _HEIGHT)
 
 
-def with_lens_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
+def with_intrinsics_error(camera: Intrinsics, percent: float, rng: np.random.Generator) -> Intrinsics:
     """Intrinsics that are off by Gaussian errors: fx and fy by one of `percent`, cx and cy each of that of the width."""
     focal, x, y = 0.01 * percent * rng.normal(size=3)
     return replace(
@@ -44,7 +44,9 @@ def stated_intrinsics(
     camera: Intrinsics, options: SimulateOptions, rng: np.random.Generator
 ) -> Intrinsics | None:
     """The intrinsics that capture.json gives: with the errors that the options ask for, or None where it gives none."""
-    return None if options.unknown_intrinsics else with_lens_error(camera, options.lens_error, rng)
+    return (
+        None if options.unknown_intrinsics else with_intrinsics_error(camera, options.intrinsics_error, rng)
+    )
 
 
 def with_robot_noise(

@@ -11,7 +11,7 @@ from jcr.calibration.stage import calibrate
 from jcr.camera import rays
 from jcr.capture.images import read_image
 from jcr.capture.read import read_capture
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, transform
 from jcr.reconstruct.direct.coarse_to_fine import after_step, axes_meet, free_directions
 from jcr.reconstruct.direct.direct import exposure_gains, pyramid, reconstruct_direct
@@ -46,10 +46,10 @@ def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     reconstruction = reconstruct_direct(capture)
     hand_eye = calibrate(capture, reconstruction)
     assert hand_eye.converged and hand_eye.inliers.all()
-    missed = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
-    assert np.linalg.norm(missed) < 3e-3
+    errors = hand_eye.gripper_from_camera[:3, 3] - truth.gripper_from_camera[:3, 3]
+    assert np.linalg.norm(errors) < 3e-3
     assert rotation_between_deg(hand_eye.gripper_from_camera[:3, :3], truth.gripper_from_camera[:3, :3]) < 0.3
-    assert (np.abs(missed) < 4 * np.sqrt(np.diag(hand_eye.covariance)[:3])).all()
+    assert (np.abs(errors) < 4 * np.sqrt(np.diag(hand_eye.covariance)[:3])).all()
     assert reconstruction.intrinsics.fx == pytest.approx(truth.intrinsics.fx, rel=0.01)
     # The tracks are points of the table and the objects, in the unit that the calibration found.
     x = hand_eye.scale * reconstruction.tracks.points_in_recon
@@ -57,7 +57,7 @@ def test_a_plain_table_calibrates_the_camera_from_nothing(plain):
     assert np.mean((height > -0.01) & (height < 0.25)) > 0.8
 
 
-def test_a_picture_of_another_pose_is_left_out_and_named(plain):
+def test_a_image_of_another_pose_is_left_out_and_named(plain):
     capture, truth = plain
     poses = capture.base_from_gripper.copy()
     poses[4] = poses[0]
@@ -68,14 +68,14 @@ def test_a_picture_of_another_pose_is_left_out_and_named(plain):
     assert np.linalg.norm(x[:3, 3] - truth.gripper_from_camera[:3, 3]) < 5e-3
 
 
-def test_pictures_of_other_poses_are_refused(plain):
+def test_images_of_other_poses_are_refused(plain):
     capture, truth = plain
     mixed = replace(
         capture,
         base_from_gripper=np.roll(capture.base_from_gripper, 2, axis=0),
         intrinsics=truth.intrinsics,
     )
-    with pytest.raises(NotTrustedError, match="direct alignment"):
+    with pytest.raises(RejectedError, match="direct alignment"):
         reconstruct_direct(mixed)
 
 
@@ -91,12 +91,12 @@ def test_images_of_different_exposure_are_evened(plain):
     assert left < 0.1 < 0.25 < np.abs(np.log(factor)).max()
 
 
-def test_pictures_of_nothing_are_refused(plain, tmp_path):
+def test_images_of_nothing_are_refused(plain, tmp_path):
     capture, _ = plain
     for name in capture.images:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.new("RGB", capture.image_size, (120, 110, 100)).save(tmp_path / name)
-    with pytest.raises(NotTrustedError, match="one colour"):
+    with pytest.raises(RejectedError, match="one colour"):
         reconstruct_direct(replace(capture, folder=tmp_path))
 
 

@@ -170,8 +170,8 @@ def test_rotary_positions_and_activations_equal_the_published_ones() -> None:
 
     units = {key: torch.from_numpy(value) for key, value in np.load(FIXTURES / "units.npz").items()}
     for x, position, out in zip(units["rope_in"], units["rope_pos"], units["rope_out"], strict=True):
-        turned = rotate(x[None], rotary_embedding(position, x.shape[-1], 100.0))
-        torch.testing.assert_close(turned[0], out, rtol=1e-5, atol=1e-6)
+        rotated = rotate(x[None], rotary_embedding(position, x.shape[-1], 100.0))
+        torch.testing.assert_close(rotated[0], out, rtol=1e-5, atol=1e-6)
     raw = torch.cat([units["depth_in"], units["conf_in"][..., None]], -1).permute(0, 3, 1, 2)
     view = pointmap(raw)
     torch.testing.assert_close(view.points, units["depth_out"], rtol=1e-5, atol=1e-6)

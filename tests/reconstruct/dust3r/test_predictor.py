@@ -62,7 +62,7 @@ def test_pair_graphs() -> None:
     assert len(window_pairs(5, 9)) == 20
 
 
-def test_each_pair_is_what_the_network_says_of_its_two_images(
+def test_each_pair_is_what_the_network_shows_of_its_two_images(
     loaded: "LoadedNetwork", images: PreparedImages, tmp_path: Path
 ) -> None:
     import torch
@@ -140,7 +140,7 @@ def test_pointmaps_too_large_for_the_budget_are_the_same_from_a_file(
         predicted(loaded, images, options(tmp_path / "3", memory_gb=0.5 * budget / 1e9))
 
 
-def test_out_of_memory_halves_the_batch_and_says_so(
+def test_out_of_memory_halves_the_batch_and_reports_it(
     loaded: "LoadedNetwork",
     images: PreparedImages,
     tmp_path: Path,
@@ -171,7 +171,7 @@ def test_out_of_memory_halves_the_batch_and_says_so(
     np.testing.assert_allclose(pairs.pts3d, undisturbed.pts3d, rtol=1e-4, atol=1e-5)
 
 
-def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_says_so(
+def test_a_gpu_too_small_for_one_pair_hands_over_to_the_cpu_and_reports_it(
     loaded: "LoadedNetwork",
     images: PreparedImages,
     tmp_path: Path,
@@ -305,17 +305,17 @@ def test_robot_poses_leave_out_exactly_the_pairs_without_a_common_view() -> None
 
 def test_all_pairs_are_kept_when_the_motions_do_not_tell_where_the_camera_looks() -> None:
     count = 6
-    turn = Rotation.from_euler("z", np.linspace(0, 60, count)[:, None], degrees=True)
+    rotation = Rotation.from_euler("z", np.linspace(0, 60, count)[:, None], degrees=True)
     down = Rotation.from_euler("x", 180, degrees=True)
     base_from_camera = transform(
-        (turn * down).as_matrix(), np.array([[0.3 * k, 0, 0.4] for k in range(count)])
+        (rotation * down).as_matrix(), np.array([[0.3 * k, 0, 0.4] for k in range(count)])
     )
     edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), base_from_camera)
     assert len(edges) == count * (count - 1) and "less than two axes" in note
     rng = np.random.default_rng(3)
     shuffled = transform(Rotation.random(count, rng=rng).as_matrix(), rng.normal(size=(count, 3)))
     base_from_camera[:, :3, :3] = (
-        Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3))) * turn * down
+        Rotation.from_rotvec(rng.normal(scale=0.2, size=(count, 3))) * rotation * down
     ).as_matrix()
     edges, note = overlapping_pairs(chain_over_a_table(base_from_camera, noise=0.0), shuffled)
     assert len(edges) == count * (count - 1) and "do not agree with the robot" in note

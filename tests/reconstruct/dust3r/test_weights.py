@@ -288,8 +288,8 @@ def test_jcr_predict_writes_pairs_from_a_checkpoint_and_a_bad_one_is_exit_2(
         pose[:3, :3] = Rotation.from_rotvec([0.3 * k, 0.2, 0.1 * k * k]).as_matrix()
         pose[0, 3] = 0.1 * k
         frames.append({"image": f"{k}.png", "base_from_gripper": pose.tolist()})
-    lens = {"fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "distortion": [0, 0, 0, 0, 0]}
-    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": lens}))
+    intrinsics = {"fx": 70.0, "fy": 70.0, "cx": 39.5, "cy": 29.5, "distortion": [0, 0, 0, 0, 0]}
+    (tmp_path / "capture.json").write_text(json.dumps({"frames": frames, "intrinsics": intrinsics}))
     weights = write_pth(tmp_path / "weights.pth", linear, LINEAR_MODEL)
     out = tmp_path / "pairs.npz"
     command = [

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.synthetic_pairs import PairErrors, PairTruth, synthetic_pairs
 from jcr.cli import dispatch
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply_similarity, fit_similarity, retract, rotation_between_deg
 from jcr.reconstruct.dust3r.pair_graph import complete_pairs, window_pairs
 from jcr.reconstruct.global_alignment.align import align
@@ -34,8 +34,8 @@ def errors(result: Alignment, truth: PairTruth) -> tuple[float, float]:
     true, found = truth.base_from_camera, result.recon_from_camera
     base_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
     centers = apply_similarity(base_from_recon, scale, found[:, :3, 3])
-    turn = rotation_between_deg(base_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
-    return 1e3 * float(np.linalg.norm(centers - true[:, :3, 3], axis=1).mean()), float(turn.mean())
+    rotation = rotation_between_deg(base_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
+    return 1e3 * float(np.linalg.norm(centers - true[:, :3, 3], axis=1).mean()), float(rotation.mean())
 
 
 @pytest.mark.parametrize("focal", ["shared", "own"])
@@ -170,7 +170,7 @@ def test_images_that_no_pair_reaches_are_named():
         align(replace(predictions, images=tuple("abcd")))
 
 
-def test_non_square_pixels_and_a_principal_point_off_the_middle_are_held():
+def test_non_square_pixels_and_a_principal_point_off_the_middle_are_fixed():
     given = Intrinsics(46.0, 41.0, 21.0, 19.5, *SMALL)
     predictions, truth = synthetic_pairs(complete_pairs(4), SMALL, intrinsics=given)
     result = align(predictions)
@@ -230,7 +230,7 @@ def test_predictions_that_are_noise_are_called_useless():
     predictions, _ = synthetic_pairs(complete_pairs(3), SMALL, PairErrors(noise_pairs=6))
     try:
         said = align(predictions).warnings
-    except NotTrustedError as refusal:
+    except RejectedError as refusal:
         said = (str(refusal),)
     assert any("nothing can be built on them" in note or "too little in common" in note for note in said)
 
@@ -276,7 +276,7 @@ def _set(key, index, value):
     ],
     ids=["missing", "nan", "edge out of range", "negative", "shape"],
 )
-def test_command_says_what_is_wrong_with_a_file(tmp_path, capsys, spoil, said):
+def test_command_shows_what_is_wrong_with_a_file(tmp_path, capsys, spoil, said):
     predictions, _ = synthetic_pairs(complete_pairs(2), SMALL)
     names = ("edges", "pts3d", "conf", "pts3d_in_other_view", "conf2")
     arrays = {name: getattr(predictions, name) for name in names} | {"images": np.array(["a", "b"])}
@@ -313,10 +313,10 @@ def test_yardstick(tmp_path):
         true, found = made["gt_poses"], file["poses"]
         world_from_recon, scale = fit_similarity(true[:, :3, 3], found[:, :3, 3])
         centers = apply_similarity(world_from_recon, scale, found[:, :3, 3])
-        turn = rotation_between_deg(world_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
+        rotation = rotation_between_deg(world_from_recon[:3, :3] @ found[:, :3, :3], true[:, :3, :3])
         # What the published aligner reaches with 10 images.
         assert 1e3 * np.linalg.norm(centers - true[:, :3, 3], axis=1).mean() < 0.84
-        assert turn.mean() < 0.091
+        assert rotation.mean() < 0.091
         np.testing.assert_allclose(file["focals"], made["gt_focal"], rtol=9e-4)
         assert np.median(np.abs(file["depth"] * scale / made["gt_depth"] - 1)) < 3e-3
 
@@ -329,5 +329,5 @@ def test_pairs_whose_errors_cannot_be_solved_for_are_rejected(monkeypatch: pytes
 
     monkeypatch.setattr(ImageEquations, "reduced", singular)
     predictions, _ = synthetic_pairs(complete_pairs(3), (32, 24))
-    with pytest.raises(NotTrustedError, match="too little in common"):
+    with pytest.raises(RejectedError, match="too little in common"):
         align(predictions)

@@ -48,9 +48,9 @@ class Case:
 
     def error(self, found: HandEye) -> np.ndarray:
         """True less found, in the order of the covariance."""
-        turn = self.gripper_from_camera[:3, :3] @ found.gripper_from_camera[:3, :3].T
+        rotation = self.gripper_from_camera[:3, :3] @ found.gripper_from_camera[:3, :3].T
         offset = self.gripper_from_camera[:3, 3] - found.gripper_from_camera[:3, 3]
-        return np.concatenate([offset, rotation_log(turn), [np.log(self.scale / found.scale)]])
+        return np.concatenate([offset, rotation_log(rotation), [np.log(self.scale / found.scale)]])
 
 
 def case(
@@ -129,7 +129,7 @@ def test_reported_sigmas_are_those_of_the_errors(noise: tuple[float, float]):
 
 
 @pytest.mark.slow
-def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_say():
+def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_show():
     # Errors that neighbouring pixels share look like signal to an adjustment of independent observations.
     refined, poses = [], []
     for seed in range(4):
@@ -144,7 +144,7 @@ def test_bundle_adjustment_of_pointmap_tracks_does_not_spoil_what_the_poses_say(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("factor", "off_percent"), [(1.0, 0.0), (1.05, 5.0), (1000.0, 99900.0)])
-def test_a_metric_network_is_held_against_the_robot(factor: float, off_percent: float):
+def test_a_metric_network_is_fixed_against_the_robot(factor: float, off_percent: float):
     made = case(6, 3, (1e-4, 2e-4))
     network = replace(
         made.predictions,

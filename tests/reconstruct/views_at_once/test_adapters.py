@@ -28,8 +28,8 @@ class Scene:
         middle = (width - 1) / 2, (height - 1) / 2
         self.pinhole = Intrinsics(0.9 * width, 0.9 * width, *middle, width, height)
         eyes = np.array([[0.2, 0.1, -0.7], [-0.2, 0.2, -0.6], [0.0, -0.3, -0.8]])
-        turns = Rotation.from_euler("xyz", [[8, 15, 20], [-14, -16, -40], [20, 2, 70]], degrees=True)
-        self.recon_from_camera = transform(turns.as_matrix(), eyes)
+        rotations = Rotation.from_euler("xyz", [[8, 15, 20], [-14, -16, -40], [20, 2, 70]], degrees=True)
+        self.recon_from_camera = transform(rotations.as_matrix(), eyes)
         v, u = np.mgrid[:height, :width]
         ramp = np.stack([(u + 0.5) / width, (v + 0.5) / height, np.zeros((height, width))], -1)
         # Dithered: eight bits alone are steps of four pixels.
@@ -39,13 +39,16 @@ class Scene:
     def seen(self, images: ndarray) -> tuple[ndarray, ndarray]:
         """K of images (n,h,w,3) in [0, 1] from their colours, pixel (0, 0) a centre, and depth along z (n,h,w)."""
         count, height, width = images.shape[:3]
-        lens = self.pinhole
+        intrinsics = self.pinhole
         matrices = np.tile(np.eye(3), (count, 1, 1))
         inner = slice(2, -2)
         for k, image in enumerate(images):
             v, u = np.mgrid[:height, :width]
             for axis, (pixel, size, focal, centre) in enumerate(
-                ((u, lens.width, lens.fx, lens.cx), (v, lens.height, lens.fy, lens.cy))
+                (
+                    (u, intrinsics.width, intrinsics.fx, intrinsics.cx),
+                    (v, intrinsics.height, intrinsics.fy, intrinsics.cy),
+                )
             ):
                 there = image[inner, inner, axis] * size - 0.5
                 slope, start = np.polyfit(pixel[inner, inner].ravel(), there.ravel(), 1)
@@ -76,7 +79,7 @@ def unnormalised(images: Any) -> ndarray:
     return images.double().numpy().transpose(0, 2, 3, 1) * IMAGENET_STD + IMAGENET_MEAN
 
 
-def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], Any]]:
+def networks(scene: Scene, given_to_network: dict[str, Any]) -> dict[str, Callable[[Any], Any]]:
     """By adapter, the prediction of a network that knows the truth; `told` collects what it was shown beside images."""
     import torch
     from torch import nn
@@ -93,9 +96,9 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
 
     class Da3(Network):
         def forward(self, images: Any, extrinsics: Any, intrinsics: Any) -> Any:
-            told.update(extrinsics=extrinsics, intrinsics=intrinsics)
+            given_to_network.update(extrinsics=extrinsics, intrinsics=intrinsics)
             matrices, depth = scene.seen(unnormalised(images[0]))
-            told["matrices"] = matrices
+            given_to_network["matrices"] = matrices
             poses = inverse(scene.recon_from_camera)
             poses[:, :3, 3] /= UNIT
             return {
@@ -109,7 +112,7 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
         def infer(self, views: list[dict[str, Any]], **options: Any) -> list[dict[str, Any]]:
             images = np.concatenate([unnormalised(view["img"]) for view in views])
             matrices, depth = scene.seen(images)
-            told.update(matrices=matrices, views=views)
+            given_to_network.update(matrices=matrices, views=views)
             points = points_of(matrices, depth)
             mask = torch.ones(1, *depth.shape[1:], 1)
             mask[0, 0, 0] = 0
@@ -128,7 +131,7 @@ def networks(scene: Scene, told: dict[str, Any]) -> dict[str, Callable[[Any], An
         calls = 0
 
         def infer(self, image: Any, fov_x: float | None, **options: Any) -> Any:
-            told["fov_x"] = fov_x
+            given_to_network["fov_x"] = fov_x
             one = image[None].double().numpy().transpose(0, 2, 3, 1)
             matrices, depth = scene.seen(np.repeat(one, COUNT, 0))
             k, self.calls = self.calls, self.calls + 1
@@ -172,32 +175,32 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
     if name == "moge":
         assert found.recon_from_camera is None
         return
-    turned = found.recon_from_camera[:, :3, :3] @ np.swapaxes(scene.recon_from_camera[:, :3, :3], 1, 2)
-    assert np.degrees(rotation_angle(turned)).max() < 1e-3
+    rotated = found.recon_from_camera[:, :3, :3] @ np.swapaxes(scene.recon_from_camera[:, :3, :3], 1, 2)
+    assert np.degrees(rotation_angle(rotated)).max() < 1e-3
     np.testing.assert_allclose(
         unit * found.recon_from_camera[:, :3, 3], scene.recon_from_camera[:, :3, 3], atol=1e-6
     )
 
 
 @pytest.mark.parametrize("name", ["da3", "mapanything", "moge"])
-def test_what_is_known_is_told_in_the_packages_conventions(name: str) -> None:
+def test_what_is_known_is_named_in_the_packages_conventions(name: str) -> None:
     from jcr.reconstruct.views_at_once.interface import Views
 
-    scene, told = Scene(640, 480), {}
-    networks(scene, told)[name](Views(scene.colors, scene.pinhole, scene.recon_from_camera))
+    scene, given_to_network = Scene(640, 480), {}
+    networks(scene, given_to_network)[name](Views(scene.colors, scene.pinhole, scene.recon_from_camera))
     if name == "moge":
-        assert told["fov_x"] == pytest.approx(np.degrees(2 * np.arctan(0.5 / 0.9)))
+        assert given_to_network["fov_x"] == pytest.approx(np.degrees(2 * np.arctan(0.5 / 0.9)))
         return
-    matrices = told["matrices"]
+    matrices = given_to_network["matrices"]
     if name == "mapanything":
-        given = np.concatenate([view["intrinsics"].numpy() for view in told["views"]])
+        given = np.concatenate([view["intrinsics"].numpy() for view in given_to_network["views"]])
         np.testing.assert_allclose(given, matrices, rtol=2e-3, atol=0.06)
-        for view, pose in zip(told["views"], scene.recon_from_camera, strict=True):
+        for view, pose in zip(given_to_network["views"], scene.recon_from_camera, strict=True):
             np.testing.assert_allclose(view["camera_poses"][0], pose, atol=1e-6)
         return
-    np.testing.assert_allclose(told["intrinsics"][0], edges(matrices), rtol=2e-3, atol=0.06)
+    np.testing.assert_allclose(given_to_network["intrinsics"][0], edges(matrices), rtol=2e-3, atol=0.06)
     # Depth Anything 3: from the first camera, in units of the median distance from it.
-    given = inverse(told["extrinsics"][0].double().numpy())
+    given = inverse(given_to_network["extrinsics"][0].double().numpy())
     np.testing.assert_allclose(given[0], np.eye(4), atol=1e-6)
     assert np.median(np.linalg.norm(given[:, :3, 3], axis=1)) == pytest.approx(1, abs=1e-5)
     between = inverse(scene.recon_from_camera[0]) @ scene.recon_from_camera
@@ -296,8 +299,8 @@ def test_moge_agrees_with_its_package() -> None:
     with torch.no_grad():  # a random mask is empty as soon as not
         [bias for name, bias in network.mask_head.named_parameters() if name.endswith("bias")][-1].fill_(3.0)
     images = np.random.default_rng(0).integers(0, 256, (2, 96, 128, 3), np.uint8)
-    lens = Intrinsics(110.0, 110.0, 63.5, 47.5, 128, 96)
-    found = moge.predict(network, Views(images, lens))
+    intrinsics = Intrinsics(110.0, 110.0, 63.5, 47.5, 128, 96)
+    found = moge.predict(network, Views(images, intrinsics))
     fov_deg = float(np.degrees(2 * np.arctan(64 / 110)))
     for k, image in enumerate(images):
         shown = torch.from_numpy(image).permute(2, 0, 1) / 255

@@ -25,7 +25,7 @@ from jcr.reconstruct.hub import Weights
 from jcr.records import Capture, Intrinsics, Reconstruction, Tracks
 
 pytestmark = pytest.mark.slow  # draws, and torch
-COUNT, LENS = 6, Intrinsics(420.0, 420.0, 199.5, 149.5, 400, 300)
+COUNT, INTRINSICS = 6, Intrinsics(420.0, 420.0, 199.5, 149.5, 400, 300)
 X = transform(
     Rotation.from_euler("xyz", [10, -20, 40], degrees=True).as_matrix(), np.array([0.03, -0.05, 0.08])
 )
@@ -62,8 +62,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pixel_from_plane = np.array([[1000.0, 0, 749.5], [0, 1000.0, 749.5], [0, 0, 1]])
     for k, pose in enumerate(base_from_camera()):
         camera_from_plane = inverse(pose)[:3][:, [0, 1, 3]]
-        image_from_print = LENS.matrix @ camera_from_plane @ np.linalg.inv(pixel_from_plane)
-        image = cv2.warpPerspective(print_, image_from_print, (LENS.width, LENS.height), flags=cv2.INTER_AREA)
+        image_from_print = INTRINSICS.matrix @ camera_from_plane @ np.linalg.inv(pixel_from_plane)
+        image = cv2.warpPerspective(
+            print_, image_from_print, (INTRINSICS.width, INTRINSICS.height), flags=cv2.INTER_AREA
+        )
         image = np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8)
         Image.fromarray(image).convert("RGB").save(place / f"{k}.png")
     return place
@@ -74,34 +76,34 @@ def capture(folder: Path) -> Capture:
     rng = np.random.default_rng(5)
     noise = rng.normal(0, 1, (COUNT, 6)) * ([2e-4] * 3 + [4e-4] * 3)
     gripper = retract(base_from_camera() @ inverse(X), noise)
-    return Capture(folder, tuple(f"{k}.png" for k in range(COUNT)), gripper, (400, 300), LENS)
+    return Capture(folder, tuple(f"{k}.png" for k in range(COUNT)), gripper, (400, 300), INTRINSICS)
 
 
 class Fake:
     """A model that knows the truth, but for errors; of a second pass, the cameras that it is shown."""
 
-    def __init__(self, turn_deg: float = 0.8, bend: float = 0.02, better_again: bool = True) -> None:
-        self.errors, self.better_again, self.shown = (turn_deg, bend), better_again, []
+    def __init__(self, rotation_deg: float = 0.8, bend: float = 0.02, better_again: bool = True) -> None:
+        self.errors, self.better_again, self.shown = (rotation_deg, bend), better_again, []
 
     def __call__(self, views):
         from jcr.reconstruct.views_at_once.da3 import grid_of
         from jcr.reconstruct.views_at_once.interface import Predicted
 
         self.shown.append(views.recon_from_camera)
-        turn_deg, bend = self.errors
+        rotation_deg, bend = self.errors
         if views.recon_from_camera is not None and self.better_again:
             bend = 0.0
         rng = np.random.default_rng(1)
         grid = grid_of(views.size)
-        lens = grid.grid_intrinsics(LENS)
-        poses, ray = base_from_camera(), rays(lens)
+        intrinsics = grid.grid_intrinsics(INTRINSICS)
+        poses, ray = base_from_camera(), rays(intrinsics)
         y, x = np.mgrid[-1 : 1 : 1j * grid.size[1], -1 : 1 : 1j * grid.size[0]]
         depth = np.stack([-pose[2, 3] / (ray @ pose[2, :3]) for pose in poses])
         depth *= np.stack([1 + bend * (a * x + b * y + c * x * y) for a, b, c in rng.normal(size=(COUNT, 3))])
-        step = rng.normal(size=(COUNT, 6)) * ([0.01] * 3 + [np.radians(turn_deg)] * 3)
+        step = rng.normal(size=(COUNT, 6)) * ([0.01] * 3 + [np.radians(rotation_deg)] * 3)
         recon = inverse(poses[0]) @ retract(poses, step)
         recon[:, :3, 3] *= 2
-        pinholes = np.tile([lens.fx, lens.fy, lens.cx, lens.cy], (COUNT, 1))
+        pinholes = np.tile([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy], (COUNT, 1))
         points = (2 * depth[..., None] * ray).astype(np.float32)
         return Predicted(grid, points, np.ones(depth.shape, np.float32), pinholes, recon, False)
 
@@ -121,7 +123,7 @@ def options(**changes):
     return replace(made, **changes)
 
 
-def test_matches_by_colour_put_predicted_cameras_right_and_say_how_surely(capture: Capture) -> None:
+def test_matches_by_colour_put_predicted_cameras_right_and_show_how_surely(capture: Capture) -> None:
     from jcr.calibration.stage import calibrate
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
@@ -133,8 +135,8 @@ def test_matches_by_colour_put_predicted_cameras_right_and_say_how_surely(captur
     assert scale == pytest.approx(0.5, rel=0.02), "the model's own unit stays"
     off = apply_similarity(base, scale, found.recon_from_camera[:, :3, 3]) - truth[:, :3, 3]
     assert np.linalg.norm(off, axis=1).max() < 5e-4, "10 mm as predicted"
-    turned = rotation_between_deg(base[:3, :3] @ found.recon_from_camera[:, :3, :3], truth[:, :3, :3])
-    assert np.max(turned) < 0.05, "0.8° as predicted"
+    rotated = rotation_between_deg(base[:3, :3] @ found.recon_from_camera[:, :3, :3], truth[:, :3, :3])
+    assert np.max(rotated) < 0.05, "0.8° as predicted"
     std = np.sqrt(np.diag(found.evidence.covariance)).reshape(-1, 6)
     assert (std[0] == 0).all()
     # The covariance is that in the frame of the first camera; so are these errors.
@@ -165,11 +167,11 @@ def test_an_unknown_focal_length_is_adjusted(capture: Capture) -> None:
     images = prepare_images(replace(capture, intrinsics=None), whole)
     from jcr.reconstruct.views_at_once.interface import Views
 
-    predicted = Fake(turn_deg=0.3, bend=0.0)(Views(images.colors, None))
-    guess = replace(LENS, fx=LENS.fx * 1.03, fy=LENS.fy * 1.03)
+    predicted = Fake(rotation_deg=0.3, bend=0.0)(Views(images.colors, None))
+    guess = replace(INTRINSICS, fx=INTRINSICS.fx * 1.03, fy=INTRINSICS.fy * 1.03)
     refined = refine(predicted, images, guess)
     assert refined is not None
-    assert refined.pinhole.fx == pytest.approx(LENS.fx, rel=0.01)
+    assert refined.pinhole.fx == pytest.approx(INTRINSICS.fx, rel=0.01)
 
 
 @pytest.mark.parametrize("better", [True, False])
@@ -196,11 +198,11 @@ def test_a_second_pass_is_shown_the_robots_cameras_and_stands_where_it_is_better
 def test_a_view_that_the_robot_contradicts_is_named(capture: Capture) -> None:
     from jcr.reconstruct.views_at_once.views_at_once import reconstruct_views_at_once
 
-    turned, shifted = capture.base_from_gripper.copy(), capture.base_from_gripper.copy()
-    turned[2] = retract(turned[2], np.array([0, 0, 0, 0.25, 0.15, 0.25]))
+    rotated, shifted = capture.base_from_gripper.copy(), capture.base_from_gripper.copy()
+    rotated[2] = retract(rotated[2], np.array([0, 0, 0, 0.25, 0.15, 0.25]))
     shifted[3, :3, 3] += [0.0, 0.05, 0.03]  # which no angle shows
     for gripper, said in (
-        (turned, "2.png: its angles to the other views"),
+        (rotated, "2.png: its angles to the other views"),
         (shifted, "3.png: its matches lie"),
     ):
         found = reconstruct_views_at_once(
@@ -225,15 +227,17 @@ def test_single_views_take_their_cameras_and_fit_their_depth(capture: Capture) -
     rng = np.random.default_rng(0)
     on_plane = np.column_stack([rng.uniform(-0.2, 0.2, (400, 2)), np.zeros(400)])
     in_recon = apply(inverse(base_from_camera()[0]), on_plane)
-    seen = [project(LENS, apply(inverse(pose), in_recon)) for pose in truth]
-    inside = np.array([((px > 1) & (px < [LENS.width - 2, LENS.height - 2])).all(1) for px in seen])
+    seen = [project(INTRINSICS, apply(inverse(pose), in_recon)) for pose in truth]
+    inside = np.array(
+        [((px > 1) & (px < [INTRINSICS.width - 2, INTRINSICS.height - 2])).all(1) for px in seen]
+    )
     image, point = np.nonzero(inside)
     recon_from_camera = truth.copy()
     recon_from_camera[:, :3, 3] *= unit
     sparse = Reconstruction(
         image_index=np.arange(COUNT),
         recon_from_camera=recon_from_camera,
-        intrinsics=LENS,
+        intrinsics=INTRINSICS,
         tracks=Tracks(image, np.array(seen)[image, point], point, unit * in_recon),
         backend="colmap",
     )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.robots import Adjusted
 from jcr.adjust.score_test import freed_intrinsics
 from jcr.calibration.adjust import adjust_case, estimate_of, refined_by
@@ -49,7 +49,7 @@ def intrinsics_contradiction(case: Case) -> Checked:
     if case.hand_eye.converged and (refined := judged(refined_by(case, freed))).converged:
         return Checked((contradicted,), refined, freed)
     with_found, as_given = (
-        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(given, HELD)))
+        estimate_of(one, case.tracks) for one in (freed, adjust_case(case, prior=prior_of(given, FIXED)))
     )
     # Camera poses may have been found with other intrinsics than those given: the farther of the two answers counts.
     shift = max(

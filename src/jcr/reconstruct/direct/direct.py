@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from jcr.camera import pinhole_inside, project, undistort_image, unproject, usable_lens, zoomed
+from jcr.camera import pinhole_inside, project, undistort_image, unproject, usable_intrinsics, zoomed
 from jcr.capture.images import read_image
-from jcr.errors import InputError, NotTrustedError
+from jcr.errors import InputError, RejectedError
 from jcr.geometry import apply, inverse, step_axes
 from jcr.memory import plan
 from jcr.progress import Progress, silent
@@ -80,7 +80,7 @@ def reconstruct_direct(
     report = progress or silent
     plan(len(capture), capture.image_size, memory_gb)
     images = [read_image(capture.folder / name) for name in capture.images]
-    given, warnings = usable_lens(capture.intrinsics)
+    given, warnings = usable_intrinsics(capture.intrinsics)
     notes: tuple[str, ...] = ()
     intrinsics = given or _guessed_intrinsics(capture.image_size)
     levels = pyramid(images, intrinsics)
@@ -102,7 +102,7 @@ def reconstruct_direct(
     cameras, points = align_photometrically(level, cameras, FINEST, free_directions(cameras, known))
     report("direct alignment", 1.0)
     if (agreed := points.agreed.sum() / max(len(points.agreed), LEAST_POINTS)) < LEAST_AGREED:
-        raise NotTrustedError(
+        raise RejectedError(
             f"direct alignment: the views agree on {100 * agreed:.0f} % of the pixels at edges, too few",
             "take images that overlap more, of a scene that does not move or shine",
         )
@@ -155,7 +155,7 @@ def images_that_fit(
         if fits.all():
             return rows, cameras
         if fits.sum() < 3:
-            raise NotTrustedError("direct alignment: fewer than three images fit together", "take more")
+            raise RejectedError("direct alignment: fewer than three images fit together", "take more")
         rows, level = rows[fits], level.rows(np.flatnonzero(fits))
         cameras = Cameras(cameras.base_from_camera[fits], cameras.zoom)
 

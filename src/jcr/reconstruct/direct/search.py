@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import inverse, rotation_between_deg, rotation_exp, transform
 from jcr.progress import Progress
 from jcr.reconstruct.direct.coarse_to_fine import (
@@ -45,7 +45,7 @@ def search(
 ) -> Found:
     """The hand-eye transform under which colours agree best; NotTrustedError where a different one is as good."""
     if not len(strongest(levels[COARSEST.height], COARSEST.per_image)[0]):
-        raise NotTrustedError(
+        raise RejectedError(
             "direct alignment: the images show one colour and no edges", "put different objects in view"
         )
     directions = tied_directions(intrinsics_known)
@@ -67,7 +67,7 @@ def search(
         fine.append(with_cost(levels[JUDGE.height], cameras, JUDGE))
     best, *rivals = different(fine)
     if rivals and best.cost > CLEARLY_BETTER * rivals[0].cost:
-        raise NotTrustedError(
+        raise RejectedError(
             f"direct alignment: cameras at different places explain the images alike (cost {best.cost:.3f} and "
             f"{rivals[0].cost:.3f})",
             "take more images, from more sides, of more and different objects",

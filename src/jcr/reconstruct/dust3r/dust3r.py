@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.memory import give_back, resident
 from jcr.progress import Progress
 from jcr.reconstruct.dust3r.pair_graph import PairOptions
@@ -76,5 +76,5 @@ def reconstruct_dust3r(
             notes=notes,
             progress=progress,
         )
-    except NotTrustedError as error:  # what was used, and its licence, are worth knowing all the same
+    except RejectedError as error:  # what was used, and its licence, are worth knowing all the same
         raise error.with_more(*notes) from None

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.extras import extra
 from jcr.geometry import inverse, skew
 from jcr.progress import Progress
@@ -93,7 +93,7 @@ def _kinematic_if_better(
         return None, f"cameras aligned freely: {count} images are too few to tie them to the robot", ()
     try:
         kinematic, cameras = solve_kinematic(problem, free, base_from_gripper)
-    except (NotTrustedError, np.linalg.LinAlgError):
+    except (RejectedError, np.linalg.LinAlgError):
         return None, "cameras aligned freely: tied to the robot's poses they are undetermined", ()
     contradicted = contradictions(cameras, problem.predictions)
     if contradicted:

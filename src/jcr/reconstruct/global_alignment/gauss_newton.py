@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import csr_array
 
-from jcr.errors import NotTrustedError
+from jcr.errors import RejectedError
 from jcr.geometry import adjoint, inverse, retract, twist_from_step
 from jcr.least_squares import one_blas_thread
 from jcr.progress import Progress
@@ -239,7 +239,7 @@ def _linearised(
         try:
             reduced = equations.reduced(ties)
         except np.linalg.LinAlgError:
-            raise NotTrustedError(UNDETERMINED) from None
+            raise RejectedError(UNDETERMINED) from None
         found.append(_Linearised(equations, ties, reduced, _selection(o, layout, to_twist)))
     return noise, found
 
@@ -258,7 +258,7 @@ def _step(linearised: list[_Linearised], layout: Layout, cameras: Cameras) -> Fl
     except np.linalg.LinAlgError:
         step = np.full(layout.size, np.nan)
     if not np.isfinite(step).all():
-        raise NotTrustedError(UNDETERMINED)
+        raise RejectedError(UNDETERMINED)
     return step
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from jcr.adjust.images import ImageEvidence, adjust_images
-from jcr.adjust.intrinsics_prior import ESTIMATED, HELD, prior_of
+from jcr.adjust.intrinsics_prior import ESTIMATED, FIXED, prior_of
 from jcr.adjust.scene import Freedom, Observations, Scene
 from jcr.camera import unproject
 from jcr.geometry import inverse
@@ -152,7 +152,7 @@ def adjust_matches(tracks: Tracks, geometry: Geometry, fixed: bool) -> _Adjusted
     """Cameras and points adjusted, and the focal length unless it is fixed; matches far from their points left out, and
     points that fewer than two views are left to see."""
     images, camera = len(geometry.recon_from_camera), geometry.pinhole
-    prior = prior_of(camera, HELD if fixed else {"f": ESTIMATED["f"]})
+    prior = prior_of(camera, FIXED if fixed else {"f": ESTIMATED["f"]})
     shown = adjust_images(
         Scene(
             world_from_rig=geometry.recon_from_camera,

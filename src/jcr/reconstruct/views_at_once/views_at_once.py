@@ -111,11 +111,11 @@ class _Candidate:
     @property
     def leave_one_out_m(self) -> float:
         """The leave-one-out error as one length; infinite where there are too few to leave one out."""
-        error = self.hand_eye.held_out
+        error = self.hand_eye.leave_one_out
         return float("inf") if error is None else error.length_m
 
     def error_in_words(self) -> str:
-        error = self.hand_eye.held_out
+        error = self.hand_eye.leave_one_out
         if error is None:
             return self.name
         return f"{self.name} {error.translation_mm:.2g} mm, {error.rotation_deg:.2g}°"
