@@ -34,7 +34,7 @@ def run(long: bool = False) -> str:
     lines = [
         f"> {count} small captures take {seconds[1]:.0f} s by one process and {seconds[2]:.0f} s by two.",
         "",
-        f"{count} captures of {IMAGES} images of {INTRINSICS.width}x{INTRINSICS.height} with pointmaps given (`--backend "
+        f"{count} captures of {IMAGES} images of {INTRINSICS.width}x{INTRINSICS.height}, pointmaps given (`--backend "
         "predictions --calibrate-only`); memory is the resident set of the command and of its workers together",
         "",
         "| processes | s | times one process | MiB after a quarter | half | three quarters | all |",

@@ -220,7 +220,7 @@ def _sheet(verdicts: Sequence[Verdict]) -> bytes:
     kinds = list(dict.fromkeys(v.trial.what for v in verdicts))
     across = max(sum(v.trial.what == kind for v in verdicts) for kind in kinds)
     figure = blank(2.3 * across, 2.1 * len(kinds))
-    figure.set_layout_engine("constrained", h_pad=0.07)  # inches: a caption stays with the picture above it
+    figure.set_layout_engine("constrained", h_pad=0.07)  # inches: a caption stays with the image above it
     axes = figure.subplots(len(kinds), across, squeeze=False)
     for row, kind in zip(axes, kinds, strict=True):
         chosen = [v for v in verdicts if v.trial.what == kind]

@@ -28,7 +28,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     from beartype import beartype
 
     name = function.__module__, function.__qualname__
-    if "<locals>" in function.__qualname__:  # defined anew in each call of what is around it
+    if "<locals>" in function.__qualname__:  # defined again in each call of what is around it
         _checks[name] += 1
         if _checks[name] > CALLS:
             return function

@@ -265,7 +265,7 @@ def test_learned_features_are_asked_where_those_of_sift_fail(
     kept, tried = auto_result(problem, {"sift": RejectedError("0 of 8"), "xfeat": good}, monkeypatch)
     assert tried == ["colmap", "colmap"]
     assert "colmap with sift failed (0 of 8); colmap with xfeat (leave-one-out" in kept.notes[0]
-    # Two that fail, and a third that does not: all three are told.
+    # Two that fail, and a third that does not: all three are named.
     refused = RejectedError("1 of 8")
     kept, tried = auto_result(problem, {"sift": refused, "xfeat": shuffled, "direct": good}, monkeypatch)
     assert tried == ["colmap", "colmap", "direct"] and kept.backend == "direct"
@@ -387,7 +387,7 @@ def test_input_that_calibration_cannot_use_is_no_reason_for_another_back_end(
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "auto", RunOptions(calibrate=lost))
     assert made == ["colmap"]
-    # Where there is no choice, the reconstruction is kept before it is calibrated: mended options find it there.
+    # Where there is no choice, the reconstruction is kept before it is calibrated: corrected options find it there.
     with pytest.raises(InputError, match="nowhere.png"):
         calibrate(capture, tmp_path / "colmap", RunOptions(calibrate=lost), backend="colmap")
     kept = RunFolder(tmp_path / "colmap").reconstruction()
@@ -506,7 +506,7 @@ def test_a_network_that_gives_garbage_is_left_for_colmap_and_the_run_folder_repo
     why = next(text for text in found["notes"] if text.startswith("back end dust3r"))
     assert "colmap" in why and ("rejected" in why or "failed" in why)
     assert why in (out / "log.txt").read_text()
-    # Its own answer, asked for by name, is not trusted.
+    # Its own answer, asked for by name, is rejected.
     assert dispatch(["calibrate", *arguments, "--backend", "dust3r"]) == 3
     found = json.loads((out / "calibration.json").read_text())
     assert found["backend"] == "dust3r" and not found["converged"]

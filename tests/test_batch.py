@@ -117,7 +117,9 @@ def test_a_bug_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert not (tmp_path / "out" / STATE).exists()
 
 
-def test_without_ray_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]):
+def test_without_ray_the_remedy_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, captures: list[Path]
+):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(module.InputError, match=r"jcr-handeye\[cluster\]"):
         batch(captures[:1], tmp_path / "out", RunOptions(), replace(COMPLETE, ray="auto"))

@@ -1,4 +1,4 @@
-"""Whether a calibration is still valid: false alarms at their rate, bumps found, a moved table told from them."""
+"""Whether a calibration is still valid: false alarms at their rate, bumps found, a moved table is distinguished."""
 
 import json
 import shutil

@@ -18,7 +18,7 @@ from jcr.records import Capture, HandEye, Intrinsics, Reconstruction
 def pictured(
     seed: int, images: int, intrinsics: Intrinsics | None, **motion
 ) -> tuple[HandEyeProblem, Capture, Reconstruction]:
-    """Images that LENS made, of which it is told that `lens` did; None: told nothing."""
+    """Images of a camera with INTRINSICS, calibrated with `intrinsics` as given; None: none are given."""
     rng = np.random.default_rng([seed, images])
     problem = hand_eye_problem(
         rng, images, robot_noise=(5e-4, np.radians(0.1)), camera_noise=(1e-3, np.radians(0.1)), **motion
@@ -83,7 +83,7 @@ def test_a_wrong_focal_length_is_named_with_the_right_one(factor: float, images:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_a_wrong_focal_length_does_is_in_the_covariance(seed: int) -> None:
-    # Told that the robot is good, the fit alone would be sure of a wrong answer.
+    # Given a good robot, the fit alone would be sure of a wrong answer.
     problem, hand_eye = calibrated(seed, 10, scaled(1.03), CalibrateOptions(robot_noise=(0.5, 0.1)))
     off = error(problem, hand_eye.gripper_from_camera, hand_eye.scale)
     std = np.sqrt(np.diag(hand_eye.covariance))

@@ -100,7 +100,7 @@ def test_exif_rotation_is_honoured(capture: Path):
         file = capture / "images" / f"{k:02d}.jpg"
         upright = read_image(file)
         exif = Image.Exif()
-        exif[0x0112] = 6  # the camera was turned: rotate by 90° clockwise to show
+        exif[0x0112] = 6  # the camera was rotated: rotate by 90° clockwise to show
         Image.fromarray(np.rot90(upright)).save(file.with_suffix(".png"), exif=exif)
         assert (read_image(file.with_suffix(".png")) == upright).all()
         file.unlink()
@@ -244,7 +244,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_is_one_line_with_place_and_cure(capture: Path, fault: str):
+def test_each_fault_is_one_line_with_place_and_remedy(capture: Path, fault: str):
     plant, words = FAULTS[fault]
     plant(capture)
     with pytest.raises(jcr.InputError, match=words) as error:

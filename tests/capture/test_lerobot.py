@@ -40,7 +40,7 @@ def walked(states: np.ndarray) -> np.ndarray:
 
 
 def pictured(tabletop: Path, count: int, first: int = 0) -> list[np.ndarray]:
-    """The bundled images, small, each as often as its view lasts; row and view are told by grey bars."""
+    """The bundled images, small, each as often as its view lasts; row and view are encoded in grey bars."""
     capture = jcr.read_capture(tabletop)
     images = []
     for k in range(count):

@@ -147,14 +147,14 @@ def test_every_controller_is_read_as_it_writes(convention: str, problem: HandEye
 
 def test_known_poses_of_controllers():
     """Values from the controllers' manuals, not from our own writer."""
-    # UR: p[0.1, 0.2, 0.3, 0, 3.1416, 0] turns by half a turn about y.
+    # UR: p[0.1, 0.2, 0.3, 0, 3.1416, 0] rotates by 180° about y.
     ur = poses_from_numbers(np.array([[0.1, 0.2, 0.3, 0, np.pi, 0]]), "ur", "auto", "")
     assert np.allclose(ur[0, :3, :3], np.diag([-1, 1, -1]), atol=1e-9)
     # KUKA: A=90 about z, then B=90 about the new y: the tool's x axis ends up pointing down.
     kuka = poses_from_numbers(np.array([[500, 0, 300, 90, 90, 0.0]]), "kuka", "auto", "")
     assert np.allclose(kuka[0, :3, 0], [0, 0, -1], atol=1e-9)
     assert np.allclose(kuka[0, :3, 3], [0.5, 0, 0.3])
-    # ABB: [[600,0,400],[0,1,0,0]] is w, x, y, z: half a turn about x.
+    # ABB: [[600,0,400],[0,1,0,0]] is w, x, y, z: 180° about x.
     abb = poses_from_numbers(np.array([[600, 0, 400, 0, 1, 0, 0.0]]), "abb", "auto", "")
     assert np.allclose(abb[0, :3, :3], np.diag([1, -1, -1]), atol=1e-9)
     # Franka: the translation is the last four of sixteen.

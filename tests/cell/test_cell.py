@@ -427,7 +427,7 @@ def test_a_fixed_camera_that_watches_the_gripper_is_placed_beside_a_wrist_camera
 
 @pytest.mark.parametrize("rotated", [False, True])
 def test_learned_features_refine_a_place_and_never_make_another(monkeypatch, rotated: bool):
-    """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board turned by 180°."""
+    """Of an image 40 points by SIFT are shared; a network finds 60 more, or the board rotated by 180°."""
     rng = np.random.default_rng(3)
     intrinsics = Intrinsics(600.0, 600.0, 319.5, 239.5, 640, 480)
     ahead = rng.uniform([-0.2, -0.15, 0.7], [0.2, 0.15, 0.9], (100, 3))

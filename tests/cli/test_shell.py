@@ -116,7 +116,7 @@ def test_what_is_completed_is_what_the_help_lists(name: str, capsys: pytest.Capt
     listed = set(re.findall(r"^  (--[a-z][a-z0-9-]*)", printed, re.MULTILINE))
     offered = {argument.flag for group in groups(_arguments(name), "jcr") for argument in group.arguments}
     assert listed == offered - {""}
-    # Arguments are told by their own names, and None is no word of a command line.
+    # Arguments have their own names, and None is no word of a command line.
     assert "{None" not in printed and " PATH PATH" not in printed.splitlines()[0]
 
 

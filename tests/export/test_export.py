@@ -208,7 +208,7 @@ def test_camera_info_is_what_image_proc_reads():
         matrix("projection_matrix"), np.column_stack([intrinsics.matrix, np.zeros(3)])
     )
     np.testing.assert_array_equal(matrix("rectification_matrix"), np.eye(3))
-    # OpenCV, whose order of coefficients plumb_bob takes, projects where our lens does.
+    # OpenCV, whose order of coefficients plumb_bob takes, projects where our camera model does.
     x = np.array([[0.2, -0.15, 1.0]])
     seen, _ = cv2.projectPoints(
         x, np.zeros(3), np.zeros(3), matrix("camera_matrix"), matrix("distortion_coefficients")

@@ -297,14 +297,14 @@ FAULTS: dict[str, tuple[Plant, int, str]] = {
         2,
         r"[45]\.\d ± \d\.\d % too long for a ur5e",
     ),
-    # The pictures.
+    # The images.
     "zero-byte image": (image(lambda p: p.write_bytes(b"")), 2, "not a readable image"),
     "truncated image": (image(cut), 2, "not a readable image"),
     "text file named .png": (image(lambda p: p.write_text("hello")), 2, "not a readable image"),
     "16-bit image": (
         image(lambda p: Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96)).save(p)),
         3,
-        "registered 0 of 6",  # read as it should be: the other pictures are noise
+        "registered 0 of 6",  # read as it should be: the other images are noise
     ),
     "CMYK image": (
         by_colmap(image(lambda p: Image.new("CMYK", SIZE, (9, 99, 9, 0)).save(p, format="TIFF"))),

@@ -111,7 +111,7 @@ def test_half_rotates_alone_are_solved(seed):
     camera = inverse(z) @ gripper @ x
     gripper = retract(gripper, 1e-6 * rng.normal(size=(3, 6)))
     found, _, base = closed_form(gripper, camera)
-    # A half turn tells an axis but not which way it points: an answer must explain the rotations, and may be another.
+    # A rotation by 180° has an axis without a sign: an answer must explain the rotations, and may be another.
     assert np.abs((gripper @ found - base @ camera)[:, :3, :3]).max() < 5e-6
 
 
@@ -121,7 +121,7 @@ def test_problems_of_a_batch_are_solved_as_one_by_one(seed, count, shape):
     rng = np.random.default_rng(seed)
     stacks = [noisy(int(rng.integers(2**32)), count)[:2] for _ in range(int(np.prod(shape)))]
     gripper, camera = (np.stack(of).reshape(*shape, count, 4, 4) for of in zip(*stacks, strict=True))
-    # One of them with a half turn, and another way to be solved.
+    # One of them with 180°, and another way to be solved.
     gripper[(0,) * len(shape)][0] = gripper[(0,) * len(shape)][1] @ any_rigid(rng, np.pi)
     x, scale, z = closed_form(gripper, camera)
     assert np.shape(scale) == tuple(shape)

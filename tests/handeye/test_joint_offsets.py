@@ -32,7 +32,7 @@ def test_offsets_are_right_within_their_sigma_and_a_bent_arm_is_distinguished_fr
         printed.append(found.std / found.prior_std)
         assert p < 1e-3
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
-    # The first and the last joint turn base and gripper, which nothing shows.
+    # The first and the last joint rotate base and gripper, which nothing shows.
     assert (np.median(printed, axis=0)[[0, 5]] > 0.95).all() and (np.median(printed, axis=0)[1:5] < 0.7).all()
     assert sum(examined("white", seed)[2] < 0.05 for seed in range(12)) <= 2
 

@@ -119,7 +119,7 @@ MUJOCO_FORMS = {
         ((-0.11257, -0.028, 0), (0.707107, 0, 0, 0.707107), Z),
         ((-0.1349, 0.0052, 0), (0.707107, 0, 0, -0.707107), Z),
         ((0, -0.0611, 0.0181), (0.0172091, -0.0172091, 0.706897, 0.706897), Z),
-        # The site's quaternion has another roll than gripper_frame_link of the URDF: half a turn about y there.
+        # The site's quaternion has another roll than gripper_frame_link of the URDF: 180° about y there.
         ((-0.0079, -0.000218121, -0.0981274), (0, 0, 1, 0), None),
     ],
     "ur10e": [

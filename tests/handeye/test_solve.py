@@ -32,7 +32,7 @@ def test_exact_poses_give_the_exact_answer(count, pattern):
 def test_half_rotates_do_not_flip_the_answer():
     rng = np.random.default_rng(3)
     problem = hand_eye_problem(rng, 8)
-    # Every second view is half a turn (to 1e-9) about a skew axis from its neighbour.
+    # Every second view is rotated by 180° (to 1e-9) about a skew axis from its neighbour.
     rotations = np.pi * rng.normal(size=(8, 3))
     rotations *= (np.pi - 1e-9) / np.linalg.norm(rotations, axis=1, keepdims=True)
     gripper = problem.base_from_gripper.copy()

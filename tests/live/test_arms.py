@@ -63,7 +63,7 @@ def test_an_arm_gives_pose_and_joints_through_its_makers_package():
     needs("xarm")
     with fake_xarm("127.0.0.7", POSE, JOINTS):
         pose, joints, refused = named_by(ASK, "xarm", "127.0.0.7", "127.0.0.8")
-    # An xArm tells float32, of which its package keeps six digits.
+    # An xArm tells float32, and its package keeps six digits.
     assert np.allclose(pose, POSE, atol=1e-6) and np.allclose(joints, JOINTS, atol=1e-6)
     assert "xarm:127.0.0.8" in refused and "check the address" in refused
 

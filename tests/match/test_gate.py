@@ -134,7 +134,7 @@ def test_rotated_upright_no_image_is_rotated_against_another():
     about_axis = rotation_exp(np.outer(rotation, [0.0, 0.0, 1.0]))
     upright = rolls(base_from_first @ about_axis)
     back = rotation_exp(np.outer(upright, [0.0, 0.0, 1.0]))
-    # What image 0, turned, sees at an angle, every other one, turned, sees at the same.
+    # What image 0, rotated, sees at an angle, every other one, rotated, sees at the same.
     relative = back[0] @ about_axis[0].T @ about_axis @ np.swapaxes(back, 1, 2)
     assert np.degrees(np.asarray(rotation_angle(relative)).max()) < 1e-6
 

@@ -117,7 +117,7 @@ def test_same_pixels_same_result(capture: Capture, four: Reconstruction, tmp_pat
     names = []
     for name in rotated.images:
         exif = Image.Exif()
-        exif[0x0112] = 6  # to be turned a quarter clockwise for viewing
+        exif[0x0112] = 6  # to be rotated by 90° clockwise for viewing
         names.append(f"{Path(name).stem}.png")
         with Image.open(capture.folder / name) as upright:
             on_its_side = upright.convert("RGB").transpose(Image.Transpose.ROTATE_90)

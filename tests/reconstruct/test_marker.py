@@ -210,7 +210,7 @@ def test_the_metre_of_a_board_is_kept_on_disk_and_its_pointmaps_are_in_metres(tm
         ("qr:0.05", "chessboard:9x6:0.025"),
     ],
 )
-def test_a_board_that_is_none_is_refused_with_the_cure(spec, message):
+def test_a_board_that_is_none_is_refused_with_the_remedy(spec, message):
     with pytest.raises(InputError, match=message):
         boards(spec)
 

@@ -151,7 +151,7 @@ def test_pointmaps_in_one_frame_keep_their_poses(
     result = reconstructed(capture, pointmap_arrays(truth))
     assert_poses(result, truth["gt_poses"], millimetres=1e-3, degrees=1e-4)
     assert_tracks(result, median_px=0.3)
-    # Unknown, the lens comes out of the points.
+    # Unknown, the camera model comes out of the points.
     assert result.intrinsics.fx == pytest.approx(5 * truth["gt_focal"], rel=1e-4)
     assert result.intrinsics.cx == pytest.approx(2.5 * WIDTH + 2, abs=0.05)
 

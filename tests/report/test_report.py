@@ -504,7 +504,7 @@ def test_uncertainty_of_every_notation_is_what_small_errors_make(angle: float):
         if part.name == "Quaternion":
             sides *= np.sign(sides @ part.value)[..., None]
         if part.name == "Rotation vector" and angle > 3.1:
-            # Beyond a half turn the shorter vector of the same rotation points the other way.
+            # Beyond 180° the shorter vector of the same rotation points the other way.
             length = np.linalg.norm(sides, axis=-1, keepdims=True)
             sides = np.where(sides @ part.value[:, None] > 0, sides, sides * (1 - 2 * np.pi / length))
         slopes = (sides[:, 0] - sides[:, 1]) / 2
@@ -616,7 +616,7 @@ def test_in_a_browser(chromium: Chromium, file: Path):
     assert len(drawn) > 0.05 * image.shape[0] * image.shape[1]
     assert len(np.unique(drawn, axis=0)) > 200
 
-    # Turned by the mouse, it shows something else; every layer and switch changes it too.
+    # Rotated by the mouse, it shows something else; every layer and switch changes it too.
     before = chromium.image("#scene")
     x, y = chromium.center("#scene")
     mouse = {"button": "left", "buttons": 1, "clickCount": 1}

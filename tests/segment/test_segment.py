@@ -217,7 +217,7 @@ def test_labels_that_came_with_the_images_are_kept_and_measured(rng: np.random.G
 
 
 def test_the_height_of_a_can_is_its_rims_and_not_its_sunk_lids(rng: np.random.Generator):
-    """A lid 3 mm below a rim of 6 mm, of which depth makes a slope; a tilted lid without one is no can."""
+    """A lid 3 mm below a rim of 6 mm that depth makes a slope; a tilted lid without one is no can."""
     flat = box(rng, (0.07, 0.07, 0.1))
     lid = flat[:, 2] > 0.0999
     inward = np.abs(flat[:, :2]).max(1) < 0.029
@@ -342,7 +342,7 @@ def test_a_pixel_beyond_the_image_has_no_label_and_distortion_is_followed(tmp_pa
     capture, reconstruction = labelled_capture(tmp_path)
     for name in "ab":
         spot = np.zeros((60, 80), np.uint8)
-        # Where the lens puts the ray of the grid's pixel (35, 15).
+        # Where the camera model puts the ray of the grid's pixel (35, 15).
         ray = np.array([[(35 - PINHOLE.cx) / PINHOLE.fx, (15 - PINHOLE.cy) / PINHOLE.fy, 1.0]])
         x, y = cv2.projectPoints(
             ray, np.zeros(3), np.zeros(3), INTRINSICS.matrix, np.array(INTRINSICS.distortion)

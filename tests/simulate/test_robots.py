@@ -66,7 +66,7 @@ def test_effective_hand_eye_of_errors_that_only_move_gripper_or_base():
     arm, rng = arm_named("ur5e"), np.random.default_rng(0)
     physical = hand_eye_on(arm, rng)
     about_z = transform(rotation_exp(np.array([0.0, 0.0, 0.01])), np.zeros(3))
-    # The last joint turns the flange about its z: to the user the camera sits turned. The first turns the base.
+    # The last joint rotates the flange about its z: to the user the camera sits rotated. The first rotates the base.
     last = effective_about(only(arm, "joint 6", 0.01), physical, 12, rng).gripper_from_camera
     np.testing.assert_allclose(last, about_z @ physical, atol=1e-9)
     first = effective_about(only(arm, "joint 1", 0.01), physical, 12, rng).gripper_from_camera
@@ -176,7 +176,7 @@ def test_a_capture_of_a_bent_arm(tmp_path):
     assert capture.robot == robot["robot"] == "z1" and capture.joints is not None
     np.testing.assert_allclose(forward_kinematics(arm, capture.joints), capture.base_from_gripper, atol=1e-9)
     assert {"joint 3", "link 2 tilt 1", "joint 4 sag", "joint 5 gear sine"} <= robot["errors"].keys()
-    # The pictures are taken from where the bent arm is: the table's depth lies on the table.
+    # The images are taken from where the bent arm is: the table's depth lies on the table.
     physical = np.array(reference["physical_gripper_from_camera"])
     np.testing.assert_allclose(truth.base_from_camera, truth.base_from_gripper @ physical, atol=1e-12)
     off = np.linalg.norm((truth.base_from_gripper - capture.base_from_gripper)[:, :3, 3], axis=1)
@@ -188,7 +188,7 @@ def test_a_capture_of_a_bent_arm(tmp_path):
     table = points[true_labels(truth, 0) == 1]
     assert len(table) > 1000
     np.testing.assert_allclose(table[:, 2], truth.table_height, atol=2e-4)
-    # What is asked for is neither where the camera is bolted, nor the true lens.
+    # What is asked for is neither where the camera is bolted, nor the true intrinsics.
     effective = np.array(reference["gripper_from_camera"])
     assert 1e-5 < np.abs(effective - physical).max() < 0.05
     assert capture.intrinsics is not None and capture.intrinsics.fx != camera.fx

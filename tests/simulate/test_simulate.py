@@ -300,7 +300,7 @@ def test_command_line(tmp_path):
     assert (done.returncode, json.loads(done.stdout)) == (0, {"capture": str(tmp_path / "out")})
     again = subprocess.run(command, capture_output=True, text=True)
     assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1
-    # A machine without OpenGL: the cure is named, and nothing is left behind.
+    # A machine without OpenGL: the remedy is named, and nothing is left behind.
     command[len(jcr)] = str(tmp_path / "blind")
     blind = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"MUJOCO_GL": "disable"})
     assert blind.returncode == 2 and "apt-get install" in blind.stderr and blind.stderr.count("\n") == 1

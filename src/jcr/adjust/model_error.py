@@ -54,7 +54,7 @@ def size_of(
     """
     posterior = np.linalg.inv(covariance)
     right = posterior @ likeliest
-    # Of the images alone, along directions of which they know independently.
+    # Of the images alone, along directions that they measure independently.
     known, directions = np.linalg.eigh(posterior - np.diag(std**-2.0))
     known, right = np.maximum(known, 0.0), directions.T @ right
     variance = float(std[0] ** 2)

@@ -78,7 +78,7 @@ class Case:
         """Observations in the used images; of more than are adjusted those of a random choice of the points."""
         if self.chosen_tracks is not None:
             return self.chosen_tracks
-        return some_of_many(of_images(self.reconstruction.tracks, self.hand_eye.inliers))
+        return some_of_many(of_images(self.reconstruction.tracks, self.hand_eye.inliers), MOST_OBSERVATIONS)
 
     def with_tracks(self, tracks: Tracks) -> "Case":
         """The case with some of its observations."""
@@ -142,7 +142,7 @@ def of_images(tracks: Tracks, used: Bool[ndarray, " m"]) -> Tracks:
     return replace(kept, image=row[kept.image])
 
 
-def some_of_many(tracks: Tracks, most: int = MOST_OBSERVATIONS) -> Tracks:
+def some_of_many(tracks: Tracks, most: int) -> Tracks:
     """All observations, or where there are more than `most` those of a random choice of the points and of all corners
     of boards."""
     if len(tracks.image) <= most:

@@ -35,7 +35,7 @@ def load_urdf(file: Path, build_scene_graph: bool) -> "yourdfpy.URDF":
     import yourdfpy
 
     try:
-        # yourdfpy mends what is no XML, with two lines of its own on stderr.
+        # yourdfpy repairs what is no XML, with two lines of its own on stderr.
         etree.fromstring(read_text(file).encode(), etree.XMLParser(resolve_entities=False, no_network=True))
         urdf = yourdfpy.URDF.load(file, load_meshes=False, build_scene_graph=False)
         by_child = {joint.child: joint for joint in urdf.robot.joints}

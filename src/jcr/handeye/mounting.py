@@ -62,7 +62,7 @@ def _require_length(arm: Arm, base_from_gripper: Poses, nominal: Poses) -> None:
     """LengthError where one factor on all positions makes them agree with the nominal arm, and it is not 1."""
     tool, scale, base = closed_form(base_from_gripper, nominal)
     factor = float(scale)
-    if factor <= 0:  # no motion shows it
+    if factor <= 0:  # unobservable
         return
     residual, j = residuals(tool, factor, base, base_from_gripper, nominal)
     metres, radians = _apart(residual)

@@ -198,7 +198,7 @@ def _of_uncertainty(hand_eye: HandEye) -> Iterator[Finding]:
     if not hand_eye.observability.observable:
         return
     std = np.sqrt(np.diag(hand_eye.covariance))
-    # Of few images half the uncertainty may be that the robot's noise is hardly known.
+    # Of few images half the uncertainty may be that the robot pose noise is hardly known.
     unknown = hand_eye.robot_noise.given is None and int(hand_eye.inliers.sum()) < FEW
     parts = {"translation": std[:3].max(), "rotation": std[3:6].max(), "scale": std[6]}
     for (part, value), limit in zip(parts.items(), MAX_STD, strict=True):

@@ -169,7 +169,7 @@ def rolls(base_from_camera: Float[ndarray, "n 3 3"]) -> Float[ndarray, " n"]:
     relative = base_from_mean.T @ base_from_camera
     # Of a quaternion: 2 atan2(q_z, q_w), which is atan2 of twice these (Shepperd 1978).
     twist = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-    # Most images as they are, for turning costs sharpness.
+    # Most images as they are, for rotating costs sharpness.
     common = np.cos(twist[:, None] - twist)
     return twist - twist[int(np.argmax(np.maximum(common - 0.9, 0).sum(1)))]
 

@@ -90,7 +90,7 @@ def _refined(
         agreeing = np.linalg.norm(residual, axis=1) < tolerance
         if agreeing.sum() < 3:
             return None
-        # turned → exp(w) turned exp(-w): the residual, in the axes after turned, changes by (turnedᵀ − I) w.
+        # rotated → exp(w) rotated exp(-w): the residual, in the axes after rotated, changes by (rotatedᵀ − I) w.
         jacobian = np.swapaxes(rotated, 1, 2) - np.eye(3)
         w = np.where(agreeing, weight / (1 + (2 * np.linalg.norm(residual, axis=1) / tolerance) ** 2), 0.0)
         information = np.einsum("p,pki,pkj->ij", w, jacobian, jacobian)

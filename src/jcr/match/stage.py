@@ -171,7 +171,7 @@ class _Search:
     def _better(self, new: Pair, old: Pair) -> bool:
         """Whether a new geometry of the same pair is confirmed where the old one is not, or has more matches."""
         first, second = (self._agrees(pair) for pair in (new, old))
-        # The later one is of images turned upright, whose keypoints all pairs share.
+        # The later one is of images rotated upright, whose keypoints all pairs share.
         return first if first != second else 2 * len(new.rows) > len(old.rows)
 
     def _agrees(self, pair: Pair) -> bool:
@@ -230,7 +230,7 @@ def match_with_robot(
     believed = {pair.key for pair in (*found.confirmed, *found.undecided)}
     believed |= {pair.key for pair in found.contradicted if stale & set(pair.key)}
     if known:
-        # Of a pair that cannot say how it turns, only what the known rotation explains would be right.
+        # Of a pair whose rotation is not measured, only what the known rotation explains would be right.
         believed -= {pair.key for pair in found.undecided}
     report(1.0)
     kept = {key: geometry for key, geometry in search.geometries.items() if key in believed}
@@ -278,7 +278,7 @@ def _contradicted_by_all(found: Gate, motion: Float[ndarray, "n n 4 4"]) -> set[
     suspects = {row for pair in found.contradicted for row in pair.key} - confirmed
     stale = set()
     for row in sorted(suspects):
-        # By how much the gripper would have to be turned for each pair; sound pairs ask for the same.
+        # By how much the gripper would have to be rotated for each pair; sound pairs ask for the same.
         corrections = []
         for pair in found.contradicted:
             if row not in pair.key or not (set(pair.key) - {row}) & confirmed:

@@ -32,7 +32,7 @@ def _verification(seed: int, known: bool, matches: int) -> pycolmap.TwoViewGeome
     options.ransac.dyn_num_trials_multiplier = 1.0
     options.ransac.confidence, options.ransac.max_num_trials = 0.99, 2000
     options.min_num_inliers = MIN_INLIERS
-    # The gripper's fingers, or text drawn into the pictures, keep their pixels while the scene moves.
+    # The gripper's fingers, or text drawn into the images, keep their pixels while the scene moves.
     options.filter_stationary_matches = True
     options.stationary_matches_max_error = STATIONARY_PX
     if known:  # a fundamental matrix bends itself to wrong matches, which an essential matrix cannot explain

@@ -394,7 +394,7 @@ def adjust_robustly(model: pycolmap.Reconstruction, fix_intrinsics: bool) -> Non
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # pycolmap.bundle_adjustment() does the same, but turns the log back on.
+    # pycolmap.bundle_adjustment() does the same, but enables the log again.
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 

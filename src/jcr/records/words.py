@@ -112,7 +112,7 @@ def worst_direction(gripper_from_camera: ndarray, covariance: ndarray) -> str:
     name, axis = max(named.items(), key=lambda item: abs(item[1] @ direction))
     if abs(axis @ direction) < np.cos(np.radians(30)):
         name = f"({', '.join(f'{x:.2f}' for x in direction)}) of the gripper"
-    # An offset that no motion shows may be uncertain by metres.
+    # An offset that is unobservable may be uncertain by metres.
     size = f"{significant(std_mm)} mm" if std_mm < 1000 else f"{significant(std_mm / 1e3)} m"
     return f"along {name}: ±{size}"
 

@@ -67,7 +67,7 @@ def _leave_one_out(calibration: CalibrationFile) -> str:
         return "There were too few images to leave one out and see how well the others predict it."
     error = leave_one_out_text(held_out)
     if not calibration.observability.observable:
-        # An error along a direction that no motion shows changes no prediction.
+        # An error along a direction that is unobservable changes no prediction.
         return f"Its leave-one-out error of {error} is no comfort: what is unobservable, no image can contradict."
     if not calibration.converged:
         return (

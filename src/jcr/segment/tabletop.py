@@ -135,7 +135,7 @@ def label_tabletop(
     object_of = np.zeros(len(height), int)
     if over.any():
         cell = np.floor(x_in_support[:, :2] / (options.object_gap / 2)).astype(int)
-        # Two empty cells all around, the outermost of which stands for all that lies farther out.
+        # Two empty cells all around, the outermost one stands for all that lies farther out.
         low, high = cell[over].min(0) - 2, cell[over].max(0) + 2
         parts = _parts(cell[over] - low, tuple((high - low + 1).tolist()))
         place = tuple((np.clip(cell, low, high) - low).T)

@@ -34,8 +34,8 @@ def open_server(port: int, title: str) -> LocalServer:
         with socket.create_server((HOST, port)):
             pass
     except OSError as error:
-        cure = "choose another with --port (0 takes any free one)"
-        raise InputError(f"cannot listen on port {port} of {HOST} ({error.strerror}); {cure}") from None
+        remedy = "choose another with --port (0 takes any free one)"
+        raise InputError(f"cannot listen on port {port} of {HOST} ({error.strerror}); {remedy}") from None
     with redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)

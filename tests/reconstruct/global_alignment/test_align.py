@@ -197,7 +197,7 @@ def test_principal_point_comes_from_the_option_then_the_file_then_the_middle():
 
 @pytest.mark.parametrize("network", ["from 1 up", "from 0 to 1"])
 def test_pixels_without_confidence_do_not_count(network):
-    # More than half of each picture is rubbish, as sky is.
+    # More than half of each image is rubbish, as sky is.
     predictions, truth = synthetic_pairs(complete_pairs(4), SMALL)
     rubbish = np.random.default_rng(0).normal(0, 1, (12, 36, 28, 3)).astype(np.float32)
     nothing = 1.0 if network == "from 1 up" else 0.0

@@ -161,7 +161,7 @@ def test_an_adapter_undoes_its_packages_conventions(name: str, size: tuple[int, 
     unit = 1.0 if found.is_metric else UNIT
     assert found.is_metric == (name in ("mapanything", "moge"))
 
-    # The grid is where the adapter says, so that the true lens on it gives the true rays and depth.
+    # The grid is where the adapter says, so that the true intrinsics on it give the true rays and depth.
     known = grid.grid_intrinsics(scene.pinhole)
     expected = np.tile([known.fx, known.fy, known.cx, known.cy], (COUNT, 1))
     np.testing.assert_allclose(found.pinholes, expected, rtol=2e-3, atol=0.06)

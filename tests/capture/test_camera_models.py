@@ -67,7 +67,7 @@ def test_a_intrinsics_survives_colmap(intrinsics: Intrinsics, tmp_path: Path):
         ("plumb_bob", 8, "'plumb_bob' with 8"),
     ],
 )
-def test_other_lenses_are_refused_by_name(model: str, count: int, words: str):
+def test_other_camera_models_are_refused_by_name(model: str, count: int, words: str):
     k = [500.0, 0, 320, 0, 500, 240, 0, 0, 1]
     with pytest.raises(jcr.InputError, match=words):
         camera_info.intrinsics_of_ros(k, model, [0.1] * count, SIZE, SIZE, "camera_info")
