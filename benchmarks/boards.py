@@ -142,10 +142,8 @@ def _left_out(
     odd = ~even[shown.image_index]
     tracks, corners = shown.tracks, shown.tracks.on_board
     own = tracks.only(odd[tracks.image])
-    return tuple(
-        _reprojection_px(own.only(corners[own.point] == on_board), cameras, intrinsics)
-        for on_board in (False, True)
-    )
+    features, on_board = (own.only(corners[own.point] == kind) for kind in (False, True))
+    return _reprojection_px(features, cameras, intrinsics), _reprojection_px(on_board, cameras, intrinsics)
 
 
 def _of(capture: Capture, chosen: Bool[ndarray, " n"]) -> Capture:
@@ -285,7 +283,7 @@ def _claim(table: "Table") -> str:
     long = [one["both"].named for (_, _, scale), draws in table.items() for one in draws if scale >= 1.02]
     clean = [one["both"] for (_, _, scale), draws in table.items() for one in draws if scale == 1.0]
     return (
-        f"> Simulated robots whose lengths are right: both together are nearest in {sum(nearest)} of {len(nearest)} rows, "
+        f"> Simulated robots whose lengths are right: both are nearest in {sum(nearest)} of {len(nearest)} rows, "
         f"{sum(one.sigmas > 3 for one in clean)} of {len(clean)} results are beyond 3 σ and "
         f"{sum(one.named for one in clean)} are falsely said to contradict the board. Positions 2 and 5 % too long are "
         f"named in {sum(long)} of {len(long)} draws."
@@ -304,8 +302,8 @@ def _simulated_table(table: Table, draws: int) -> list[str]:
         f"Simulated, the truth known, {draws} draws a row: 500 features seen with 0.4 px of noise, a chessboard of 9x6 "
         "corners and 25 mm seen with 0.1 px, printed to 0.2 %, flat or with its edges 2 mm up; robot pose noise 0.3 mm "
         "and 0.06° per axis. *too long*: all positions of the robot. *off*: median distance from the true transform; of "
-        "positions that are too long the robot's own metre is, and so is its transform. *> 3 σ*: accepted results with an "
-        "axis of X more than three stated σ off. *named*: a finding says that board and robot contradict each other.",
+        "positions that are too long the robot's own metre is, and so is its transform. *> 3 σ*: accepted results with "
+        "an axis of X more than three stated σ off. *named*: a finding says that board and robot contradict each other.",
         "",
         "| images | sheet | too long | features: mm | ° | > 3 σ | board: mm | ° | > 3 σ | both: mm | ° | > 3 σ | "
         "named | rejected |",

@@ -85,10 +85,11 @@ def test_a_board_that_no_image_shows_is_named_and_features_alone_are_used(monkey
     assert np.array_equal(hand_eye.gripper_from_camera, alone.gripper_from_camera)
     (named,) = (one for one in hand_eye.findings if one.kind is Kind.BOARD_NOT_FOUND)
     assert named.severity == "warns" and SPEC in sentence(named)
-    proposed = replace(
-        made, tracks=replace(made.tracks, boards=replace(made.tracks.boards, proposed="aruco:SIDE:X"))
-    )
-    assert any("seem to show aruco:SIDE:X" in text for text in calibrate(capture, proposed).warnings)
+    boards = made.tracks.boards
+    assert boards is not None
+    proposed = replace(made.tracks, boards=replace(boards, proposed="aruco:SIDE:X"))
+    warnings = calibrate(capture, replace(made, tracks=proposed)).warnings
+    assert any("seem to show aruco:SIDE:X" in text for text in warnings)
 
 
 def test_a_board_of_unknown_side_has_its_side_as_unit():

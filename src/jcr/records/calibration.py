@@ -395,9 +395,10 @@ class BoardFound:
     """Of the corners' reprojection errors, per axis."""
     bend_mm: float
     """Between the lowest and the highest corner beside the plane; the largest of all bodies."""
-    centres_in_base: Float[ndarray, "b 3"]
-    """Of the bodies."""
-    normals_in_base: Float[ndarray, "b 3"]
+    centres_in_base: tuple[tuple[float, float, float], ...]
+    """Of the bodies (m)."""
+    tilts_deg: tuple[float, ...]
+    """Of the bodies, from the horizontal of the base."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from jcr.adjust.robots import Adjusted, size_of_boards
 from jcr.calibration.case import Case, Checked
@@ -48,6 +50,7 @@ def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
     height_mm = 1e3 * placed.scale * np.exp(shape[0]) * shapes.bend(shape)
     numbers = np.unique(shapes.body)
     rigs = scene.world_from_rig[shapes.first_rig + numbers]
+    normals = rigs[:, :3, 2] @ placed.z[0][:3, :3].T
     points = apply(placed.z[0], placed.scale * scene.points_in_world[shapes.point])
     return BoardFound(
         spec=boards.spec,
@@ -59,6 +62,10 @@ def board_found(adjusted: Adjusted, boards: Boards) -> BoardFound:
         stated_mm=None if boards.size_std is None else 1e3 * boards.side,
         rms_px=float(np.sqrt((evidence.view.residual_px[of_corners] ** 2).mean())),
         bend_mm=max(float(np.ptp(height_mm[shapes.body == k])) for k in numbers),
-        centres_in_base=np.stack([points[shapes.body == k].mean(0) for k in numbers]),
-        normals_in_base=rigs[:, :3, 2] @ placed.z[0][:3, :3].T,
+        centres_in_base=tuple(_xyz(points[shapes.body == k].mean(0)) for k in numbers),
+        tilts_deg=tuple(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0, 1))).tolist()),
     )
+
+
+def _xyz(x: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    return float(x[0]), float(x[1]), float(x[2])
